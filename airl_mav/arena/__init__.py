@@ -1,0 +1,1 @@
+"""The environment generator: (spec, seed) -> a concrete arena with walls, obstacles and a goal."""

@@ -1,0 +1,94 @@
+"""A concrete arena as plain arrays: what the plant, the camera, training and the report share.
+
+Frame: local NED, origin at the vehicle's start on the floor, x north. The floor is z = 0; heights
+are negative z. The four walls stand on the edges of `bounds`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.constants import US_PER_S
+
+
+class Shape(IntEnum):
+    """Primitive kinds of an obstacle; the numbers are what the numba kernels see."""
+
+    BOX = 0
+    CYLINDER = 1
+    SPHERE = 2
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The arena's floor rectangle and wall height."""
+
+    north_min: float
+    north_max: float
+    east_min: float
+    east_max: float
+    height: float
+    """Wall height above the floor [m], positive."""
+
+    def as_array(self) -> NDArray[np.float64]:
+        """Return [north_min, north_max, east_min, east_max, height] for the kernels."""
+        return np.array(
+            [self.north_min, self.north_max, self.east_min, self.east_max, self.height], np.float64
+        )
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """n primitives, static ones first."""
+
+    shape: NDArray[np.int8]  # (n,) Shape
+    center: NDArray[np.float64]  # (n, 3) NED [m]; for moving ones: at time 0
+    half_size: NDArray[np.float64]  # (n, 3) [m]
+    """Box: half extents along its own axes. Cylinder (vertical axis): radius, radius, half height.
+    Sphere: radius three times."""
+    yaw: NDArray[np.float64]  # (n,) heading of a box's first axis [rad]
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(self.shape)
+
+
+@dataclass(frozen=True)
+class Tour:
+    """The closed way of one moving obstacle: way-points passed at given times, over and over."""
+
+    times_s: NDArray[np.float64]  # (k,) from 0 to the tour's period, increasing
+    points: NDArray[np.float64]  # (k, 2) north, east [m]; the last equals the first
+
+
+@dataclass(frozen=True)
+class Arena:
+    """One concrete arena. The same object makes bodies, depth images, episodes and pictures."""
+
+    name: str
+    seed: int
+    bounds: Bounds
+    wall_colour: tuple[int, int, int]
+    """Red, green, blue, 0-255."""
+    obstacles: Obstacles
+    """All obstacles; the last `len(tours)` of them move."""
+    tours: tuple[Tour, ...]
+    goal: NDArray[np.float64]  # (2,) north, east [m] from the start
+
+    @property
+    def n_static(self) -> int:
+        """Number of obstacles that stand still."""
+        return len(self.obstacles) - len(self.tours)
+
+    def centers_at(self, time_us: int) -> NDArray[np.float64]:
+        """Return all obstacle centres (n, 3) NED [m], `time_us` after the episode's start."""
+        centers = self.obstacles.center.copy()
+        for i, tour in enumerate(self.tours, start=self.n_static):
+            t = (time_us / US_PER_S) % tour.times_s[-1]
+            centers[i, 0] = np.interp(t, tour.times_s, tour.points[:, 0])
+            centers[i, 1] = np.interp(t, tour.times_s, tour.points[:, 1])
+        return centers

@@ -1,0 +1,66 @@
+"""A depth frame and its wire format: one ZeroMQ message, header then Z16 pixels."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.intrinsics import Intrinsics
+
+MAGIC = b"ADF1"
+"""Air-learning depth frame, version 1."""
+
+# magic, sequence, capture time [µs], width, height, focal, cx, cy; little endian
+_HEADER = struct.Struct("<4sQqHHddd")
+
+MM_PER_M = 1000.0
+MAX_MM = 65_535
+
+
+class FrameError(ValueError):
+    """Bytes that are no frame of this version."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One depth image, RealSense Z16 convention."""
+
+    sequence: int
+    """Counts up by one per captured frame."""
+    capture_time_us: int
+    """Simulated time of the exposure [µs]."""
+    depth_mm: NDArray[np.uint16]  # (height, width) along the optical axis [mm]; 0 = no return
+    intrinsics: Intrinsics
+
+    def depth_m(self) -> NDArray[np.float32]:
+        """Return depth (height, width) [m]; 0 = no return."""
+        return self.depth_mm.astype(np.float32) / np.float32(MM_PER_M)
+
+    def to_bytes(self) -> bytes:
+        """Return the wire form."""
+        k = self.intrinsics
+        header = _HEADER.pack(
+            MAGIC, self.sequence, self.capture_time_us, k.width, k.height, k.focal, k.cx, k.cy
+        )
+        return header + self.depth_mm.astype("<u2", copy=False).tobytes()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Frame:
+        """Read the wire form. Raises FrameError for anything else."""
+        if len(data) < _HEADER.size:
+            raise FrameError(f"{len(data)} bytes are too short for a frame header")
+        magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
+        if magic != MAGIC:
+            raise FrameError(f"magic {magic!r}, expected {MAGIC!r}")
+        if len(data) != _HEADER.size + 2 * width * height:
+            raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels")
+        pixels = np.frombuffer(data, "<u2", offset=_HEADER.size).reshape(height, width)
+        return cls(sequence, time_us, pixels, Intrinsics(width, height, focal, cx, cy))
+
+
+def depth_to_z16(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """Turn metres (0 = no return) into Z16 millimetres, rounded, clipped to 65,535 mm."""
+    return np.clip(np.rint(depth_m * MM_PER_M), 0, MAX_MM).astype(np.uint16)

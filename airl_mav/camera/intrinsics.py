@@ -1,0 +1,28 @@
+"""The pinhole model of the depth camera."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole intrinsics with square pixels, RealSense convention.
+
+    A pixel (u, v) looks along ((u - cx) / focal, (v - cy) / focal, 1) in the optical frame
+    (right, down, forward). Pixel centres are at whole numbers.
+    """
+
+    width: int
+    height: int
+    focal: float
+    """Focal length [px]."""
+    cx: float
+    cy: float
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, horizontal_fov: float) -> Intrinsics:
+        """Return the intrinsics of a camera with a horizontal field of view [rad] in (0, pi)."""
+        focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
+        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1))

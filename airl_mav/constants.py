@@ -1,0 +1,42 @@
+"""Physical constants and unit conversions. SI, with sources."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+GRAVITY_M_S2: Final = 9.80665
+"""Standard gravity [m/s²] (CGPM 1901; PX4's CONSTANTS_ONE_G)."""
+
+AIR_DENSITY_KG_M3: Final = 1.225
+"""Air density at sea level, 15 °C [kg/m³] (ISA, ISO 2533)."""
+
+SEA_LEVEL_PRESSURE_HPA: Final = 1013.25
+"""ISA static pressure at sea level [hPa]."""
+
+SEA_LEVEL_TEMPERATURE_K: Final = 288.15
+"""ISA temperature at sea level [K]."""
+
+TEMPERATURE_LAPSE_K_M: Final = 0.0065
+"""ISA temperature lapse rate in the troposphere [K/m]."""
+
+GAS_CONSTANT_AIR: Final = 287.05287
+"""Specific gas constant of dry air [J/(kg K)] (ISA)."""
+
+EARTH_RADIUS_M: Final = 6_371_000.0
+"""Radius of PX4's azimuthal equidistant local projection [m] (CONSTANTS_RADIUS_OF_EARTH)."""
+
+ZERO_CELSIUS_K: Final = 273.15
+"""0 °C [K]."""
+
+US_PER_S: Final = 1_000_000
+"""Microseconds in a second."""
+
+TICK_US: Final = 4_000
+"""Base tick of plant and autopilot [µs]: 250 Hz, PX4's simulator interface rate."""
+
+TICK_S: Final = TICK_US / US_PER_S
+"""Base tick [s]."""
+
+DEG: Final = math.pi / 180.0
+"""One degree [rad]."""

@@ -1,0 +1,1 @@
+"""PX4's multicopter cascade as numba kernels: velocity -> attitude -> rate -> mixer."""

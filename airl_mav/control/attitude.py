@@ -1,0 +1,100 @@
+"""Thrust vector and heading -> attitude setpoint -> body rate setpoint.
+
+The structure of PX4's AttitudeControl (Brescianini, Hehn, D'Andrea, Nonlinear Quadrocopter
+Attitude Control, ETH 2013): the thrust axis is turned first, the heading with a reduced weight.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.control.gains import Gains
+from airl_mav.control.velocity import clamp
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize, rotate
+
+
+@njit(cache=True, nogil=True)
+def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
+    """Return the attitude whose body -z lies along the thrust vector NED, with a heading [rad].
+
+    PX4's ControlMath::bodyzToAttitude.
+    """
+    norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
+    if norm < 1e-9:
+        return (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+    zx, zy, zz = -thrust[0] / norm, -thrust[1] / norm, -thrust[2] / norm
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    # x = y_c x z with y_c = (-sin, cos, 0)
+    xx, xy, xz = cy * zz, sy * zz, -sy * zy - cy * zx
+    if zz < 0.0:
+        xx, xy, xz = -xx, -xy, -xz
+    n = math.sqrt(xx * xx + xy * xy + xz * xz)
+    if n < 1e-6:
+        xx, xy, xz, n = 0.0, 0.0, 1.0, 1.0
+    xx, xy, xz = xx / n, xy / n, xz / n
+    yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
+    return _from_axes((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
+
+
+@njit(cache=True, nogil=True)
+def _from_axes(x: Vec, y: Vec, z: Vec) -> Quat:
+    """Return the quaternion of the rotation with columns x, y, z (Shepperd's method)."""
+    trace = x[0] + y[1] + z[2]
+    if trace > 0.0:
+        s = 2.0 * math.sqrt(1.0 + trace)
+        return normalize((0.25 * s, (y[2] - z[1]) / s, (z[0] - x[2]) / s, (x[1] - y[0]) / s))
+    if x[0] > y[1] and x[0] > z[2]:
+        s = 2.0 * math.sqrt(1.0 + x[0] - y[1] - z[2])
+        return normalize(((y[2] - z[1]) / s, 0.25 * s, (y[0] + x[1]) / s, (z[0] + x[2]) / s))
+    if y[1] > z[2]:
+        s = 2.0 * math.sqrt(1.0 + y[1] - x[0] - z[2])
+        return normalize(((z[0] - x[2]) / s, (y[0] + x[1]) / s, 0.25 * s, (z[1] + y[2]) / s))
+    s = 2.0 * math.sqrt(1.0 + z[2] - x[0] - y[1])
+    return normalize(((x[1] - y[0]) / s, (z[0] + x[2]) / s, (z[1] + y[2]) / s, 0.25 * s))
+
+
+@njit(cache=True, nogil=True)
+def _shortest(a: Vec, b: Vec) -> Quat:
+    """Return the shortest rotation that turns unit vector a into b."""
+    cx, cy, cz = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    dot = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    if dot < -1.0 + 1e-9:
+        # Opposite: half a turn about any axis perpendicular to a.
+        if abs(a[0]) < 0.9:
+            return normalize((0.0, 0.0, a[2], -a[1]))
+        return normalize((0.0, -a[2], 0.0, a[0]))
+    return normalize((1.0 + dot, cx, cy, cz))
+
+
+@njit(cache=True, nogil=True)
+def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
+    """Return the body rates FRD [rad/s] that turn attitude q into q_sp.
+
+    Args:
+        q: Attitude body -> NED.
+        q_sp: Attitude wanted.
+        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
+        gains: Attitude P gains, yaw weight, rate limits.
+    """
+    down = (0.0, 0.0, 1.0)
+    reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)
+    mix = multiply(conjugate(reduced), q_sp)
+    sign = 1.0 if mix[0] >= 0.0 else -1.0
+    w = gains.yaw_weight
+    turn_w = math.cos(w * math.acos(clamp(sign * mix[0], -1.0, 1.0)))
+    turn_z = math.sin(w * math.asin(clamp(sign * mix[3], -1.0, 1.0)))
+    wanted = multiply(reduced, (turn_w, 0.0, 0.0, turn_z))
+    error = multiply(conjugate(q), wanted)
+    two = 2.0 if error[0] >= 0.0 else -2.0
+    # The yaw gain is divided by its weight so that the weight does not slow a pure yaw step.
+    ff = rotate(conjugate(q), (0.0, 0.0, yaw_rate_ff))
+    p = gains.att_p_roll * two * error[1] + ff[0]
+    r = gains.att_p_pitch * two * error[2] + ff[1]
+    y = gains.att_p_yaw / w * two * error[3] + ff[2]
+    return (
+        clamp(p, -gains.rate_max_roll, gains.rate_max_roll),
+        clamp(r, -gains.rate_max_pitch, gains.rate_max_pitch),
+        clamp(y, -gains.rate_max_yaw, gains.rate_max_yaw),
+    )

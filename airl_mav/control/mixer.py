@@ -1,0 +1,96 @@
+"""Control allocation of the quad X: collective and torques -> motor commands.
+
+PX4's ControlAllocationSequentialDesaturation with MC_AIRMODE = 0: roll and pitch before yaw,
+thrust is lowered but never raised to make room.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.control.velocity import clamp
+from airl_mav.vehicle.rotation import Vec
+
+Motors = tuple[float, float, float, float]
+
+# Normalised allocation matrix of a symmetric quad X (PX4 scales roll and pitch by the rms of
+# their columns): command = thrust + SIN45 roll + SIN45 pitch + yaw, motors FR, RL, FL, RR.
+SIN45 = math.sqrt(0.5)
+ROLL: Motors = (-SIN45, SIN45, SIN45, -SIN45)
+PITCH: Motors = (SIN45, -SIN45, SIN45, -SIN45)
+YAW: Motors = (1.0, 1.0, -1.0, -1.0)
+THRUST: Motors = (1.0, 1.0, 1.0, 1.0)
+# Yaw may push motors beyond their limit by this share before thrust gives way.
+YAW_MARGIN = 0.15
+
+
+@njit(cache=True, nogil=True)
+def _add(m: Motors, direction: Motors, amount: float) -> Motors:
+    return (
+        m[0] + amount * direction[0],
+        m[1] + amount * direction[1],
+        m[2] + amount * direction[2],
+        m[3] + amount * direction[3],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _excess(m: Motors, direction: Motors, high: float) -> float:
+    """Return how much of `direction` to add so that the worst motors come back into [0, high]."""
+    k_min = 0.0
+    k_max = 0.0
+    for i in range(4):
+        k = 0.0
+        if m[i] < 0.0:
+            k = -m[i] / direction[i]
+        elif m[i] > high:
+            k = (high - m[i]) / direction[i]
+        k_min = min(k_min, k)
+        k_max = max(k_max, k)
+    return k_min + k_max
+
+
+@njit(cache=True, nogil=True)
+def _desaturate(m: Motors, direction: Motors, high: float, lower_only: bool) -> Motors:
+    gain = _excess(m, direction, high)
+    if lower_only and gain > 0.0:
+        return m
+    m = _add(m, direction, gain)
+    # Half again: a compromise when motors saturate at both ends.
+    return _add(m, direction, 0.5 * _excess(m, direction, high))
+
+
+@njit(cache=True, nogil=True)
+def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
+    """Return motor commands 0..1 and the torque that could not be delivered, per axis.
+
+    Args:
+        thrust: Collective 0..1.
+        torque: Normalised roll, pitch, yaw torque, -1..1.
+    """
+    m = _add(_add(_add((0.0, 0.0, 0.0, 0.0), THRUST, thrust), ROLL, torque[0]), PITCH, torque[1])
+    m = _desaturate(m, THRUST, 1.0, True)
+    m = _desaturate(m, ROLL, 1.0, False)
+    m = _desaturate(m, PITCH, 1.0, False)
+    m = _add(m, YAW, torque[2])
+    m = _desaturate(m, YAW, 1.0 + YAW_MARGIN, False)
+    m = _desaturate(m, THRUST, 1.0, True)
+    out = (
+        clamp(m[0], 0.0, 1.0),
+        clamp(m[1], 0.0, 1.0),
+        clamp(m[2], 0.0, 1.0),
+        clamp(m[3], 0.0, 1.0),
+    )
+    roll = (-out[0] + out[1] + out[2] - out[3]) / (4.0 * SIN45)
+    pitch = (out[0] - out[1] + out[2] - out[3]) / (4.0 * SIN45)
+    yaw = 0.25 * (out[0] + out[1] - out[2] - out[3])
+    missing = (torque[0] - roll, torque[1] - pitch, torque[2] - yaw)
+    return out, (_dead(missing[0]), _dead(missing[1]), _dead(missing[2]))
+
+
+@njit(cache=True, nogil=True)
+def _dead(value: float) -> float:
+    """Return 0 for rounding noise: a saturated axis is short of more than that."""
+    return value if abs(value) > 1e-6 else 0.0

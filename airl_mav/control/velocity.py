@@ -1,0 +1,112 @@
+"""Position P and velocity PID -> acceleration -> thrust vector.
+
+The structure of PX4's PositionControl (mc_pos_control). Offboard velocity setpoints enter without
+any ramp: PX4 does not slew them.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.constants import GRAVITY_M_S2
+from airl_mav.control.gains import Gains
+from airl_mav.vehicle.rotation import Vec
+
+
+@njit(cache=True, nogil=True)
+def clamp(value: float, low: float, high: float) -> float:
+    """Return value limited to [low, high]."""
+    return min(high, max(low, value))
+
+
+@njit(cache=True, nogil=True)
+def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: Gains) -> Vec:
+    """Return the velocity to fly NED [m/s]: position error x gain + feed-forward, limited.
+
+    A NaN axis of `position_sp` has no position loop; a NaN axis of `velocity_ff` adds nothing.
+    The horizontal limit gives the position correction priority over the feed-forward.
+    """
+    px = 0.0 if math.isnan(position_sp[0]) else gains.pos_p_xy * (position_sp[0] - position[0])
+    py = 0.0 if math.isnan(position_sp[1]) else gains.pos_p_xy * (position_sp[1] - position[1])
+    pz = 0.0 if math.isnan(position_sp[2]) else gains.pos_p_z * (position_sp[2] - position[2])
+    fx = 0.0 if math.isnan(velocity_ff[0]) else velocity_ff[0]
+    fy = 0.0 if math.isnan(velocity_ff[1]) else velocity_ff[1]
+    fz = 0.0 if math.isnan(velocity_ff[2]) else velocity_ff[2]
+    limit = gains.vel_max_xy
+    norm_p = math.hypot(px, py)
+    if norm_p >= limit:
+        vx, vy = px / norm_p * limit, py / norm_p * limit
+    elif math.hypot(px + fx, py + fy) > limit:
+        # Largest share s of the feed-forward with |p + s f| = limit.
+        a = fx * fx + fy * fy
+        b = px * fx + py * fy
+        s = (-b + math.sqrt(b * b + a * (limit * limit - norm_p * norm_p))) / a
+        vx, vy = px + s * fx, py + s * fy
+    else:
+        vx, vy = px + fx, py + fy
+    return vx, vy, clamp(pz + fz, -gains.vel_max_up, gains.vel_max_down)
+
+
+@njit(cache=True, nogil=True)
+def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
+    """Return the thrust vector NED (normalised, hover = hover_thrust) for an acceleration [m/s²].
+
+    Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1): the tilt follows
+    from the horizontal part alone, limited to tilt_max.
+    """
+    horizontal = math.hypot(acc[0], acc[1])
+    tilt = min(math.atan2(horizontal, GRAVITY_M_S2), gains.tilt_max)
+    s, c = math.sin(tilt), math.cos(tilt)
+    # body_z (down) points against the horizontal acceleration
+    bx = -acc[0] / horizontal * s if horizontal > 1e-9 else 0.0
+    by = -acc[1] / horizontal * s if horizontal > 1e-9 else 0.0
+    vertical = acc[2] * gains.hover_thrust / GRAVITY_M_S2 - gains.hover_thrust
+    collective = min(vertical / c, -gains.thrust_min)
+    return bx * collective, by * collective, c * collective
+
+
+@njit(cache=True, nogil=True)
+def velocity_control(
+    velocity: Vec,
+    velocity_dot: Vec,
+    velocity_sp: Vec,
+    integral: Vec,
+    gains: Gains,
+    dt: float,
+) -> tuple[Vec, Vec]:
+    """Return the thrust vector (3,) NED and the new integral (3,) [m/s²].
+
+    PID on velocity with anti-windup: vertical integration stops at the thrust limits; horizontal
+    integration is pulled back by what saturation takes away (tracking anti-windup, gain 2/P).
+    """
+    ex = velocity_sp[0] - velocity[0]
+    ey = velocity_sp[1] - velocity[1]
+    ez = velocity_sp[2] - velocity[2]
+    ax = gains.vel_p_xy * ex + integral[0] - gains.vel_d_xy * velocity_dot[0]
+    ay = gains.vel_p_xy * ey + integral[1] - gains.vel_d_xy * velocity_dot[1]
+    az = gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]
+    tx, ty, tz = thrust_from_acceleration((ax, ay, az), gains)
+    if (tz >= -gains.thrust_min and ez >= 0.0) or (tz <= -gains.thrust_max and ez <= 0.0):
+        ez = 0.0
+    # Vertical thrust first, but a horizontal margin always stays.
+    norm = math.hypot(tx, ty)
+    reserved = min(norm, gains.thrust_xy_margin)
+    tz = max(tz, -math.sqrt(max(0.0, gains.thrust_max**2 - reserved**2)))
+    room = math.sqrt(max(0.0, gains.thrust_max**2 - tz * tz))
+    if norm > room:
+        tx, ty = tx / norm * room, ty / norm * room
+    per_thrust = GRAVITY_M_S2 / gains.hover_thrust
+    produced_x, produced_y = tx * per_thrust, ty * per_thrust
+    if ax * ax + ay * ay > produced_x * produced_x + produced_y * produced_y:
+        arw = 2.0 / gains.vel_p_xy
+        ex -= arw * (ax - produced_x)
+        ey -= arw * (ay - produced_y)
+    g = GRAVITY_M_S2
+    new_integral = (
+        integral[0] + gains.vel_i_xy * ex * dt,
+        integral[1] + gains.vel_i_xy * ey * dt,
+        clamp(integral[2] + gains.vel_i_z * ez * dt, -g, g),
+    )
+    return (tx, ty, tz), new_integral

@@ -1,0 +1,154 @@
+"""The vehicle profile: airframe, rotors, drag, battery, power model, camera, parameters."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+
+class Body(ProfileModel):
+    """The rigid body."""
+
+    mass_kg: float = quantity("take-off mass", "kg", gt=0.05, le=100)
+    inertia_xx_kg_m2: float = quantity("inertia about the forward axis", "kg m²", gt=1e-6, le=100)
+    inertia_yy_kg_m2: float = quantity("inertia about the right axis", "kg m²", gt=1e-6, le=100)
+    inertia_zz_kg_m2: float = quantity("inertia about the down axis", "kg m²", gt=1e-6, le=100)
+    width_m: float = quantity("width across the propellers, for clearances", "m", gt=0.02, le=10)
+    height_m: float = quantity("height of the collision body", "m", gt=0.01, le=5)
+
+
+class Rotor(ProfileModel):
+    """One of four equal rotors in PX4 quad-X order: front right, rear left, front left, rear right.
+
+    Front right and rear left turn counter-clockwise seen from above (PX4's CA_ROTORn_KM > 0).
+    """
+
+    arm_forward_m: float = quantity(
+        "distance of the rotors fore and aft of the centre", "m", gt=0.01, le=5
+    )
+    arm_right_m: float = quantity(
+        "distance of the rotors right and left of the centre", "m", gt=0.01, le=5
+    )
+    thrust_max_n: float = quantity("static thrust at full command", "N", gt=0.01, le=1000)
+    torque_per_thrust_m: float = quantity("drag torque per newton of thrust", "m", gt=0, le=1)
+    time_constant_s: float = quantity("first-order lag of the rotor speed", "s", gt=0, le=1)
+    thrust_curve: float = quantity(
+        "thrust = max (c u² + (1 - c) u) of command u: 0 linear, 1 quadratic (PX4's THR_MDL_FAC)",
+        "1",
+        ge=0,
+        le=1,
+    )
+    speed_max_rad_s: float = quantity("rotor speed at full command", "rad/s", gt=10, le=20000)
+
+
+class Drag(ProfileModel):
+    """Aerodynamic drag of the body, against the air: F = -(linear v + quadratic |v| v)."""
+
+    linear_n_s_m: float = quantity("linear (rotor) drag", "N/(m/s)", ge=0, le=10)
+    quadratic_n_s2_m2: float = quantity("quadratic (body) drag", "N/(m/s)²", ge=0, le=10)
+    angular_n_m_s: float = quantity("rotational damping", "N m/(rad/s)", ge=0, le=1)
+
+
+class Battery(ProfileModel):
+    """A LiPo pack: open-circuit voltage linear in the charge, internal resistance."""
+
+    cells: int = quantity("cells in series", "1", ge=1, le=24)
+    capacity_mah: float = quantity("capacity", "mAh", gt=10, le=1_000_000)
+    cell_full_v: float = quantity("open-circuit voltage of a full cell", "V", gt=3, le=4.5)
+    cell_empty_v: float = quantity("open-circuit voltage of an empty cell", "V", gt=2.5, le=4)
+    resistance_ohm: float = quantity("internal resistance of the pack", "ohm", ge=0, le=1)
+
+
+class Power(ProfileModel):
+    """Nine-coefficient power model of the paper (eq. 1; Tseng et al., arXiv 1703.10049), SI units.
+
+    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m + b8 vxy.w + b9
+    """
+
+    b1_vxy: float = quantity("horizontal speed", "W/(m/s)", ge=-1000, le=1000)
+    b2_axy: float = quantity("horizontal acceleration", "W/(m/s²)", ge=-1000, le=1000)
+    b3_vxy_axy: float = quantity("product of the two", "W/(m²/s³)", ge=-1000, le=1000)
+    b4_vz: float = quantity("vertical speed", "W/(m/s)", ge=-1000, le=1000)
+    b5_az: float = quantity("vertical acceleration", "W/(m/s²)", ge=-1000, le=1000)
+    b6_vz_az: float = quantity("product of the two", "W/(m²/s³)", ge=-1000, le=1000)
+    b7_payload: float = quantity("payload", "W/g", ge=-100, le=100)
+    b8_wind: float = quantity("ground velocity . wind", "W/(m²/s²)", ge=-1000, le=1000)
+    b9_hover: float = quantity("hover", "W", ge=0, le=100_000)
+    payload_g: float = quantity("payload m of the seventh term", "g", ge=0, le=100_000, default=0.0)
+
+
+class Camera(ProfileModel):
+    """The forward depth camera."""
+
+    width_px: int = quantity("image width", "px", ge=8, le=640)
+    height_px: int = quantity("image height", "px", ge=6, le=480)
+    horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
+    range_m: float = quantity("farthest depth returned", "m", gt=0.5, le=65)
+    rate_hz: float = quantity("frames a second", "Hz", ge=1, le=125)
+    forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
+    up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
+    pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
+
+
+class Imu(ProfileModel):
+    """Accelerometer and gyroscope: white noise, bias at start, bias random walk."""
+
+    accel_noise_m_s2: float = quantity("white noise, sd of a sample", "m/s²", ge=0, le=10)
+    accel_bias_m_s2: float = quantity("start bias, sd", "m/s²", ge=0, le=2)
+    accel_walk_m_s2_sqrt_s: float = quantity("bias random walk", "m/s²/sqrt(s)", ge=0, le=0.1)
+    gyro_noise_rad_s: float = quantity("white noise, sd of a sample", "rad/s", ge=0, le=1)
+    gyro_bias_rad_s: float = quantity("start bias, sd", "rad/s", ge=0, le=0.2)
+    gyro_walk_rad_s_sqrt_s: float = quantity("bias random walk", "rad/s/sqrt(s)", ge=0, le=0.01)
+
+
+class Magnetometer(ProfileModel):
+    """Three-axis magnetometer, calibrated."""
+
+    rate_hz: float = quantity("sample rate", "Hz", gt=0, le=250)
+    noise_gauss: float = quantity("white noise, sd of a sample", "gauss", ge=0, le=0.1)
+
+
+class Barometer(ProfileModel):
+    """Static pressure sensor."""
+
+    rate_hz: float = quantity("sample rate", "Hz", gt=0, le=250)
+    noise_pa: float = quantity("white noise, sd of a sample", "Pa", ge=0, le=100)
+    drift_pa_sqrt_s: float = quantity("drift random walk", "Pa/sqrt(s)", ge=0, le=10)
+
+
+class Gps(ProfileModel):
+    """GPS receiver."""
+
+    rate_hz: float = quantity("fixes a second", "Hz", ge=1, le=25)
+    horizontal_noise_m: float = quantity("white noise, sd", "m", ge=0, le=10)
+    vertical_noise_m: float = quantity("white noise, sd", "m", ge=0, le=20)
+    velocity_noise_m_s: float = quantity("white noise, sd per axis", "m/s", ge=0, le=2)
+    drift_m_sqrt_s: float = quantity("position drift random walk", "m/sqrt(s)", ge=0, le=1)
+    drift_time_constant_s: float = quantity("the drift decays with", "s", gt=1, le=10_000)
+
+
+class Sensors(ProfileModel):
+    """The sensor suite."""
+
+    imu: Imu
+    magnetometer: Magnetometer
+    barometer: Barometer
+    gps: Gps
+
+
+class VehicleProfile(ProfileModel):
+    """Everything about the aircraft that is not its companion computer."""
+
+    description: str = Field(description="one line for people")
+    source: str = Field(description="where the numbers come from")
+    body: Body
+    rotor: Rotor
+    drag: Drag
+    battery: Battery
+    power: Power
+    camera: Camera
+    sensors: Sensors
+    parameters: dict[str, float | int] = Field(
+        default_factory=dict, description="PX4-named parameters that differ from the defaults"
+    )

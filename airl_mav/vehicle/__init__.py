@@ -1,0 +1,1 @@
+"""The airframe as scalar numba kernels, one vehicle or N: rotors, body, power, battery."""

@@ -1,0 +1,45 @@
+"""The airframe's constants as one typed row for the kernels."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from airl_mav.profiles.vehicle import VehicleProfile
+
+
+class Airframe(NamedTuple):
+    """Constants of body, rotors and drag; SI. Fields as in `profiles.vehicle`."""
+
+    mass: float
+    inertia_xx: float
+    inertia_yy: float
+    inertia_zz: float
+    arm_forward: float
+    arm_right: float
+    thrust_max: float
+    torque_per_thrust: float
+    rotor_time_constant: float
+    thrust_curve: float
+    drag_linear: float
+    drag_quadratic: float
+    drag_angular: float
+
+    @classmethod
+    def from_profile(cls, profile: VehicleProfile) -> Airframe:
+        """Collect the constants of a vehicle profile."""
+        body, rotor, drag = profile.body, profile.rotor, profile.drag
+        return cls(
+            body.mass_kg,
+            body.inertia_xx_kg_m2,
+            body.inertia_yy_kg_m2,
+            body.inertia_zz_kg_m2,
+            rotor.arm_forward_m,
+            rotor.arm_right_m,
+            rotor.thrust_max_n,
+            rotor.torque_per_thrust_m,
+            rotor.time_constant_s,
+            rotor.thrust_curve,
+            drag.linear_n_s_m,
+            drag.quadratic_n_s2_m2,
+            drag.angular_n_m_s,
+        )

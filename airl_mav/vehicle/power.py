@@ -1,0 +1,36 @@
+"""Electrical power of the airframe: the paper's nine-coefficient model, SI units."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.vehicle.rotation import Vec
+
+Coefficients = tuple[float, float, float, float, float, float, float, float, float]
+
+
+@njit(cache=True, nogil=True)
+def power_w(
+    velocity: Vec, acceleration: Vec, wind: Vec, payload_g: float, b: Coefficients
+) -> float:
+    """Return the power [W] in flight, never below 0.
+
+    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m
+    + b8 vxy.w + b9 (Krishnan et al. 2021, eq. 1, after Tseng et al., arXiv 1703.10049).
+
+    Args:
+        velocity: NED [m/s].
+        acceleration: NED, gravity removed [m/s²].
+        wind: NED [m/s].
+        payload_g: Payload [g].
+        b: b1..b9.
+    """
+    vxy = math.hypot(velocity[0], velocity[1])
+    axy = math.hypot(acceleration[0], acceleration[1])
+    vz = abs(velocity[2])
+    az = abs(acceleration[2])
+    tail = velocity[0] * wind[0] + velocity[1] * wind[1]
+    p = b[0] * vxy + b[1] * axy + b[2] * vxy * axy + b[3] * vz + b[4] * az + b[5] * vz * az
+    return max(0.0, p + b[6] * payload_g + b[7] * tail + b[8])

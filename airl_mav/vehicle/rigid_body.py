@@ -1,0 +1,73 @@
+"""Forces on the airframe and the free rigid body, in NED / FRD.
+
+The integrator is the one of Bullet's multi-body (semi-implicit Euler, explicit gyroscopic torque,
+exponential map for the attitude), so that the batch twin and the pybullet plant agree to
+rounding while free of contact.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.constants import GRAVITY_M_S2
+from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, normalize, rotate
+
+
+@njit(cache=True, nogil=True)
+def drag_force(velocity: Vec, wind: Vec, airframe: Airframe) -> Vec:
+    """Return the drag NED [N] at a ground velocity and wind NED [m/s]."""
+    x, y, z = velocity[0] - wind[0], velocity[1] - wind[1], velocity[2] - wind[2]
+    k = airframe.drag_linear + airframe.drag_quadratic * math.sqrt(x * x + y * y + z * z)
+    return (-k * x, -k * y, -k * z)
+
+
+@njit(cache=True, nogil=True)
+def step(
+    position: Vec,
+    velocity: Vec,
+    q: Quat,
+    omega: Vec,
+    force: Vec,
+    torque: Vec,
+    airframe: Airframe,
+    dt: float,
+) -> tuple[Vec, Vec, Quat, Vec]:
+    """Advance a free body by dt [s].
+
+    Args:
+        position: NED [m].
+        velocity: NED [m/s].
+        q: Attitude body -> world.
+        omega: Angular velocity FRD [rad/s].
+        force: All forces but gravity, NED [N].
+        torque: FRD [N m].
+        airframe: Mass and inertia.
+        dt: Step [s].
+
+    Returns:
+        Position, velocity, attitude, angular velocity after the step.
+    """
+    m = airframe.mass
+    vx = velocity[0] + force[0] / m * dt
+    vy = velocity[1] + force[1] / m * dt
+    vz = velocity[2] + (force[2] / m + GRAVITY_M_S2) * dt
+    ix, iy, iz = airframe.inertia_xx, airframe.inertia_yy, airframe.inertia_zz
+    p, r_, s = omega
+    # Euler's equations: I dw/dt = torque - w x (I w)
+    wx = p + (torque[0] - (iz - iy) * r_ * s) / ix * dt
+    wy = r_ + (torque[1] - (ix - iz) * s * p) / iy * dt
+    wz = s + (torque[2] - (iy - ix) * p * r_) / iz * dt
+    # Bullet keeps the new angular velocity in world axes of the old attitude while it turns.
+    world = rotate(q, (wx, wy, wz))
+    dq = exponential((world[0] * dt, world[1] * dt, world[2] * dt))
+    q_new = normalize(multiply(dq, q))
+    body = rotate((q_new[0], -q_new[1], -q_new[2], -q_new[3]), world)
+    return (
+        (position[0] + vx * dt, position[1] + vy * dt, position[2] + vz * dt),
+        (vx, vy, vz),
+        q_new,
+        body,
+    )

@@ -1,0 +1,54 @@
+"""Rotors: command -> speed (first-order lag) -> thrust and torque.
+
+PX4 quad-X order: 0 front right, 1 rear left, 2 front left, 3 rear right; 0 and 1 turn
+counter-clockwise seen from above. Speeds are fractions of the speed at full command.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.rotation import Vec
+
+N_ROTORS = 4
+# Position of each rotor relative to the centre of mass, as signs of the arms (forward, right).
+FORWARD_SIGN = (1.0, -1.0, 1.0, -1.0)
+RIGHT_SIGN = (1.0, -1.0, -1.0, 1.0)
+# Reaction torque on the body about the down axis: a rotor turning counter-clockwise pushes the
+# body clockwise, which is positive yaw.
+YAW_SIGN = (1.0, 1.0, -1.0, -1.0)
+
+
+@njit(cache=True, nogil=True)
+def steady_speed(command: float, thrust_curve: float) -> float:
+    """Return the speed fraction 0..1 that a command 0..1 settles at (thrust ~ speed²)."""
+    u = min(1.0, max(0.0, command))
+    return math.sqrt(thrust_curve * u * u + (1.0 - thrust_curve) * u)
+
+
+@njit(cache=True, nogil=True)
+def spin(speed: float, command: float, airframe: Airframe, dt: float) -> float:
+    """Return the speed fraction after dt [s]: exact step response of a first-order lag."""
+    target = steady_speed(command, airframe.thrust_curve)
+    return target + (speed - target) * math.exp(-dt / airframe.rotor_time_constant)
+
+
+@njit(cache=True, nogil=True)
+def wrench(s0: float, s1: float, s2: float, s3: float, airframe: Airframe) -> tuple[float, Vec]:
+    """Return collective thrust [N] along body up, and the body torque FRD [N m]."""
+    speeds = (s0, s1, s2, s3)
+    thrust = 0.0
+    roll = 0.0
+    pitch = 0.0
+    yaw = 0.0
+    for i in range(N_ROTORS):
+        t = airframe.thrust_max * speeds[i] * speeds[i]
+        thrust += t
+        # torque = r x F with F = (0, 0, -t) at r = (forward, right, 0)
+        roll -= RIGHT_SIGN[i] * airframe.arm_right * t
+        pitch += FORWARD_SIGN[i] * airframe.arm_forward * t
+        yaw += YAW_SIGN[i] * airframe.torque_per_thrust * t
+    return thrust, (roll, pitch, yaw)

@@ -1,0 +1,111 @@
+"""Timers that watch a flight and turn into commander events. All in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from airl_mav.constants import US_PER_S
+from firmware_sim.autopilot.commander import Event, Flight, Phase
+from firmware_sim.autopilot.state import Message, Mode, Severity
+
+# COM_OBL_RC_ACT -> event. 1 and 2 (altitude, manual) need a pilot's sticks as 0 does; 6 is
+# flight termination.
+OFFBOARD_LOSS = {
+    0: Event.SETPOINT_LOST_POSITION,
+    1: Event.SETPOINT_LOST_POSITION,
+    2: Event.SETPOINT_LOST_POSITION,
+    3: Event.SETPOINT_LOST_RETURN,
+    4: Event.SETPOINT_LOST_LAND,
+    5: Event.SETPOINT_LOST_HOLD,
+    6: Event.SETPOINT_LOST_DISARM,
+    7: Event.SETPOINT_LOST_DISARM,
+}
+
+
+class Watch:
+    """Setpoint age, time on the ground, battery, ground station."""
+
+    def __init__(self, value: Callable[[str], float]) -> None:
+        """Take a lookup of PX4 parameter names."""
+        self._value = value
+        self._setpoint_us: int | None = None
+        self._gcs_us: int | None = None
+        self._gcs_lost = False
+        self._standing_since_us: int | None = None
+        self._flown = False
+        self._battery_level = 0
+        self._offboard_lost = False
+
+    def setpoint(self, time_us: int) -> None:
+        """Note a valid offboard setpoint."""
+        self._setpoint_us = time_us
+
+    def gcs_heartbeat(self, time_us: int) -> None:
+        """Note a ground station's heartbeat."""
+        self._gcs_us = time_us
+
+    def setpoint_fresh(self, time_us: int) -> bool:
+        """Return whether the newest setpoint is younger than COM_OF_LOSS_T."""
+        limit_us = self._value("COM_OF_LOSS_T") * US_PER_S
+        return self._setpoint_us is not None and time_us - self._setpoint_us <= limit_us
+
+    def events(self, flight: Flight, time_us: int, battery: float) -> Iterator[Event | Message]:
+        """Yield what has become due at `time_us`; `battery` is the state of charge 0..1."""
+        yield from self._offboard(flight, time_us)
+        yield from self._ground(flight, time_us)
+        yield from self._battery(battery)
+        yield from self._ground_station(time_us)
+
+    def _offboard(self, flight: Flight, time_us: int) -> Iterator[Event]:
+        armed = flight.phase >= Phase.GROUND
+        fresh = self.setpoint_fresh(time_us)
+        if not armed or flight.intended is not Mode.OFFBOARD:
+            self._offboard_lost = False
+        elif not self._offboard_lost and flight.mode is Mode.OFFBOARD and not fresh:
+            self._offboard_lost = True
+            yield OFFBOARD_LOSS[int(self._value("COM_OBL_RC_ACT"))]
+        elif self._offboard_lost and fresh:
+            self._offboard_lost = False
+            yield Event.SETPOINT_BACK
+
+    def _ground(self, flight: Flight, time_us: int) -> Iterator[Event]:
+        if flight.phase is not Phase.GROUND:
+            self._standing_since_us = None
+            self._flown = flight.phase is Phase.AIR
+            return
+        if self._standing_since_us is None:
+            self._standing_since_us = time_us
+        name = "COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT"
+        limit_s = self._value(name)
+        if limit_s > 0.0 and time_us - self._standing_since_us >= limit_s * US_PER_S:
+            yield Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
+
+    def _battery(self, remaining: float) -> Iterator[Event | Message]:
+        limits = [self._value(n) for n in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")]
+        level = sum(remaining <= limit for limit in limits)
+        if level <= self._battery_level:
+            return
+        self._battery_level = level
+        action = int(self._value("COM_LOW_BAT_ACT"))
+        if level == 1:
+            yield Message(Severity.WARNING, "Low battery level, return advised")
+        elif level == 2:
+            yield Message(Severity.CRITICAL, "Critical battery level, land now")
+            if action == 2:
+                yield Event.BATTERY_LAND
+            elif action == 3:
+                yield Event.BATTERY_RETURN
+        else:
+            yield Message(Severity.EMERGENCY, "Dangerously low battery level! Land immediately!")
+            if action in (2, 3):
+                yield Event.BATTERY_LAND
+
+    def _ground_station(self, time_us: int) -> Iterator[Message]:
+        if self._gcs_us is None:
+            return
+        lost = time_us - self._gcs_us > self._value("COM_DL_LOSS_T") * US_PER_S
+        if lost and not self._gcs_lost:
+            yield Message(Severity.INFO, "Connection to ground station lost")
+        elif self._gcs_lost and not lost:
+            yield Message(Severity.INFO, "GCS connection regained")
+        self._gcs_lost = lost

@@ -1,0 +1,83 @@
+"""The autopilot as the MAVLink services see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from firmware_sim.autopilot.state import AutopilotState, Message, Mode, Result, Setpoint
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """One parameter as stored."""
+
+    name: str
+    value: int | float
+    """int for INT32 parameters, float for REAL32."""
+    index: int
+
+
+class ParameterStore(Protocol):
+    """PX4-named parameters."""
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        ...
+
+    def by_name(self, name: str) -> ParameterValue | None:
+        """Return a parameter, or None when there is no such name."""
+        ...
+
+    def by_index(self, index: int) -> ParameterValue | None:
+        """Return a parameter, or None when the index is out of range."""
+        ...
+
+    def set(self, name: str, value: int | float) -> ParameterValue | None:
+        """Store a value (clamped to the parameter's range) and return what is stored now."""
+        ...
+
+
+class AutopilotPort(Protocol):
+    """Commands in, state out. Every call happens between two ticks, on one thread."""
+
+    @property
+    def parameters(self) -> ParameterStore:
+        """The parameter store."""
+        ...
+
+    def state(self) -> AutopilotState:
+        """Return the snapshot after the newest tick."""
+        ...
+
+    def take_messages(self) -> list[Message]:
+        """Return texts for the operator since the last call."""
+        ...
+
+    def arm(self, *, force: bool) -> Result:
+        """Ask to arm."""
+        ...
+
+    def disarm(self, *, force: bool) -> Result:
+        """Ask to disarm; force = kill, also in the air."""
+        ...
+
+    def takeoff(self, altitude_m: float | None) -> Result:
+        """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
+        ...
+
+    def set_mode(self, mode: Mode) -> Result:
+        """Ask for HOLD, OFFBOARD, LAND, RETURN, TAKEOFF or POSITION."""
+        ...
+
+    def set_home_here(self) -> Result:
+        """Make the present position home (MAV_CMD_DO_SET_HOME with param1 = 1)."""
+        ...
+
+    def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
+        """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
+        ...
+
+    def gcs_heartbeat(self, time_us: int) -> None:
+        """A ground station was heard."""
+        ...

@@ -1,0 +1,153 @@
+"""What the autopilot knows and reports: plain data for MAVLink, the recorder and tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.frames import Geodetic
+from firmware_sim.interfaces import BatterySample, GpsFix
+
+Vector = NDArray[np.float64]
+
+
+class Arming(IntEnum):
+    """Arming state."""
+
+    BOOT = 0
+    """Estimator not yet converged: cannot arm."""
+    STANDBY = 1
+    ARMED = 2
+
+
+class Mode(IntEnum):
+    """Flight modes."""
+
+    HOLD = 0
+    TAKEOFF = 1
+    OFFBOARD = 2
+    LAND = 3
+    RETURN = 4
+    POSITION = 5
+    """Position Control: only as the offboard-loss fallback. Without a pilot's sticks PX4 was
+    measured to brake and to descend to the ground."""
+
+
+class Landed(IntEnum):
+    """Landing detector."""
+
+    ON_GROUND = 0
+    TAKEOFF = 1
+    IN_AIR = 2
+    LANDING = 3
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY of a STATUSTEXT."""
+
+    EMERGENCY = 0
+    ALERT = 1
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+    DEBUG = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A text for the operator (STATUSTEXT)."""
+
+    severity: Severity
+    text: str
+
+
+class Result(IntEnum):
+    """Answer to a command; the numbers are MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """An offboard setpoint, already in local NED. NaN = not commanded on that axis."""
+
+    position: Vector  # (3,) NED [m]
+    velocity: Vector  # (3,) NED [m/s]
+    yaw: float
+    """Heading [rad]."""
+    yaw_rate: float
+    """[rad/s], positive clockwise seen from above."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The estimator's output."""
+
+    time_us: int
+    position: Vector  # (3,) local NED [m]
+    velocity: Vector  # (3,) NED [m/s]
+    acceleration: Vector  # (3,) NED, gravity removed [m/s²]
+    quaternion: Vector  # (4,) body FRD -> NED
+    angular_velocity: Vector  # (3,) FRD, bias removed [rad/s]
+    gyro_bias: Vector  # (3,) [rad/s]
+    accel_bias: Vector  # (3,) [m/s²]
+    sigma: Vector
+    """(16,) standard deviations: position, velocity, attitude (3 each), gyro bias, accelerometer
+    bias (3 each), barometer offset."""
+    innovation_ratio: Vector
+    """(4,) newest normalised innovation (test ratio, 1 = rejection gate) of horizontal velocity
+    and position (GPS), height (barometer), magnetometer, GPS height/vertical speed."""
+    healthy: bool
+    """Converged: may be armed and flown on."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommanderStatus:
+    """The commander's public face."""
+
+    arming: Arming
+    mode: Mode
+    """What flies now; a failsafe may differ from what the user asked."""
+    intended_mode: Mode
+    landed: Landed
+    failsafe: bool
+
+
+@dataclass(slots=True)
+class AutopilotState:
+    """One consistent snapshot after a tick."""
+
+    time_us: int
+    estimate: Estimate
+    status: CommanderStatus
+    setpoint: Setpoint
+    """What the controller tracks (in every mode)."""
+    attitude_setpoint: Vector  # (4,) body -> NED
+    rate_setpoint: Vector  # (3,) FRD [rad/s]
+    thrust_setpoint: float
+    """Collective, 0..1."""
+    motors: tuple[float, float, float, float]
+    accel: Vector  # (3,) newest raw sample, FRD [m/s²]
+    gyro: Vector  # (3,) newest raw sample, FRD [rad/s]
+    mag: Vector  # (3,) newest raw sample, FRD [gauss]
+    pressure_hpa: float
+    temperature_c: float
+    battery: BatterySample
+    gps: GpsFix | None
+    """Newest fix; None before the first."""
+    home: Geodetic | None
+    """Set when the estimator's origin is set and at arming; None before."""
+    origin: Geodetic | None
+    """The point of the globe where local NED is zero; None before the first fix."""
+    load: float = 0.0
+    """Share of the tick spent computing, 0..1."""
+    messages: list[Message] = field(default_factory=list)

@@ -1,0 +1,76 @@
+"""The seam between plant and autopilot: PX4's simulator interface as plain data.
+
+A plant turns motor commands into sensor samples; an autopilot turns sensor samples into motor
+commands. Real firmware sits behind the same two messages (HIL_SENSOR / HIL_ACTUATOR_CONTROLS).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.frames import Geodetic
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """One GPS solution."""
+
+    position: Geodetic
+    velocity_ned: Vector  # (3,) [m/s]
+    eph_m: float
+    """Horizontal standard deviation [m]."""
+    epv_m: float
+    """Vertical standard deviation [m]."""
+    satellites: int
+    fix_type: int = 3
+    """GPS_FIX_TYPE: 3 = 3-D fix."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatterySample:
+    """What a power module reports."""
+
+    voltage_v: float
+    current_a: float
+    consumed_mah: float
+    remaining: float
+    """State of charge 0..1."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSample:
+    """Everything measured at one tick; slower sensors are None between their samples."""
+
+    time_us: int
+    accel: Vector  # (3,) specific force FRD [m/s²], (0, 0, -9.81) at rest
+    gyro: Vector  # (3,) FRD [rad/s]
+    temperature_c: float
+    battery: BatterySample
+    mag: Vector | None = None  # (3,) FRD [gauss]
+    pressure_hpa: float | None = None
+    """Static pressure [hPa]."""
+    gps: GpsFix | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ActuatorControls:
+    """Motor commands, PX4 quad-X order: front right, rear left, front left, rear right."""
+
+    time_us: int
+    motors: tuple[float, float, float, float]
+    """Normalised commands 0..1; all 0 while disarmed."""
+    armed: bool
+
+
+class Autopilot(Protocol):
+    """A flight controller: the built-in one, or a bridge to real firmware."""
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Advance to the sample's time and return the motor commands to hold until the next."""
+        ...
