@@ -1,0 +1,267 @@
+"""The environment generator: (spec, seed) -> Arena, a pure function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from airl_mav.arena.bodies import Bodies, draw_bodies
+from airl_mav.arena.footprints import (
+    Boxes,
+    Floats,
+    bounding_boxes,
+    footprint_areas,
+    inner,
+    join,
+)
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.arena.passage import passage_exists
+from airl_mav.arena.placement import TRIES, NoRoomError, draw_place, place_all
+from airl_mav.arena.tours import draw_tour
+from airl_mav.arena.zones import draw_goal, zone_radius_m
+from airl_mav.errors import UsageError
+from airl_mav.profiles.arena import ArenaSpec
+
+LAYOUTS = 20
+"""Whole layouts drawn before a request is refused."""
+
+GOALS_PER_LAYOUT = 4
+"""Goals drawn in a layout before it is given up for want of a way to one."""
+
+STARTS_PER_TOUR = 16
+"""Places tried for a moving obstacle that cannot leave where it stands."""
+
+
+class _Stream(IntEnum):
+    """Independent random streams of one seed: a change to one draw leaves the others alone."""
+
+    COUNT = 0
+    STATIC = 1
+    GOAL = 2
+    MOVING = 3
+
+
+@dataclass(frozen=True)
+class _Request:
+    """What stays the same over all layouts of one call."""
+
+    spec: ArenaSpec
+    bounds: Bounds
+    counts: tuple[int, int]
+    ring_m: tuple[float, float]
+    vehicle_width_m: float
+
+    @property
+    def start_box(self) -> Boxes:
+        """What obstacles leave free around the start."""
+        return _around(np.zeros(2), self.spec.start.clearance_m)
+
+
+def generate(
+    spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None = None
+) -> Arena:
+    """Make the arena of a seed. Same arguments, same arena, on any machine with this numpy.
+
+    The obstacles do not depend on the zone unless a first layout had no room for the goal.
+
+    Args:
+        spec: Knobs.
+        seed: Not negative. Runs of `spec.count_period` seeds share the numbers of obstacles.
+        name: Goes into the arena and into messages.
+        vehicle_width_m: The way from start to goal is at least this wide [m].
+        zone: Curriculum zone that bounds the goal; None means the largest.
+
+    Raises:
+        UsageError: A wrong argument, or no such arena was found in LAYOUTS layouts: says why.
+    """
+    if seed < 0:
+        raise UsageError(f"seed = {seed}: accepted: value >= 0")
+    if not vehicle_width_m > 0.0:
+        raise UsageError(f"vehicle_width_m = {vehicle_width_m:g}: accepted: value > 0 m")
+    request = _Request(
+        spec=spec,
+        bounds=local_bounds(spec),
+        counts=_draw_counts(spec, seed),
+        ring_m=(spec.goal.min_distance_m, zone_radius_m(spec, zone)),
+        vehicle_width_m=vehicle_width_m,
+    )
+    _check_fixed_goal(request, zone)
+    static_rng, goal_rng, moving_rng = (
+        _rng(seed, stream) for stream in (_Stream.STATIC, _Stream.GOAL, _Stream.MOVING)
+    )
+    failure = NoRoomError("", -1)
+    for _ in range(LAYOUTS):
+        try:
+            static = _draw_static(static_rng, request)
+            goal = _draw_reachable_goal(goal_rng, request, static)
+            moving, tours = _draw_moving(moving_rng, request, static)
+        except NoRoomError as error:
+            failure = max(failure, error, key=lambda each: each.progress)
+            continue
+        return Arena(
+            name=name,
+            seed=seed,
+            bounds=request.bounds,
+            wall_colour=spec.wall_colour,
+            obstacles=_concatenate(static, moving),
+            tours=tours,
+            goal=goal,
+        )
+    raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
+
+
+def local_bounds(spec: ArenaSpec) -> Bounds:
+    """Return the walls in local NED, origin at the start."""
+    return Bounds(
+        north_min=-spec.start.north_m,
+        north_max=spec.size.north_m - spec.start.north_m,
+        east_min=-spec.start.east_m,
+        east_max=spec.size.east_m - spec.start.east_m,
+        height=spec.size.height_m,
+    )
+
+
+def free_area_fraction(arena: Arena) -> float:
+    """Return the share of the floor that no static obstacle covers, seen from above."""
+    b = arena.bounds
+    floor = (b.north_max - b.north_min) * (b.east_max - b.east_min)
+    return 1.0 - float(footprint_areas(arena.obstacles)[: arena.n_static].sum()) / floor
+
+
+def _rng(seed: int, stream: _Stream) -> np.random.Generator:
+    """Return the generator of one stream."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+
+
+def _draw_counts(spec: ArenaSpec, seed: int) -> tuple[int, int]:
+    """Return the numbers of static and moving obstacles, shared within a count period."""
+    rng = _rng(seed // spec.count_period, _Stream.COUNT)
+    static = rng.integers(*spec.static.count, endpoint=True)
+    moving = rng.integers(*spec.moving.count, endpoint=True)
+    return int(static), int(moving)
+
+
+def _check_fixed_goal(request: _Request, zone: int | None) -> None:
+    """Refuse a fixed goal outside the asked zone; the spec has checked it against the walls."""
+    fixed, radius = request.spec.goal.fixed, request.ring_m[1]
+    if fixed is None or zone is None:
+        return
+    if (distance := float(np.hypot(*fixed))) > radius:
+        raise UsageError(
+            f"goal.north_m = {fixed[0]:g}, goal.east_m = {fixed[1]:g}: fixed {distance:.1f} m from "
+            f"the start; accepted: value <= {radius:g} m in zone {zone}"
+        )
+
+
+def _draw_static(rng: np.random.Generator, request: _Request) -> Obstacles:
+    """Draw and place the static obstacles."""
+    spec, (n, _) = request.spec, request.counts
+    bodies = draw_bodies(rng, n, spec.static, spec.flight_altitude_m)
+    keep_off = request.start_box
+    if spec.goal.fixed is not None:
+        keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
+    try:
+        places = place_all(
+            rng, bodies.bounding_half, keep_off, request.bounds, spec.min_clearance_m
+        )
+    except NoRoomError as error:
+        floor = spec.size.north_m * spec.size.east_m
+        taken = 4.0 * np.prod(bodies.bounding_half + spec.min_clearance_m / 2.0, axis=1).sum()
+        raise NoRoomError(
+            f"too dense: {error.progress} of {n} static obstacles found a place, none for the next "
+            f"in {TRIES} tries; with half of min_clearance_m {spec.min_clearance_m:g} around each, "
+            f"all would take {taken / floor:.0%} of the {spec.size.north_m:g} x "
+            f"{spec.size.east_m:g} m floor",
+            error.progress,
+        ) from None
+    return bodies.at(places)
+
+
+def _draw_reachable_goal(rng: np.random.Generator, request: _Request, static: Obstacles) -> Floats:
+    """Return the fixed goal, or draw a free one, with a way to it."""
+    spec, progress = request.spec, len(static)
+    keep_off = bounding_boxes(static).grown(spec.goal.clearance_m)
+    for _ in range(GOALS_PER_LAYOUT):
+        goal = (
+            draw_goal(rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m)
+            if spec.goal.fixed is None
+            else np.array(spec.goal.fixed)
+        )
+        if goal is None:
+            near, far = request.ring_m
+            raise NoRoomError(
+                f"no free place for the goal {near:g} to {far:g} m from the start, "
+                f"goal.clearance_m {spec.goal.clearance_m:g}, among {len(static)} static obstacles",
+                progress,
+            )
+        if passage_exists(request.bounds, static, goal, request.vehicle_width_m):
+            return goal
+    raise NoRoomError(
+        f"no way {request.vehicle_width_m:g} m wide from the start to the goal among "
+        f"{len(static)} static obstacles",
+        progress,
+    )
+
+
+def _draw_moving(
+    rng: np.random.Generator, request: _Request, static: Obstacles
+) -> tuple[Obstacles, tuple[Tour, ...]]:
+    """Draw the moving obstacles where they are at time 0, and their tours."""
+    spec, (_, n) = request.spec, request.counts
+    bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
+    places = np.empty((n, 2))
+    tours = []
+    for i in range(n):
+        tour = _draw_walk(rng, request, static, bodies, places, i)
+        if tour is None:
+            raise NoRoomError(
+                f"too dense: {i} of {n} moving obstacles found a place and a tour among "
+                f"{len(static)} static ones",
+                len(static) + i,
+            )
+        places[i] = tour.points[0]
+        tours.append(tour)
+    return bodies.at(places), tuple(tours)
+
+
+def _draw_walk(
+    rng: np.random.Generator,
+    request: _Request,
+    static: Obstacles,
+    bodies: Bodies,
+    places: Floats,
+    i: int,
+) -> Tour | None:
+    """Draw the tour of the i-th moving obstacle, clear at time 0 of the i placed before it."""
+    spec, half = request.spec, bodies.bounding_half[i]
+    gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
+    standing = bounding_boxes(static)
+    others = Boxes(places[:i], bodies.bounding_half[:i])
+    keep_off = join(request.start_box, standing.grown(max(gap, walking_gap)), others.grown(gap))
+    walls = join(request.start_box, standing.grown(walking_gap)).grown(half)
+    for _ in range(STARTS_PER_TOUR):
+        start = draw_place(rng, half, keep_off, request.bounds, max(gap, walking_gap))
+        if start is None:
+            return None
+        corners = inner(request.bounds, half + walking_gap)
+        tour = draw_tour(rng, start, walls, corners, spec.moving)
+        if tour is not None:
+            return tour
+    return None
+
+
+def _around(center: Floats, clearance: float) -> Boxes:
+    """Return the box that reaches `clearance` [m] from one point."""
+    return Boxes(center[None], np.full((1, 2), clearance))
+
+
+def _concatenate(static: Obstacles, moving: Obstacles) -> Obstacles:
+    """Return both, static ones first."""
+    return Obstacles(
+        *(
+            np.concatenate([getattr(static, field), getattr(moving, field)])
+            for field in ("shape", "center", "half_size", "yaw")
+        )
+    )

@@ -1,0 +1,105 @@
+"""Is there a way, wide enough for the vehicle, from the start to the goal? Never a wrong yes.
+
+Only what stands counts: walls and static obstacles, at their full footprint.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from airl_mav.arena.footprints import Floats, bounding_boxes, outside_all
+from airl_mav.arena.geometry import Bounds, Obstacles, Shape
+
+CELL_M = 0.25
+"""Raster pitch; coarser on a floor of more than CELLS_MAX cells."""
+
+CELLS_MAX = 250_000
+
+
+def passage_exists(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
+    """Return whether a disc of diameter `width_m` can be moved from the origin to `goal`.
+
+    Args:
+        bounds: The walls.
+        obstacles: Static obstacles.
+        goal: (2,) north, east [m].
+        width_m: Width of the vehicle [m].
+    """
+    return gaps_suffice(bounds, obstacles, goal, width_m) or raster_passage(
+        bounds, obstacles, goal, width_m
+    )
+
+
+def gaps_suffice(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
+    """Return whether every gap is wider than the vehicle; then every free place can be reached.
+
+    A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is
+    what remains for the vehicle's centre when no two boxes grown by half its width touch.
+    """
+    boxes = bounding_boxes(obstacles)
+    ends = np.stack([np.zeros(2), goal])
+    low = np.array([bounds.north_min, bounds.east_min])
+    high = np.array([bounds.north_max, bounds.east_max])
+    if ((ends - low <= width_m / 2.0) | (high - ends <= width_m / 2.0)).any():
+        return False
+    if not outside_all(ends, boxes.grown(width_m / 2.0)).all():
+        return False
+    to_walls = np.minimum(boxes.center - boxes.half - low, high - boxes.center - boxes.half)
+    if (to_walls <= width_m).any():
+        return False
+    gap: Floats = np.abs(boxes.center[:, None] - boxes.center) - boxes.half[:, None] - boxes.half
+    close = np.all(gap <= width_m, axis=2)
+    return int(close.sum()) == len(boxes)  # only each with itself
+
+
+def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
+    """Return whether free cells join the start's cell to the goal's, stepping along the axes.
+
+    A cell is free when its centre keeps half the width plus half a cell diagonal from everything:
+    no point of a step between two free cells, or of the last bit to the goal, is then too near.
+    """
+    area = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
+    cell = max(CELL_M, math.sqrt(area / CELLS_MAX))
+    margin = width_m / 2.0 + cell / math.sqrt(2.0)
+    # The origin is a cell's centre.
+    south, west = math.floor(bounds.north_min / cell), math.floor(bounds.east_min / cell)
+    north = cell * np.arange(south, math.ceil(bounds.north_max / cell) + 1, dtype=np.float64)
+    east = cell * np.arange(west, math.ceil(bounds.east_max / cell) + 1, dtype=np.float64)
+    free_north = (north - bounds.north_min > margin) & (bounds.north_max - north > margin)
+    free_east = (east - bounds.east_min > margin) & (bounds.east_max - east > margin)
+    free = free_north[:, None] & free_east
+    boxes = bounding_boxes(obstacles)
+    for i in range(len(obstacles)):
+        reach = boxes.half[i] + margin
+        rows = _window(north, boxes.center[i, 0], reach[0])
+        columns = _window(east, boxes.center[i, 1], reach[1])
+        free[rows, columns] &= _distance(obstacles, i, north[rows], east[columns]) > margin
+    label, _ = ndimage.label(free)
+    start = label[-south, -west]
+    end = label[round(float(goal[0]) / cell) - south, round(float(goal[1]) / cell) - west]
+    return bool(start != 0 and start == end)
+
+
+def _window(axis: Floats, center: float, reach: float) -> slice:
+    """Return the cells of an ascending axis within `reach` of `center`."""
+    first, last = np.searchsorted(axis, [center - reach, center + reach])
+    return slice(int(first), int(last) + 1)
+
+
+def _distance(obstacles: Obstacles, i: int, north: Floats, east: Floats) -> NDArray[np.float64]:
+    """Return the distance (rows, columns) [m] of cells to a footprint; not above 0 inside."""
+    dn = north[:, None] - obstacles.center[i, 0]
+    de = east[None, :] - obstacles.center[i, 1]
+    along, across = obstacles.half_size[i, :2]
+    if obstacles.shape[i] != Shape.BOX:
+        radial: NDArray[np.float64] = np.hypot(dn, de) - along
+        return radial
+    cos, sin = math.cos(obstacles.yaw[i]), math.sin(obstacles.yaw[i])
+    u = np.abs(dn * cos + de * sin) - along
+    v = np.abs(de * cos - dn * sin) - across
+    distance: NDArray[np.float64] = np.hypot(np.maximum(u, 0.0), np.maximum(v, 0.0))
+    return distance

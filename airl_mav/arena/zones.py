@@ -1,0 +1,69 @@
+"""Curriculum zones: discs around the start, each holding the smaller ones, that bound the goal."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from airl_mav.arena.footprints import Boxes, Floats, inner, outside_all
+from airl_mav.arena.geometry import Bounds
+from airl_mav.arena.placement import BATCH, BATCHES
+from airl_mav.errors import UsageError
+from airl_mav.profiles.arena import ArenaSpec
+
+
+def zone_radius_m(spec: ArenaSpec, zone: int | None) -> float:
+    """Return how far [m] from the start a goal of a zone may be; None means the largest zone.
+
+    Raises:
+        UsageError: There is no such zone.
+    """
+    if zone is None:
+        return spec.zones_m[-1]
+    if not 0 <= zone < len(spec.zones_m):
+        raise UsageError(
+            f"zone = {zone}: accepted: 0 <= value <= {len(spec.zones_m) - 1} "
+            f"(zones_m {[f'{radius:g}' for radius in spec.zones_m]} m)".replace("'", "")
+        )
+    return spec.zones_m[zone]
+
+
+def zone_of(spec: ArenaSpec, goal: Floats) -> int | None:
+    """Return the smallest zone that holds a goal (2,) [m from the start]; None: beyond them all."""
+    distance = math.hypot(goal[0], goal[1])
+    return next((k for k, radius in enumerate(spec.zones_m) if distance <= radius), None)
+
+
+def draw_goal(
+    rng: np.random.Generator,
+    bounds: Bounds,
+    keep_off: Boxes,
+    ring_m: tuple[float, float],
+    gap_m: float,
+) -> Floats | None:
+    """Draw a goal (2,) [m], uniform over the free floor at a distance within `ring_m`.
+
+    Args:
+        rng: Source of the draws.
+        bounds: The walls.
+        keep_off: Where it must not be; any clearance already added.
+        ring_m: Least and greatest distance from the start [m].
+        gap_m: Least gap to the walls [m].
+
+    Returns:
+        North, east from the start; None when no try was free.
+    """
+    nearest, farthest = ring_m
+    low, high = inner(bounds, gap_m)
+    low, high = np.maximum(low, -farthest), np.minimum(high, farthest)
+    if (low > high).any():
+        return None
+    for _ in range(BATCHES):
+        points = rng.uniform(low, high, size=(BATCH, 2))
+        distance = np.hypot(points[:, 0], points[:, 1])
+        free = (distance >= nearest) & (distance <= farthest) & outside_all(points, keep_off)
+        if free.any():
+            goal: Floats = points[int(free.argmax())]
+            return goal
+    return None

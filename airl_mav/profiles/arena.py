@@ -1,0 +1,240 @@
+"""The arena specification: the knobs of the environment generator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+from pydantic import Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+ShapeName = Literal["box", "cylinder", "sphere"]
+Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
+
+SPHERE_OFFSET = 0.5
+"""A sphere's centre is at most this share of its radius off the flight altitude."""
+
+
+@dataclass(frozen=True)
+class Each:
+    """Range of every number of a tuple field. The bounds carry pydantic's names for `range_of`."""
+
+    ge: float
+    le: float
+    ascending: bool = False
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Put the checks before and behind the field's own type."""
+        args = get_args(source)
+        length = None if Ellipsis in args else len(args)
+        inner = core_schema.no_info_after_validator_function(self.check, handler(source))
+
+        def listed(value: Any) -> Any:
+            if not isinstance(value, list | tuple) or len(value) != (length or len(value) or -1):
+                raise ValueError(
+                    f"{value!r}; accepted: a list of {length or 'one or more'} numbers"
+                )
+            return value
+
+        return core_schema.no_info_before_validator_function(listed, inner)
+
+    def check(self, values: Numbers) -> Numbers:
+        """Return `values`, or raise when one is out of range or they do not ascend."""
+        if not all(self.ge <= value <= self.le for value in values):
+            raise PydanticCustomError("out_of_range", "out of range")
+        if self.ascending and list(values) != sorted(values):
+            raise ValueError(f"{list(values)}; accepted: numbers in ascending order")
+        return values
+
+
+class Size(ProfileModel):
+    """The floor rectangle and the walls on its edges."""
+
+    north_m: float = quantity("length of the floor, south to north", "m", ge=5, le=500, default=50)
+    east_m: float = quantity("width of the floor, west to east", "m", ge=5, le=500, default=50)
+    height_m: float = quantity("height of the walls", "m", ge=1, le=50, default=5)
+
+
+class Start(ProfileModel):
+    """Where the vehicle takes off, heading north."""
+
+    north_m: float = quantity("distance from the south wall", "m", ge=0.5, le=499.5, default=3)
+    east_m: float = quantity("distance from the west wall", "m", ge=0.5, le=499.5, default=25)
+    clearance_m: float = quantity(
+        "free way around the start, for standing and moving obstacles",
+        "m",
+        ge=0.5,
+        le=50,
+        default=3,
+    )
+
+
+class Goal(ProfileModel):
+    """Where to fly: drawn anew with every seed, or fixed by `north_m` and `east_m`."""
+
+    north_m: float | None = quantity(
+        "fixed goal: north of the start; left out: drawn", "m", ge=-500, le=500, default=None
+    )
+    east_m: float | None = quantity(
+        "fixed goal: east of the start; left out: drawn", "m", ge=-500, le=500, default=None
+    )
+    min_distance_m: float = quantity(
+        "least distance of a drawn goal from the start", "m", ge=0, le=500, default=7
+    )
+    clearance_m: float = quantity(
+        "free way around the goal, to static obstacles and walls", "m", ge=0.5, le=50, default=2
+    )
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Goal:
+        if (self.north_m is None) != (self.east_m is None):
+            missing = "north_m" if self.north_m is None else "east_m"
+            raise ValueError(f"{missing}: missing; a fixed goal needs north_m and east_m")
+        return self
+
+    @property
+    def fixed(self) -> tuple[float, float] | None:
+        """North and east [m] from the start, or None when the goal is drawn."""
+        if self.north_m is None or self.east_m is None:
+            return None
+        return self.north_m, self.east_m
+
+
+class StaticObstacles(ProfileModel):
+    """Obstacles that stand still. Ranges are [least, greatest], drawn uniformly, one by one."""
+
+    count: Annotated[tuple[int, int], Each(0, 200, ascending=True)] = quantity(
+        "how many", "1", default=(0, 0)
+    )
+    shapes: Annotated[tuple[ShapeName, ...], Field(min_length=1)] = Field(
+        default=("box", "cylinder", "sphere"), description="kinds drawn, with equal odds"
+    )
+    half_width_m: Annotated[tuple[float, float], Each(0.1, 20, ascending=True)] = quantity(
+        "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.5, 1.5)
+    )
+    height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
+        "height of a box or cylinder; they stand on the floor", "m", default=(3.0, 5.0)
+    )
+
+
+class MovingObstacles(StaticObstacles):
+    """Random way-point walkers: a straight leg at constant speed, a stop, the next leg."""
+
+    count: Annotated[tuple[int, int], Each(0, 30, ascending=True)] = quantity(
+        "how many", "1", default=(0, 0)
+    )
+    half_width_m: Annotated[tuple[float, float], Each(0.1, 20, ascending=True)] = quantity(
+        "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.4, 0.8)
+    )
+    speed_m_s: Annotated[tuple[float, float], Each(0.1, 15, ascending=True)] = quantity(
+        "speed, drawn once per obstacle", "m/s", default=(1.0, 2.5)
+    )
+    leg_max_m: float = quantity("greatest length of a leg", "m", ge=5, le=500, default=30)
+    dwell_s: float = quantity("stop at every way-point", "s", ge=0, le=60, default=0.2)
+    tour_min_s: float = quantity("least time before a tour repeats", "s", ge=10, le=300, default=60)
+    clearance_m: float = quantity(
+        "least gap to static obstacles and walls on the way", "m", ge=0.05, le=10, default=0.25
+    )
+
+
+class ArenaSpec(ProfileModel):
+    """Knobs of an arena; defaults are the paper's where it has them (arXiv 1906.00421).
+
+    A bounding box is the rectangle around an obstacle's footprint, its sides along north and east.
+    """
+
+    description: str = Field(description="one line for people")
+    default_seed: int = quantity("seed when none is asked for", "1", ge=0, le=999_999, default=0)
+    wall_colour: Annotated[tuple[int, int, int], Each(0, 255)] = quantity(
+        "red, green, blue of all walls", "1", default=(153, 0, 0)
+    )
+    size: Size = Field(default_factory=Size, description="floor and walls")
+    start: Start = Field(default_factory=Start, description="where the vehicle takes off")
+    goal: Goal = Field(default_factory=Goal, description="where to fly")
+    zones_m: Annotated[tuple[float, ...], Each(1, 750, ascending=True)] = quantity(
+        "curriculum zones: greatest distance of a drawn goal from the start; inclusive",
+        "m",
+        default=(16.0, 32.0, 48.0),
+    )
+    min_clearance_m: float = quantity(
+        "least gap between the bounding boxes of obstacles, and to the walls; "
+        "of moving ones at time 0",
+        "m",
+        ge=0,
+        le=50,
+        default=2,
+    )
+    count_period: int = quantity(
+        "consecutive seeds that share the drawn numbers of obstacles",
+        "1",
+        ge=1,
+        le=10_000,
+        default=1,
+    )
+    flight_altitude_m: float = quantity(
+        "height above the floor that every sphere crosses", "m", ge=0.2, le=50, default=2.5
+    )
+    static: StaticObstacles = Field(
+        default_factory=StaticObstacles, description="obstacles that stand still"
+    )
+    moving: MovingObstacles = Field(
+        default_factory=MovingObstacles, description="obstacles that move"
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> ArenaSpec:
+        self._check_start()
+        self._check_goal()
+        for name in ("static", "moving"):
+            self._check_heights(name, getattr(self, name))
+        return self
+
+    def _check_start(self) -> None:
+        free = self.start.clearance_m
+        for axis in ("north_m", "east_m"):
+            value, length = getattr(self.start, axis), getattr(self.size, axis)
+            if not free <= value <= length - free:
+                raise ValueError(
+                    f"start.{axis} = {value:g}: accepted: {free:g} <= value <= {length - free:g} m "
+                    f"(size.{axis} {length:g}, start.clearance_m {free:g})"
+                )
+
+    def _check_goal(self) -> None:
+        if self.goal.fixed is None:
+            if self.goal.min_distance_m >= self.zones_m[0]:
+                raise ValueError(
+                    f"goal.min_distance_m = {self.goal.min_distance_m:g}: accepted: "
+                    f"value < {self.zones_m[0]:g} m (the smallest of zones_m)"
+                )
+            return
+        free = self.goal.clearance_m
+        for axis, value in zip(("north_m", "east_m"), self.goal.fixed, strict=True):
+            start = getattr(self.start, axis)
+            low, high = free - start, getattr(self.size, axis) - start - free
+            if not low <= value <= high:
+                raise ValueError(
+                    f"goal.{axis} = {value:g}: accepted: {low:g} <= value <= {high:g} m from the "
+                    f"start (inside the walls, goal.clearance_m {free:g})"
+                )
+
+    def _check_heights(self, name: str, kind: StaticObstacles) -> None:
+        wall = self.size.height_m
+        if kind.count[1] == 0:
+            return
+        if kind.height_m[1] > wall and set(kind.shapes) - {"sphere"}:
+            raise ValueError(
+                f"{name}.height_m = {list(kind.height_m)}: accepted: value <= {wall:g} m "
+                "(size.height_m, the walls)"
+            )
+        radius = kind.half_width_m[1]
+        top = radius + max(radius, self.flight_altitude_m + SPHERE_OFFSET * radius)
+        if "sphere" in kind.shapes and top > wall:
+            raise ValueError(
+                f"{name}.half_width_m = {list(kind.half_width_m)}: a sphere across "
+                f"flight_altitude_m {self.flight_altitude_m:g} would reach up to {top:g} m; "
+                f"accepted: a top <= {wall:g} m (size.height_m, the walls)"
+            )
