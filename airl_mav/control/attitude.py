@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize, rotate
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
     """Return the attitude whose body -z lies along the thrust vector NED, with a heading [rad].
 
@@ -38,7 +37,7 @@ def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
     return _from_axes((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _from_axes(x: Vec, y: Vec, z: Vec) -> Quat:
     """Return the quaternion of the rotation with columns x, y, z (Shepperd's method)."""
     trace = x[0] + y[1] + z[2]
@@ -55,7 +54,7 @@ def _from_axes(x: Vec, y: Vec, z: Vec) -> Quat:
     return normalize(((x[1] - y[0]) / s, (z[0] + x[2]) / s, (z[1] + y[2]) / s, 0.25 * s))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shortest(a: Vec, b: Vec) -> Quat:
     """Return the shortest rotation that turns unit vector a into b."""
     cx, cy, cz = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
@@ -68,7 +67,7 @@ def _shortest(a: Vec, b: Vec) -> Quat:
     return normalize((1.0 + dot, cx, cy, cz))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
     """Return the body rates FRD [rad/s] that turn attitude q into q_sp.
 

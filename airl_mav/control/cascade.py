@@ -10,7 +10,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
@@ -18,6 +17,7 @@ from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors, mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import velocity_control, velocity_setpoint
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, yaw_of
 
 Memory = NDArray[np.float64]
@@ -60,7 +60,7 @@ def new_memory(n: int | None = None) -> Memory:
     return np.zeros(MEMORY_SIZE if n is None else (n, MEMORY_SIZE))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def reset_integrals(memory: Memory) -> None:
     """Forget what the integrators learned: on the ground they wind up against the floor."""
     for i in range(3):
@@ -69,7 +69,7 @@ def reset_integrals(memory: Memory) -> None:
         memory[_SAT + i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _smoothing(cutoff_hz: float, dt: float) -> float:
     """Return the weight of a new sample in a first-order low-pass; cut-off 0 = no filter."""
     if cutoff_hz <= 0.0:
@@ -77,7 +77,7 @@ def _smoothing(cutoff_hz: float, dt: float) -> float:
     return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * dt)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cascade(
     position: Vec,
     velocity: Vec,

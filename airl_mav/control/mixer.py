@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from airl_mav.control.velocity import clamp
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 Motors = tuple[float, float, float, float]
@@ -26,7 +25,7 @@ THRUST: Motors = (1.0, 1.0, 1.0, 1.0)
 YAW_MARGIN = 0.15
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(m: Motors, direction: Motors, amount: float) -> Motors:
     return (
         m[0] + amount * direction[0],
@@ -36,7 +35,7 @@ def _add(m: Motors, direction: Motors, amount: float) -> Motors:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _excess(m: Motors, direction: Motors, high: float) -> float:
     """Return how much of `direction` to add so that the worst motors come back into [0, high]."""
     k_min = 0.0
@@ -52,7 +51,7 @@ def _excess(m: Motors, direction: Motors, high: float) -> float:
     return k_min + k_max
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _desaturate(m: Motors, direction: Motors, high: float, lower_only: bool) -> Motors:
     gain = _excess(m, direction, high)
     if lower_only and gain > 0.0:
@@ -62,7 +61,7 @@ def _desaturate(m: Motors, direction: Motors, high: float, lower_only: bool) -> 
     return _add(m, direction, 0.5 * _excess(m, direction, high))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
     """Return motor commands 0..1 and the torque that could not be delivered, per axis.
 
@@ -90,7 +89,7 @@ def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
     return out, (_dead(missing[0]), _dead(missing[1]), _dead(missing[2]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dead(value: float) -> float:
     """Return 0 for rounding noise: a saturated axis is short of more than that."""
     return value if abs(value) > 1e-6 else 0.0

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from airl_mav.constants import DEG
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 # Integration fades out towards this rate error: no wind-up in fast flips (PX4's RateControl).
 I_FADE_RAD_S = 400.0 * DEG
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _integrate(integral: float, error: float, gain: float, limit: float, dt: float) -> float:
     fade = error / I_FADE_RAD_S
     return clamp(integral + max(0.0, 1.0 - fade * fade) * gain * error * dt, -limit, limit)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rate_control(
     rates: Vec,
     angular_acceleration: Vec,

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.control.gains import Gains
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clamp(value: float, low: float, high: float) -> float:
     """Return value limited to [low, high]."""
     return min(high, max(low, value))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: Gains) -> Vec:
     """Return the velocity to fly NED [m/s]: position error x gain + feed-forward, limited.
 
@@ -49,7 +48,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     return vx, vy, clamp(pz + fz, -gains.vel_max_up, gains.vel_max_down)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     """Return the thrust vector NED (normalised, hover = hover_thrust) for an acceleration [m/s²].
 
@@ -67,7 +66,7 @@ def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     return bx * collective, by * collective, c * collective
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def velocity_control(
     velocity: Vec,
     velocity_dot: Vec,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from airl_mav.kernels import kernel
 
 COULOMB_PER_MAH = 3.6
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float) -> float:
     """Return the voltage under a constant-power load [W]: V = E - R P / V, upper root.
 
@@ -19,13 +19,13 @@ def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float)
     return 0.5 * (open_circuit_v + math.sqrt(max(0.0, discriminant)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def open_circuit(remaining: float, empty_v: float, full_v: float) -> float:
     """Return the open-circuit voltage, linear in the state of charge 0..1."""
     return empty_v + (full_v - empty_v) * remaining
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drain(remaining: float, current_a: float, capacity_mah: float, dt: float) -> float:
     """Return the state of charge after dt [s] at a current [A], not below 0."""
     return max(0.0, remaining - current_a * dt / (capacity_mah * COULOMB_PER_MAH))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 Coefficients = tuple[float, float, float, float, float, float, float, float, float]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def power_w(
     velocity: Vec, acceleration: Vec, wind: Vec, payload_g: float, b: Coefficients
 ) -> float:

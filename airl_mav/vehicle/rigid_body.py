@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from airl_mav.constants import GRAVITY_M_S2
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, normalize, rotate
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def drag_force(velocity: Vec, wind: Vec, airframe: Airframe) -> Vec:
     """Return the drag NED [N] at a ground velocity and wind NED [m/s]."""
     x, y, z = velocity[0] - wind[0], velocity[1] - wind[1], velocity[2] - wind[2]
@@ -24,7 +23,7 @@ def drag_force(velocity: Vec, wind: Vec, airframe: Airframe) -> Vec:
     return (-k * x, -k * y, -k * z)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def step(
     position: Vec,
     velocity: Vec,

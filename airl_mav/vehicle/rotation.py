@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from airl_mav.kernels import kernel
 
 Quat = tuple[float, float, float, float]
 Vec = tuple[float, float, float]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rotate(q: Quat, v: Vec) -> Vec:
     """Rotate v by q: body to world."""
     w, x, y, z = q
@@ -24,13 +24,13 @@ def rotate(q: Quat, v: Vec) -> Vec:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def conjugate(q: Quat) -> Quat:
     """Return the inverse rotation."""
     return (q[0], -q[1], -q[2], -q[3])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def multiply(a: Quat, b: Quat) -> Quat:
     """Return the Hamilton product a ⊗ b."""
     return (
@@ -41,14 +41,14 @@ def multiply(a: Quat, b: Quat) -> Quat:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normalize(q: Quat) -> Quat:
     """Return q scaled to length 1."""
     n = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (q[0] * n, q[1] * n, q[2] * n, q[3] * n)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def exponential(r: Vec) -> Quat:
     """Return the quaternion of a rotation vector [rad]."""
     angle = math.sqrt(r[0] * r[0] + r[1] * r[1] + r[2] * r[2])
@@ -56,7 +56,7 @@ def exponential(r: Vec) -> Quat:
     return (math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def yaw_of(q: Quat) -> float:
     """Return the heading of q [rad]."""
     return math.atan2(2.0 * (q[0] * q[3] + q[1] * q[2]), 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3]))

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from airl_mav.kernels import kernel
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Vec
 
@@ -22,21 +21,21 @@ RIGHT_SIGN = (1.0, -1.0, -1.0, 1.0)
 YAW_SIGN = (1.0, 1.0, -1.0, -1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def steady_speed(command: float, thrust_curve: float) -> float:
     """Return the speed fraction 0..1 that a command 0..1 settles at (thrust ~ speed²)."""
     u = min(1.0, max(0.0, command))
     return math.sqrt(thrust_curve * u * u + (1.0 - thrust_curve) * u)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spin(speed: float, command: float, airframe: Airframe, dt: float) -> float:
     """Return the speed fraction after dt [s]: exact step response of a first-order lag."""
     target = steady_speed(command, airframe.thrust_curve)
     return target + (speed - target) * math.exp(-dt / airframe.rotor_time_constant)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def wrench(s0: float, s1: float, s2: float, s3: float, airframe: Airframe) -> tuple[float, Vec]:
     """Return collective thrust [N] along body up, and the body torque FRD [N m]."""
     speeds = (s0, s1, s2, s3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -68,6 +69,8 @@ class BuiltinAutopilot:
         self._pressure_hpa = math.nan
         self._gps: GpsFix | None = None
         self._home: Geodetic | None = None
+        self.on_setpoint: Callable[[Setpoint, int], None] | None = None
+        """Called with every accepted setpoint and its time of receipt, if set."""
 
     # --- towards the plant
 
@@ -222,6 +225,8 @@ class BuiltinAutopilot:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
         self._setpoint = setpoint
         self._watch.setpoint(time_us)
+        if self.on_setpoint is not None:
+            self.on_setpoint(setpoint, time_us)
 
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""

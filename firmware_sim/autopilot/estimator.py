@@ -15,7 +15,6 @@ from collections.abc import Callable
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from numba import njit
 
 from airl_mav.atmosphere import altitude_m
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, US_PER_S
@@ -32,6 +31,7 @@ from airl_mav.frames import (
     quat_yaw,
     wrap_pi,
 )
+from airl_mav.kernels import kernel
 from airl_mav.location import MAGNETIC_DECLINATION
 from airl_mav.vehicle.rotation import exponential, multiply, normalize
 from firmware_sim.autopilot.state import Estimate
@@ -63,7 +63,7 @@ _READY_VELOCITY_M_S = 0.3
 _READY_POSITION_M = 1.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _propagate(
     p: Vector, v: Vector, q: Vector, gyro: Vector, accel: Vector, f_matrix: Vector, dt: float
 ) -> Vector:

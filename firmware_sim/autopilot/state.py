@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -86,6 +87,9 @@ class Setpoint:
     """Heading [rad]."""
     yaw_rate: float
     """[rad/s], positive clockwise seen from above."""
+    wire: tuple[float, float, float, float] = (math.nan, math.nan, math.nan, math.nan)
+    """Velocity and yaw rate (or yaw, where no rate is commanded) exactly as received: what latency
+    analysis recognises a message by."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import pybullet
-from numba import njit
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
@@ -65,7 +65,7 @@ class _Motion:
         self.position, self.velocity, self.q, self.omega = position, velocity, q, omega
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _actuate(
     speeds: Speeds, motors: Speeds, q: Quat, velocity: Vec, omega: Vec, wind: Vec, a: Airframe
 ) -> tuple[Speeds, Vec, Vec]:
@@ -85,7 +85,7 @@ def _actuate(
     return s, force, rotate(q, damped)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _to_ned_frd(orientation: Quat, velocity: Vec, angular: Vec) -> tuple[Quat, Vec, Vec]:
     """Turn pybullet's state (xyzw quaternion, world-frame rates) into NED / FRD, FRD rates.
 

@@ -1,0 +1,217 @@
+"""The control channel between the harness and a process it supervises: JSON lines over pipes.
+
+Requests go to the child's standard input, events come from its standard output; what the child
+wants to say to people goes to standard error. The end of standard input means that the harness is
+gone: the child ends. Because it is only pipes, the same channel runs through `ssh`.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import Annotated, Any, BinaryIO, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+
+class _Line(BaseModel):
+    """One message."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def to_line(self) -> bytes:
+        """Return the wire form."""
+        return self.model_dump_json().encode() + b"\n"
+
+
+# --- harness -> firmware
+
+
+class LoadEpisode(_Line):
+    """Set up a new arena with the vehicle at rest in it; the autopilot boots."""
+
+    type: Literal["load"] = "load"
+    episode: int
+    arena: str
+    arena_seed: int
+    seed: int
+    """Of sensors and wind."""
+    tlog: str | None
+    """Write the MAVLink log here."""
+    record: str
+    """Write the flight's arrays (.npz) here when the episode is finished."""
+
+
+class FinishEpisode(_Line):
+    """Stop the episode and save its arrays."""
+
+    type: Literal["finish"] = "finish"
+
+
+# --- harness -> companion
+
+
+class Fly(_Line):
+    """Fly one mission."""
+
+    type: Literal["fly"] = "fly"
+    episode: int
+    goal: tuple[float, float]
+    """North, east [m] from the start."""
+    epoch_ns: int | None
+    """Host monotonic time of simulated time 0 when both share a host; None = start a clock."""
+    latency_seed: int
+    """Of the injected latency."""
+    record: str
+    """Write the decision log (.npz) here."""
+
+
+class Abort(_Line):
+    """End the mission now: stop, land."""
+
+    type: Literal["abort"] = "abort"
+    reason: str
+
+
+class Shutdown(_Line):
+    """End the process."""
+
+    type: Literal["shutdown"] = "shutdown"
+
+
+# --- events
+
+
+class Ready(_Line):
+    """The process can take requests."""
+
+    type: Literal["ready"] = "ready"
+    details: dict[str, str | float | int] = Field(default_factory=dict)
+
+
+class Loaded(_Line):
+    """The episode stands: the vehicle waits at the start."""
+
+    type: Literal["loaded"] = "loaded"
+    episode: int
+    time_us: int
+    epoch_ns: int
+    """Host monotonic time of simulated time 0."""
+    goal: tuple[float, float]
+
+
+class State(_Line):
+    """The true state, a few times a second."""
+
+    type: Literal["state"] = "state"
+    time_us: int
+    position: tuple[float, float, float]
+    speed_m_s: float
+    yaw: float
+    battery: float
+    collision: str | None
+    mode: str
+    armed: bool
+    landed: bool
+    slipped_us: int
+
+
+class Text(_Line):
+    """A STATUSTEXT of the autopilot."""
+
+    type: Literal["text"] = "text"
+    time_us: int
+    severity: int
+    text: str
+
+
+class Saved(_Line):
+    """The episode's arrays are on disk."""
+
+    type: Literal["saved"] = "saved"
+    path: str
+    """Of the arrays."""
+
+
+class Progress(_Line):
+    """The mission has entered a phase."""
+
+    type: Literal["progress"] = "progress"
+    phase: str
+    time_us: int
+    detail: str = ""
+
+
+class Ended(_Line):
+    """The mission is over."""
+
+    type: Literal["ended"] = "ended"
+    reason: str
+    detail: str = ""
+    notes: tuple[str, ...] = ()
+    path: str
+    """Of the decision log."""
+
+
+class Failed(_Line):
+    """The process cannot go on and will end."""
+
+    type: Literal["failed"] = "failed"
+    message: str
+
+
+Request = Annotated[
+    LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
+]
+Event = Annotated[
+    Ready | Loaded | State | Text | Saved | Progress | Ended | Failed,
+    Field(discriminator="type"),
+]
+_REQUESTS: TypeAdapter[Any] = TypeAdapter(Request)
+_EVENTS: TypeAdapter[Any] = TypeAdapter(Event)
+
+
+def parse_event(line: bytes) -> Event:
+    """Read one event line. Raises ValueError (pydantic's) for anything else."""
+    event: Event = _EVENTS.validate_json(line)
+    return event
+
+
+class ChildChannel:
+    """The child's end: requests in through a callback, events out."""
+
+    def __init__(self, incoming: BinaryIO, outgoing: BinaryIO) -> None:
+        self._incoming = incoming
+        self._outgoing = outgoing
+        self._lock = threading.Lock()
+
+    @classmethod
+    def on_stdio(cls) -> ChildChannel:
+        """Take over standard input and output.
+
+        File descriptor 1 is pointed at standard error afterwards, so that a library that prints
+        (pybullet does, from C) cannot garble the channel.
+        """
+        outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
+        os.dup2(2, 1)
+        return cls(sys.stdin.buffer, outgoing)
+
+    def send(self, event: _Line) -> None:
+        """Send one event; a harness that is gone is no error here (its end of file is)."""
+        try:
+            with self._lock:
+                self._outgoing.write(event.to_line())
+        except BrokenPipeError:
+            return
+
+    def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
+        """Call `handle` for every request, on a thread; `gone` when the harness is gone."""
+
+        def loop() -> None:
+            for line in self._incoming:
+                handle(_REQUESTS.validate_json(line))
+            gone()
+
+        threading.Thread(target=loop, name="channel", daemon=True).start()

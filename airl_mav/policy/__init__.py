@@ -1,0 +1,1 @@
+"""What a policy sees and does: observations, actions, policies."""

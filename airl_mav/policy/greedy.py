@@ -1,0 +1,120 @@
+"""The classical baseline: turn to the goal, steer away from near returns, slow down.
+
+A vector-field histogram over the depth image (after Borenstein and Koren, IEEE Trans. Robotics
+and Automation 7(3), 1991): for each heading in view, how far could the vehicle's width fly? The
+free heading nearest to the goal wins. No memory, no map, no learning.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.policy.actions import Action
+from airl_mav.policy.observation import Observation
+
+
+@dataclass(frozen=True)
+class GreedySettings:
+    """Tuning of the baseline."""
+
+    max_speed_m_s: float = 4.0
+    max_yaw_rate_rad_s: float = math.radians(90.0)
+    brake_m_s2: float = 2.5
+    """Deceleration that the speed limit counts on."""
+    half_width_m: float = 0.55
+    """Half the vehicle's width plus a margin."""
+    band_m: float = 0.6
+    """Returns this far above or below the vehicle are in its way."""
+    stop_distance_m: float = 1.2
+    """Closer returns than this are not approached."""
+    free_distance_m: float = 6.0
+    """A heading that is free this far is as good as any."""
+    period_s: float = 0.5
+    """Time until the next decision."""
+    headings: int = 37
+    """Number of headings tried across the field of view."""
+
+
+class GreedyPolicy:
+    """Depth-reactive steering towards the goal. Implements `actions.Policy`."""
+
+    def __init__(self, settings: GreedySettings | None = None) -> None:
+        self._settings = settings or GreedySettings()
+        self._side = 1.0
+        """Which way to turn when nothing is free: kept, so as not to dither."""
+
+    def act(self, observation: Observation) -> Action:
+        """Return the velocity for an observation."""
+        s, bearing = self._settings, observation.goal_bearing
+        half_fov = math.atan2(0.5 * observation.intrinsics.width, observation.intrinsics.focal)
+        if abs(bearing) > half_fov:
+            # The goal is out of view: turn to it on the spot.
+            self._side = math.copysign(1.0, bearing)
+            return Action(0.0, 0.0, self._turn(bearing))
+        points = near_points(observation, s.band_m)
+        margin = half_fov / s.headings
+        headings = np.linspace(-half_fov + margin, half_fov - margin, s.headings)
+        clear = np.array([clearance(points, h, s.half_width_m) for h in headings])
+        distance = observation.goal_distance
+        # What lies behind the goal does not matter.
+        needed = min(s.free_distance_m, max(distance, s.stop_distance_m))
+        lack = np.maximum(0.0, needed - clear) / needed
+        cost = np.abs(headings - bearing) + 4.0 * lack
+        best = int(np.argmin(cost))
+        if clear[best] <= s.stop_distance_m:
+            return Action(0.0, 0.0, self._side * s.max_yaw_rate_rad_s * 0.5)
+        heading = float(headings[best])
+        if abs(heading) > math.radians(3.0):
+            self._side = math.copysign(1.0, heading)
+        ahead = min(clearance(points, 0.0, s.half_width_m), float(clear[best]))
+        speed = self._speed(min(ahead, float(clear[best])), distance)
+        forward = speed * max(0.0, math.cos(heading)) ** 2
+        return Action(forward, 0.0, self._turn(heading))
+
+    def _turn(self, angle: float) -> float:
+        limit = self._settings.max_yaw_rate_rad_s
+        return max(-limit, min(limit, angle / self._settings.period_s))
+
+    def _speed(self, free_m: float, goal_m: float) -> float:
+        """Return the speed from which the vehicle can stop in time after one more period."""
+        s = self._settings
+        room = max(0.0, free_m - s.stop_distance_m)
+        # v T + v²/2a = room, solved for v
+        t, a = s.period_s, s.brake_m_s2
+        v = a * (math.sqrt(t * t + 2.0 * room / a) - t)
+        return min(s.max_speed_m_s, v, max(0.5, goal_m / (2.0 * t)))
+
+
+def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
+    """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m].
+
+    The image is levelled by the vehicle's roll and pitch, so that neither the floor nor the tilt
+    of acceleration looks like an obstacle.
+    """
+    k, depth = observation.intrinsics, observation.depth_m
+    seen = depth > 0.0
+    v, u = np.nonzero(seen)
+    z = depth[seen].astype(np.float64)
+    right, down = (u - k.cx) / k.focal * z, (v - k.cy) / k.focal * z
+    # Heading frame from body: R_y(pitch) R_x(roll).
+    cr, sr = math.cos(observation.roll), math.sin(observation.roll)
+    cp, sp = math.cos(observation.pitch), math.sin(observation.pitch)
+    level_right = cr * right - sr * down
+    tilted_down = sr * right + cr * down
+    forward = cp * z + sp * tilted_down
+    level_down = -sp * z + cp * tilted_down
+    inside = np.abs(level_down) < band_m
+    return np.stack([forward[inside], level_right[inside]], axis=1)
+
+
+def clearance(points: NDArray[np.float64], heading: float, half_width_m: float) -> float:
+    """Return how far a strip of +- half_width_m can go along a heading [rad] before a point [m]."""
+    c, s = math.cos(heading), math.sin(heading)
+    along = c * points[:, 0] + s * points[:, 1]
+    across = -s * points[:, 0] + c * points[:, 1]
+    hit = (np.abs(across) < half_width_m) & (along > 0.0)
+    return float(along[hit].min()) if hit.any() else math.inf

@@ -1,0 +1,241 @@
+"""The companion's link to the flight controller: MAVSDK, as on the real aircraft.
+
+MAVSDK's synchronous API: a call is a plain C call, while the asyncio one adds a thread hop.
+MAVSDK sends a setpoint at once and then repeats it at 20 Hz from a thread of its own, also when
+this process hangs; `watchdog.py` is there for that.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
+from mavsdk.logging import log_subscribe
+from mavsdk.plugins.action import Action, ActionError
+from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
+from mavsdk.plugins.telemetry import LandedState, Telemetry
+
+from airl_mav.clock import Clock
+from airl_mav.constants import US_PER_S
+from airl_mav.errors import UsageError
+from airl_mav.policy.observation import Kinematics
+
+TELEMETRY_HZ = 50.0
+"""Rate asked for position, velocity and attitude [Hz]."""
+
+POLL_S = 0.05
+"""How often a condition is looked at while waiting for it [s]."""
+
+
+class LinkError(Exception):
+    """The flight controller refused, or is gone."""
+
+
+@dataclass(frozen=True)
+class BodyVelocity:
+    """A velocity setpoint in the heading frame, with a yaw rate."""
+
+    forward_m_s: float
+    right_m_s: float
+    down_m_s: float
+    yaw_rate_rad_s: float
+
+    def wire(self) -> tuple[float, float, float, float]:
+        """Return the four numbers in the order in which they are sent."""
+        return self.forward_m_s, self.right_m_s, self.down_m_s, self.yaw_rate_rad_s
+
+
+STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
+
+
+class Link(Protocol):
+    """What the pilot needs of a flight controller. Calls raise LinkError when refused."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the flight controller is heard."""
+        ...
+
+    def kinematics(self) -> Kinematics:
+        """Return the newest telemetry."""
+        ...
+
+    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+        """Send a velocity setpoint; it is repeated until the next one."""
+        ...
+
+    def leave_offboard(self) -> None:
+        """Switch to Hold."""
+        ...
+
+
+class MavsdkLink:
+    """MAVSDK over UDP or serial. Implements `Link`."""
+
+    def __init__(self, url: str, clock: Clock) -> None:
+        """Open a connection; `connect` waits for the vehicle.
+
+        Args:
+            url: MAVSDK connection, `udpin://127.0.0.1:14540` or `serial:///dev/ttyAMA0:921600`.
+            clock: For time-outs.
+
+        Raises:
+            UsageError: The URL is invalid or its port is taken.
+        """
+        self.url = url
+        self._clock = clock
+        # MAVSDK's own log goes to standard output; its findings reach us as results.
+        log_subscribe(lambda *_: True)
+        configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
+        self._mavsdk = Mavsdk(configuration)
+        result = self._mavsdk.add_any_connection(url)
+        if result != ConnectionResult.SUCCESS:
+            self._mavsdk.destroy()
+            raise UsageError(_connection_problem(url, result))
+        self._system: Any = None
+        self._telemetry: Any = None
+        self._action: Any = None
+        self._offboard: Any = None
+
+    def connect(self, timeout_s: float) -> None:
+        """Wait for a flight controller. Raises LinkError when none is heard in time."""
+        system = self._mavsdk.first_autopilot(timeout_s)
+        if system is None:
+            raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+        self._system = system
+        self._telemetry = Telemetry(system)
+        self._action = Action(system)
+        self._offboard = Offboard(system)
+        self._telemetry.set_rate_position_velocity_ned(TELEMETRY_HZ)
+        self._telemetry.set_rate_attitude_quaternion(TELEMETRY_HZ)
+
+    def close(self) -> None:
+        """Release MAVSDK."""
+        for plugin in (self._offboard, self._action, self._telemetry):
+            if plugin is not None:
+                plugin.destroy()
+        self._mavsdk.destroy()
+
+    @property
+    def connected(self) -> bool:
+        """Whether heartbeats of the flight controller arrive (MAVSDK allows gaps of 3 s)."""
+        return self._system is not None and bool(self._system.is_connected())
+
+    @property
+    def healthy(self) -> bool:
+        """Whether the flight controller reports all of its health checks as good."""
+        return bool(self._telemetry.health_all_ok())
+
+    @property
+    def armed(self) -> bool:
+        """Whether the heartbeat says armed (known up to 1 s late)."""
+        return bool(self._telemetry.armed())
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether the landing detector says on ground."""
+        return bool(self._telemetry.landed_state() == LandedState.ON_GROUND)
+
+    @property
+    def flight_mode(self) -> str:
+        """Flight mode as the heartbeat says it (known up to 1 s late)."""
+        return str(self._telemetry.flight_mode().name)
+
+    def kinematics(self) -> Kinematics:
+        """Return the newest position, velocity and attitude."""
+        pv = self._telemetry.position_velocity_ned()
+        q = self._telemetry.attitude_quaternion()
+        p, v = pv.position, pv.velocity
+        return Kinematics(
+            np.array([p.north_m, p.east_m, p.down_m]),
+            np.array([v.north_m_s, v.east_m_s, v.down_m_s]),
+            np.array([q.w, q.x, q.y, q.z]),
+        )
+
+    def arm(self, timeout_s: float) -> None:
+        """Arm, asking again while the flight controller is not ready for it."""
+        deadline_us = self._deadline(timeout_s)
+        while True:
+            try:
+                self._action.arm()
+                return
+            except ActionError as error:
+                if self._clock.time_us() >= deadline_us or not self.connected:
+                    raise LinkError(f"arming failed: {_reason(error)}") from None
+                self._pause()
+
+    def takeoff(self, altitude_m: float, timeout_s: float) -> None:
+        """Take off and return when the altitude above the start is reached."""
+        start_down = float(self.kinematics().position[2])
+        self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
+        self._call("take-off", self._action.takeoff)
+        deadline_us = self._deadline(timeout_s)
+        while True:
+            state = self.kinematics()
+            height = start_down - float(state.position[2])
+            if height > 0.85 * altitude_m and abs(float(state.velocity[2])) < 0.3:
+                return
+            self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s")
+            self._pause()
+
+    def enter_offboard(self) -> None:
+        """Send a standing setpoint and switch to offboard."""
+        self.set_velocity_body(STOP)
+        self._call("offboard", self._offboard.start)
+
+    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+        """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
+        s = setpoint
+        yaw_rate_deg_s = math.degrees(s.yaw_rate_rad_s)
+        try:
+            self._offboard.set_velocity_body(
+                VelocityBodyYawspeed(s.forward_m_s, s.right_m_s, s.down_m_s, yaw_rate_deg_s)
+            )
+        except OffboardError as error:
+            raise LinkError(f"setpoint refused: {_reason(error)}") from None
+
+    def leave_offboard(self) -> None:
+        """Switch to Hold; MAVSDK stops repeating setpoints."""
+        self._call("leaving offboard", self._offboard.stop)
+
+    def land(self, timeout_s: float) -> None:
+        """Land and return when disarmed."""
+        self._call("landing", self._action.land)
+        deadline_us = self._deadline(timeout_s)
+        while self.armed:
+            self._check(deadline_us, f"landing: still armed after {timeout_s:g} s")
+            self._pause()
+
+    def _call(self, what: str, call: Any) -> None:
+        try:
+            call()
+        except (ActionError, OffboardError) as error:
+            raise LinkError(f"{what} failed: {_reason(error)}") from None
+
+    def _deadline(self, timeout_s: float) -> int:
+        return self._clock.time_us() + int(timeout_s * US_PER_S)
+
+    def _check(self, deadline_us: int, message: str) -> None:
+        if not self.connected:
+            raise LinkError("the flight controller is no longer heard")
+        if self._clock.time_us() >= deadline_us:
+            raise LinkError(message)
+
+    def _pause(self) -> None:
+        self._clock.sleep_until(self._clock.time_us() + int(POLL_S * US_PER_S))
+
+
+def _reason(error: Exception) -> str:
+    """Return MAVSDK's result name."""
+    result = error.args[0] if error.args else error
+    return str(getattr(result, "name", result)).lower().replace("_", " ")
+
+
+def _connection_problem(url: str, result: Any) -> str:
+    name = result.name.lower().replace("_", " ")
+    if result == ConnectionResult.BIND_ERROR:
+        return f"--connect {url}: the port is taken (another companion?): choose another"
+    return f"--connect {url}: {name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"

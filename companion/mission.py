@@ -1,0 +1,103 @@
+"""One mission: connect, arm, take off, fly the policy to the goal, land."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from companion.camera import FrameSource
+
+from airl_mav.clock import Clock
+from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.stamps import DecisionLog
+from airl_mav.policy.actions import Policy
+from companion.link import STOP, LinkError, MavsdkLink
+from companion.pilot import Pilot, PilotSettings
+from companion.watchdog import Watchdog, WatchdogSettings
+
+ARM_TIMEOUT_S = 20.0
+TAKEOFF_TIMEOUT_S = 30.0
+LAND_TIMEOUT_S = 60.0
+
+
+@dataclass(frozen=True)
+class MissionResult:
+    """How a mission ended."""
+
+    reason: str
+    """goal reached, stopped, link lost, watchdog, or what was refused."""
+    notes: tuple[str, ...]
+    """What the watchdog did, what went wrong on the way down."""
+    log: DecisionLog
+
+
+def fly_mission(
+    link: MavsdkLink,
+    frames: FrameSource,
+    policy: Policy,
+    goal: tuple[float, float],
+    clock: Clock,
+    stop: threading.Event,
+    progress: Callable[[str], None],
+    *,
+    pilot_settings: PilotSettings,
+    watchdog_settings: WatchdogSettings,
+    latency: LatencySampler | None = None,
+) -> MissionResult:
+    """Fly one mission on a connected link; never raises for what a flight can do.
+
+    Args:
+        link: Connected.
+        frames: The camera.
+        policy: What decides.
+        goal: North, east [m] from the start.
+        clock: Simulated time.
+        stop: Set from outside to end the flight early; the vehicle then lands.
+        progress: Called with the name of each phase as it begins.
+        pilot_settings: How the policy is flown.
+        watchdog_settings: Bounds on silence.
+        latency: Where to draw t2 from, to fly as a slower computer.
+    """
+    watchdog = Watchdog(link, clock, watchdog_settings)
+    pilot = Pilot(link, frames, policy, watchdog, clock, pilot_settings, latency=latency)
+    try:
+        progress("arming")
+        link.arm(ARM_TIMEOUT_S)
+        progress("taking off")
+        link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S)
+        link.enter_offboard()
+        progress("navigating")
+        watchdog.start()
+        reason = pilot.fly(goal, stop)
+    except LinkError as error:
+        reason = str(error) if link.connected else "link lost"
+    finally:
+        watchdog.stop()
+    notes = list(watchdog.notes)
+    if link.connected:
+        progress("landing")
+        notes += _come_down(link, left_offboard=watchdog.left_offboard)
+    progress("done")
+    return MissionResult(reason, tuple(notes), pilot.log)
+
+
+def _come_down(link: MavsdkLink, *, left_offboard: bool) -> list[str]:
+    """Stop and land; return what went wrong."""
+    try:
+        if not left_offboard:
+            link.set_velocity_body(STOP)
+        link.land(LAND_TIMEOUT_S)
+    except LinkError as error:
+        return [str(error)]
+    return []
+
+
+def save_log(log: DecisionLog, path: Path) -> None:
+    """Write a decision log to an .npz: a temporary name first, then renamed."""
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        np.savez(file, **log.columns())
+    temporary.replace(path)

@@ -1,0 +1,158 @@
+"""The decision loop: observe -> infer -> act, and hold; every step stamped.
+
+Sequential, as in the paper: while the next decision is computed, the last command keeps flying.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from companion.camera import FrameSource
+
+from airl_mav.camera.frame import Frame
+from airl_mav.clock import Clock
+from airl_mav.constants import US_PER_S
+from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.stamps import DecisionLog
+from airl_mav.policy.actions import Action, Policy, limited
+from airl_mav.policy.observation import Kinematics, encode
+from companion.link import BodyVelocity, Link
+from companion.watchdog import Watchdog
+
+FRAME_WAIT_S = 0.1
+"""How long one wait for a frame lasts before the other conditions are looked at [s]."""
+
+ALTITUDE_P = 0.5
+"""Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
+
+MAX_VERTICAL_M_S = 1.0
+"""Limit of the altitude correction [m/s]."""
+
+
+@dataclass(frozen=True)
+class PilotSettings:
+    """How a policy is flown."""
+
+    hold_s: float = 0.5
+    """t3: how long an action is held before the next observation [s]."""
+    goal_radius_m: float = 2.0
+    """The goal is reached closer than this, seen from above [m]."""
+    altitude_m: float = 2.5
+    """Height above the start that is held [m]."""
+    max_speed_m_s: float = 5.0
+    """Horizontal speed limit of all actions [m/s]."""
+
+
+class Pilot:
+    """Flies a policy to a goal."""
+
+    def __init__(
+        self,
+        link: Link,
+        frames: FrameSource,
+        policy: Policy,
+        watchdog: Watchdog,
+        clock: Clock,
+        settings: PilotSettings,
+        *,
+        latency: LatencySampler | None = None,
+    ) -> None:
+        """Put the loop together.
+
+        Args:
+            link: The flight controller.
+            frames: The camera.
+            policy: What decides.
+            watchdog: Guards the setpoints.
+            clock: Simulated time.
+            settings: Hold time, goal radius, altitude, speed limit.
+            latency: Where to draw t2 from, to fly as a slower computer; None = as fast as it is.
+        """
+        self.log = DecisionLog()
+        self._link = link
+        self._frames = frames
+        self._policy = policy
+        self._watchdog = watchdog
+        self._clock = clock
+        self._settings = settings
+        self._latency = latency
+
+    def fly(self, goal: tuple[float, float], stop: threading.Event) -> str:
+        """Decide until the goal is reached, or something ends it; return why, in words.
+
+        Args:
+            goal: North, east [m] from the start.
+            stop: Set from outside to end the flight.
+
+        Raises:
+            LinkError: The flight controller refuses setpoints.
+        """
+        sequence = -1
+        while not stop.is_set():
+            if not self._link.connected:
+                return "link lost"
+            if self._watchdog.left_offboard:
+                return "watchdog"
+            self._watchdog.doing("waiting for a frame")
+            received = self._frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
+            if received is None:
+                continue
+            sequence = received.frame.sequence
+            state = self._link.kinematics()
+            away = np.hypot(goal[0] - state.position[0], goal[1] - state.position[1])
+            if away < self._settings.goal_radius_m:
+                return "goal reached"
+            if not self._decide(received.frame, received.received_us, state, goal, stop):
+                return "watchdog"
+        return "stopped"
+
+    def _decide(
+        self,
+        frame: Frame,
+        decoded_us: int,
+        state: Kinematics,
+        goal: tuple[float, float],
+        stop: threading.Event,
+    ) -> bool:
+        """Run one decision; False when the watchdog has ended the flight."""
+        clock, settings = self._clock, self._settings
+        self._watchdog.doing("inference")
+        started_us = clock.time_us()
+        action = limited(self._policy.act(encode(frame, state, goal)), settings.max_speed_m_s)
+        if self._latency is not None:
+            clock.sleep_until(started_us + self._latency.sample_us())
+        ready_us = clock.time_us()
+        setpoint = self._setpoint(action, self._link.kinematics())
+        hold_us = int(settings.hold_s * US_PER_S)
+        sent_us = clock.time_us()
+        if stop.is_set():
+            return True
+        if not self._watchdog.command(setpoint, hold_us):
+            return False
+        self._watchdog.doing("holding an action")
+        _sleep(clock, sent_us + hold_us, stop.is_set)
+        self.log.record(
+            frame.capture_time_us,
+            decoded_us,
+            started_us,
+            ready_us,
+            sent_us,
+            clock.time_us(),
+            setpoint.wire(),
+        )
+        return True
+
+    def _setpoint(self, action: Action, state: Kinematics) -> BodyVelocity:
+        """Add the vertical speed that holds the altitude."""
+        error_m = -self._settings.altitude_m - float(state.position[2])
+        down = max(-MAX_VERTICAL_M_S, min(MAX_VERTICAL_M_S, ALTITUDE_P * error_m))
+        return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
+
+
+def _sleep(clock: Clock, until_us: int, interrupted: Callable[[], bool]) -> None:
+    """Sleep until a time [µs] in slices short enough to be interrupted."""
+    while (now_us := clock.time_us()) < until_us and not interrupted():
+        clock.sleep_until(min(until_us, now_us + 50_000))

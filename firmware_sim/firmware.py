@@ -1,0 +1,126 @@
+"""The firmware process: simulation, MAVLink and camera, paced by the wall clock."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from airl_mav.clock import WallClock
+from airl_mav.constants import TICK_US, US_PER_S
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.pacing import Pacer
+from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+IDLE_S = 0.02
+"""How often requests are looked for while no episode stands [s]."""
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """An episode that has just been set up."""
+
+    time_us: int
+    epoch_ns: int
+
+
+class Firmware:
+    """Flies one episode after the other; its links and its camera stay."""
+
+    def __init__(
+        self, server: MavlinkServer, camera: CameraServer | None, clock: WallClock
+    ) -> None:
+        self.server = server
+        self.clock = clock
+        self.simulation: Simulation | None = None
+        self.on_tick: Callable[[Simulation], None] | None = None
+        """Called after every tick, if set."""
+        self._camera = camera
+        self._pacer = Pacer(clock)
+        self._tlog: TlogWriter | None = None
+
+    @property
+    def slipped_us(self) -> int:
+        """Simulated time given up since the start because the host could not keep up [µs]."""
+        return self._pacer.slipped_us
+
+    def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> Loaded:
+        """Replace the episode: a new arena, the vehicle at rest, the autopilot booting.
+
+        Args:
+            setup: The episode.
+            tlog: Where its MAVLink log goes; None = no log.
+            start_unix_us: Calendar time of this moment [µs since 1970].
+        """
+        self.discard()
+        start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
+        simulation = Simulation(setup, start_us=start_us, clock=self.clock)
+        # Building took wall time: the episode starts now.
+        behind_us = self.clock.time_us() - start_us
+        if behind_us > 0:
+            self.clock.slip(behind_us)
+        self.simulation = simulation
+        simulation.tick()
+        self.server.attach(simulation.autopilot)
+        if tlog is not None:
+            self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
+            self.server.log_to(self._tlog)
+        self._pacer.take_lateness()
+        # What lives for the whole episode need not be searched by the garbage collector: a full
+        # collection would stall the 250 Hz loop by tens of milliseconds.
+        gc.collect()
+        gc.freeze()
+        return Loaded(start_us, self.clock.epoch_ns)
+
+    def step(self) -> None:
+        """Wait for the next tick's wall time, then run it."""
+        simulation, server = self.simulation, self.server
+        if simulation is None:
+            self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
+            return
+        sockets = server.filenos()
+        self._pacer.wait(simulation.time_us, sockets, self._receive)
+        server.receive(self.clock.time_us())
+        simulation.tick()
+        server.send(simulation.time_us)
+        if self._camera is not None:
+            simulation.capture_due(self._camera.publish)
+        if self.on_tick is not None:
+            self.on_tick(simulation)
+
+    def _receive(self) -> None:
+        self.server.receive(self.clock.time_us())
+
+    def save(self, path: Path) -> None:
+        """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
+        if self.simulation is None:
+            return
+        lateness = self._pacer.take_lateness()
+        self.simulation.save(path, {"tick/lateness_us": np.asarray(lateness, np.int64)})
+        self._close_tlog()
+
+    def _close_tlog(self) -> None:
+        if self._tlog is not None:
+            self.server.log_to(None)
+            self._tlog.close()
+            self._tlog = None
+
+    def discard(self) -> None:
+        """Forget the episode."""
+        self._close_tlog()
+        if self.simulation is not None:
+            gc.unfreeze()
+            self.simulation.close()
+            self.simulation = None
+
+    def close(self) -> None:
+        """Release everything."""
+        self.discard()
+        self.server.close()
+        if self._camera is not None:
+            self._camera.close()
