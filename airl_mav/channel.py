@@ -69,10 +69,11 @@ class Fly(_Line):
 
 
 class Abort(_Line):
-    """End the mission now: stop, land."""
+    """End the mission now."""
 
     type: Literal["abort"] = "abort"
-    reason: str
+    land: bool
+    """Stop and land; False after a crash: there is nothing left to land."""
 
 
 class Shutdown(_Line):

@@ -8,6 +8,7 @@ this process hangs; `watchdog.py` is there for that.
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -28,6 +29,10 @@ TELEMETRY_HZ = 50.0
 
 POLL_S = 0.05
 """How often a condition is looked at while waiting for it [s]."""
+
+
+ARM_RETRY_S = 0.5
+"""Time between two requests to arm [s]."""
 
 
 class LinkError(Exception):
@@ -75,18 +80,21 @@ class Link(Protocol):
 class MavsdkLink:
     """MAVSDK over UDP or serial. Implements `Link`."""
 
-    def __init__(self, url: str, clock: Clock) -> None:
+    def __init__(self, url: str, clock: Clock, abandon: threading.Event | None = None) -> None:
         """Open a connection; `connect` waits for the vehicle.
 
         Args:
             url: MAVSDK connection, `udpin://127.0.0.1:14540` or `serial:///dev/ttyAMA0:921600`.
             clock: For time-outs.
+            abandon: Set from another thread to break off whatever is being waited for.
 
         Raises:
             UsageError: The URL is invalid or its port is taken.
         """
         self.url = url
-        self._clock = clock
+        self.clock = clock
+        """May be replaced between missions, by one that shares the simulator's epoch."""
+        self._abandon = abandon or threading.Event()
         # MAVSDK's own log goes to standard output; its findings reach us as results.
         log_subscribe(lambda *_: True)
         configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
@@ -156,16 +164,22 @@ class MavsdkLink:
         )
 
     def arm(self, timeout_s: float) -> None:
-        """Arm, asking again while the flight controller is not ready for it."""
+        """Wait until the flight controller reports good health, then arm.
+
+        Its health is told a few times a second, so the first request may still come too early:
+        it is repeated.
+        """
         deadline_us = self._deadline(timeout_s)
+        while not self.healthy:
+            self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm")
+            self._pause()
         while True:
             try:
                 self._action.arm()
                 return
             except ActionError as error:
-                if self._clock.time_us() >= deadline_us or not self.connected:
-                    raise LinkError(f"arming failed: {_reason(error)}") from None
-                self._pause()
+                self._check(deadline_us, f"arming failed: {_reason(error)}")
+                self._pause(ARM_RETRY_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float) -> None:
         """Take off and return when the altitude above the start is reached."""
@@ -216,16 +230,18 @@ class MavsdkLink:
             raise LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
-        return self._clock.time_us() + int(timeout_s * US_PER_S)
+        return self.clock.time_us() + int(timeout_s * US_PER_S)
 
     def _check(self, deadline_us: int, message: str) -> None:
         if not self.connected:
             raise LinkError("the flight controller is no longer heard")
-        if self._clock.time_us() >= deadline_us:
+        if self._abandon.is_set():
+            raise LinkError("abandoned")
+        if self.clock.time_us() >= deadline_us:
             raise LinkError(message)
 
-    def _pause(self) -> None:
-        self._clock.sleep_until(self._clock.time_us() + int(POLL_S * US_PER_S))
+    def _pause(self, seconds: float = POLL_S) -> None:
+        self.clock.sleep_until(self.clock.time_us() + int(seconds * US_PER_S))
 
 
 def _reason(error: Exception) -> str:

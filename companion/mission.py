@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from companion.camera import FrameSource
 
 from airl_mav.clock import Clock
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Policy
+from companion.camera import FrameSource
 from companion.link import STOP, LinkError, MavsdkLink
 from companion.pilot import Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
@@ -41,6 +41,7 @@ def fly_mission(
     goal: tuple[float, float],
     clock: Clock,
     stop: threading.Event,
+    abandon: threading.Event,
     progress: Callable[[str], None],
     *,
     pilot_settings: PilotSettings,
@@ -56,6 +57,8 @@ def fly_mission(
         goal: North, east [m] from the start.
         clock: Simulated time.
         stop: Set from outside to end the flight early; the vehicle then lands.
+        abandon: Set from outside to break off without landing: the vehicle has crashed. The same
+            event the link was made with.
         progress: Called with the name of each phase as it begins.
         pilot_settings: How the policy is flown.
         watchdog_settings: Bounds on silence.
@@ -76,8 +79,12 @@ def fly_mission(
         reason = str(error) if link.connected else "link lost"
     finally:
         watchdog.stop()
+    if abandon.is_set():
+        reason = "stopped"
     notes = list(watchdog.notes)
-    if link.connected:
+    if abandon.is_set():
+        notes += _let_go(link)
+    elif link.connected:
         progress("landing")
         notes += _come_down(link, left_offboard=watchdog.left_offboard)
     progress("done")
@@ -90,6 +97,15 @@ def _come_down(link: MavsdkLink, *, left_offboard: bool) -> list[str]:
         if not left_offboard:
             link.set_velocity_body(STOP)
         link.land(LAND_TIMEOUT_S)
+    except LinkError as error:
+        return [str(error)]
+    return []
+
+
+def _let_go(link: MavsdkLink) -> list[str]:
+    """Stop commanding; return what went wrong."""
+    try:
+        link.leave_offboard()
     except LinkError as error:
         return [str(error)]
     return []

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from companion.camera import FrameSource
 
 from airl_mav.camera.frame import Frame
 from airl_mav.clock import Clock
@@ -19,6 +18,7 @@ from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action, Policy, limited
 from airl_mav.policy.observation import Kinematics, encode
+from companion.camera import FrameSource
 from companion.link import BodyVelocity, Link
 from companion.watchdog import Watchdog
 

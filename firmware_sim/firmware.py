@@ -11,6 +11,7 @@ import numpy as np
 
 from airl_mav.clock import WallClock
 from airl_mav.constants import TICK_US, US_PER_S
+from firmware_sim.autopilot.state import Message
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacer
@@ -40,9 +41,16 @@ class Firmware:
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
         """Called after every tick, if set."""
+        self.on_message: Callable[[Message], None] | None = None
+        """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
         self._pacer = Pacer(clock)
         self._tlog: TlogWriter | None = None
+
+    @property
+    def camera_endpoint(self) -> str:
+        """Where frames are published; "" without a camera."""
+        return self._camera.endpoint if self._camera is not None else ""
 
     @property
     def slipped_us(self) -> int:
@@ -65,6 +73,7 @@ class Firmware:
         if behind_us > 0:
             self.clock.slip(behind_us)
         self.simulation = simulation
+        simulation.autopilot.on_message = self.on_message
         simulation.tick()
         self.server.attach(simulation.autopilot)
         if tlog is not None:

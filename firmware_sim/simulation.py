@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import Frame
 from airl_mav.clock import Clock
 from airl_mav.constants import TICK_US
 from airl_mav.flight.trajectory import TrajectoryRecorder
@@ -19,7 +20,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.autopilot.state import AutopilotState, Setpoint
 from firmware_sim.interfaces import SensorSample
-from firmware_sim.plant.depth_camera import DepthCamera
+from firmware_sim.plant.camera_server import DepthCamera
 from firmware_sim.plant.plant import Plant, Truth
 from firmware_sim.plant.wind import WindSettings
 
@@ -82,7 +83,10 @@ class Simulation:
         rng = np.random.default_rng(setup.seed)
         self.autopilot = BuiltinAutopilot(Parameters(setup.vehicle.parameters))
         self.plant = Plant(setup.vehicle, setup.arena, rng, start_us=start_us, wind=setup.wind)
-        self.camera = DepthCamera.from_profile(setup.vehicle.camera, setup.arena)
+        self._camera: DepthCamera | None = None
+        if setup.arena is not None:
+            self._camera = DepthCamera.from_profile(setup.vehicle.camera, setup.arena)
+            self._camera.reset(setup.arena, start_us)
         self.setpoints = SetpointLog()
         self.autopilot.on_setpoint = self.setpoints.accepted
         self.start_us = start_us
@@ -110,14 +114,12 @@ class Simulation:
             self._record_estimate(self.autopilot.state())
         self._ticks += 1
 
-    def capture_due(self, publish: Callable[[Any], None]) -> None:
-        """Hand a depth frame to `publish` when the camera is due."""
-        camera, truth = self.camera, self.truth
-        if not camera.due(self.time_us):
+    def capture_due(self, publish: Callable[[Frame], None]) -> None:
+        """Hand a depth frame to `publish` when the camera is due; an endless floor has none."""
+        camera, arena, truth = self._camera, self._arena, self.truth
+        if camera is None or arena is None or not camera.due(self.time_us):
             return
-        centers = None
-        if self._arena is not None:
-            centers = self._arena.centers_at(self.time_us - self.start_us)
+        centers = arena.centers_at(self.time_us - self.start_us)
         publish(camera.capture(self.time_us, truth.position, truth.quaternion, centers))
 
     def _record_estimate(self, state: AutopilotState) -> None:

@@ -16,6 +16,7 @@ from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.zones import zone_of
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
+from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 
@@ -42,7 +43,7 @@ class ArenaCommand:
     vehicle_width: float = 0.55
     """Width of the vehicle, m: the way from start to goal is at least this wide."""
 
-    goal_radius: float = 3.0
+    goal_radius: float = GOAL_RADIUS_M
     """Radius of the disc around the goal in the picture, m."""
 
 

@@ -71,6 +71,8 @@ class BuiltinAutopilot:
         self._home: Geodetic | None = None
         self.on_setpoint: Callable[[Setpoint, int], None] | None = None
         """Called with every accepted setpoint and its time of receipt, if set."""
+        self.on_message: Callable[[Message], None] | None = None
+        """Called with every text for the operator, if set."""
 
     # --- towards the plant
 
@@ -89,7 +91,7 @@ class BuiltinAutopilot:
         self._handle(Event.READY if estimate.healthy else Event.NOT_READY)
         for due in self._watch.events(self._flight, sample.time_us, sample.battery.remaining):
             if isinstance(due, Message):
-                self._messages.append(due)
+                self._say(due)
             else:
                 self._handle(due)
         self._output = self._control(estimate)
@@ -144,7 +146,7 @@ class BuiltinAutopilot:
         step = transition(before, event)
         self._flight = step.flight
         if step.text is not None:
-            self._messages.append(step.text)
+            self._say(step.text)
         if step.flight.mode is not before.mode and self._estimate is not None:
             self._guidance.enter(step.flight.mode, self._estimate)
         armed_now = before.phase < Phase.GROUND <= step.flight.phase
@@ -152,6 +154,11 @@ class BuiltinAutopilot:
             self._set_home(self._estimate)
             self._guidance.enter(step.flight.mode, self._estimate)
         return step.result
+
+    def _say(self, message: Message) -> None:
+        self._messages.append(message)
+        if self.on_message is not None:
+            self.on_message(message)
 
     def _set_home(self, estimate: Estimate) -> None:
         if self._estimator.origin is not None:
@@ -202,7 +209,7 @@ class BuiltinAutopilot:
         self._guidance.takeoff_altitude_m = default if altitude_m is None else altitude_m
         if altitude_m is None:
             text = f"Using default takeoff altitude: {default:.1f} m"
-            self._messages.append(Message(Severity.INFO, text))
+            self._say(Message(Severity.INFO, text))
         return self._handle(Event.TAKEOFF)
 
     def set_mode(self, mode: Mode) -> Result:

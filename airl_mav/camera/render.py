@@ -1,0 +1,83 @@
+"""A depth camera on a vehicle: where it sits, where it looks, and what it sees."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.raycast import render_depth
+from airl_mav.kernels import kernel
+from airl_mav.vehicle.rotation import Quat, Vec, multiply, rotate
+
+
+class Mount(NamedTuple):
+    """How a camera is fixed to the vehicle; a tuple, so that compiled loops take it."""
+
+    offset: Vec
+    """Position of the camera in the body frame FRD [m]."""
+    pitch_up: float
+    """Angle of the optical axis above the body's forward axis [rad]."""
+
+
+@kernel
+def camera_pose(
+    position: Vec | NDArray[np.float64], quaternion: Quat | NDArray[np.float64], mount: Mount
+) -> tuple[Vec, Quat]:
+    """Return the pose of a camera on a vehicle.
+
+    Args:
+        position: (3,) vehicle NED [m].
+        quaternion: (4,) unit [w, x, y, z] vehicle body -> NED.
+        mount: The camera's place on the body.
+
+    Returns:
+        Position NED [m] and quaternion [w, x, y, z] of the camera, as `render_depth` takes them.
+    """
+    q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
+    x, y, z = rotate(q, mount.offset)
+    # A positive turn about the body's right axis lifts the nose.
+    half = 0.5 * mount.pitch_up
+    tilt = (math.cos(half), 0.0, math.sin(half), 0.0)
+    return (position[0] + x, position[1] + y, position[2] + z), multiply(q, tilt)
+
+
+def render(
+    arena: Arena,
+    centers: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    max_range: float,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return the depth image (height, width) [m] of an arena; 0 = no return.
+
+    Args:
+        arena: What is seen.
+        centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
+        intrinsics: The camera.
+        max_range: Greatest depth along the optical axis that gives a return [m].
+        position: (3,) camera NED [m].
+        quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
+    """
+    k, obstacles = intrinsics, arena.obstacles
+    image = np.empty((k.height, k.width), np.float32)
+    render_depth(
+        image,
+        position,
+        quaternion,
+        k.focal,
+        k.cx,
+        k.cy,
+        max_range,
+        arena.bounds.as_array(),
+        obstacles.shape,
+        centers,
+        obstacles.half_size,
+        obstacles.yaw,
+    )
+    return image

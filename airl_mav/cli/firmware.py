@@ -1,0 +1,288 @@
+"""`airl-firmware`: flight controller, vehicle and camera alone, for any client."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena
+from airl_mav.channel import (
+    ChildChannel,
+    Failed,
+    FinishEpisode,
+    Loaded,
+    LoadEpisode,
+    Ready,
+    Saved,
+    Shutdown,
+    State,
+    Text,
+)
+from airl_mav.cli.common import EXIT_USAGE, run_command
+from airl_mav.clock import WallClock, utc_now
+from airl_mav.constants import US_PER_S
+from airl_mav.errors import UsageError
+from airl_mav.frames import quat_yaw
+from airl_mav.ports import LOOPBACK, Ports
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.state import Message
+from firmware_sim.firmware import Firmware
+from firmware_sim.mavlink.px4_links import px4_server
+from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.wind import WindSettings
+from firmware_sim.quiet import quiet_stdout
+from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.warm_up import warm_up
+
+STATE_EVERY = 10
+"""The harness hears the true state every so many ticks: 25 Hz."""
+
+
+@dataclass(frozen=True)
+class FirmwareCommand:
+    """Run the flight controller with its vehicle, until Ctrl-C."""
+
+    vehicle: str = "quad"
+    """Vehicle profile: a shipped name, or a path to a .toml."""
+
+    arena: str = "static-obstacles"
+    """Arena profile: a shipped name, or a path to a .toml."""
+
+    seed: int = 1
+    """Seed of arena, sensors and wind."""
+
+    speed: float = 1.0
+    """Simulated seconds per wall second, > 0."""
+
+    wind: WindSettings = field(default_factory=WindSettings)
+    """Wind; calm by default."""
+
+    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
+    """Ports."""
+
+    bind: str = LOOPBACK
+    """IPv4 address that the links and the camera bind."""
+
+    companion_host: str = LOOPBACK
+    """IPv4 address of the companion computer: MAVLink goes there unasked."""
+
+    gcs_host: str = LOOPBACK
+    """IPv4 address of the ground station."""
+
+    insecure: bool = False
+    """Allow addresses that other machines can reach. MAVLink has no authentication here yet."""
+
+    tlog: Path | None = None
+    """Write the MAVLink log of the onboard link to this file. None: no log."""
+
+    control: Literal["stdio"] | None = None
+    """stdio: take requests from a harness, JSON lines on standard input. None: stand alone."""
+
+
+def build(command: FirmwareCommand) -> Firmware:
+    """Bind all ports and return the firmware without an episode.
+
+    Raises:
+        UsageError: A port is taken, an address unusable, the speed not positive.
+    """
+    if not 0.0 < command.speed <= 100.0:
+        raise UsageError(f"--speed {command.speed:g}: accepted: 0 < value <= 100")
+    ports = command.ports
+    server = px4_server(
+        bind=command.bind,
+        api_remote=(command.companion_host, ports.api_port),
+        api_local_port=ports.api_local_port,
+        gcs_remote=(command.gcs_host, ports.gcs_port),
+        gcs_local_port=ports.gcs_local_port,
+        insecure=command.insecure,
+        boot_unix_us=unix_us(),
+    )
+    try:
+        camera = CameraServer(f"tcp://{command.bind}:{ports.camera_port or '*'}")
+    except UsageError:
+        server.close()
+        raise
+    return Firmware(server, camera, WallClock(command.speed))
+
+
+def setup(
+    command: FirmwareCommand, vehicle: VehicleProfile, arena: str, arena_seed: int, seed: int
+) -> EpisodeSetup:
+    """Return the episode of an arena and its seeds. Raises UsageError for a bad profile."""
+    spec = load_profile("arenas", arena, ArenaSpec)
+    concrete = generate(spec, arena_seed, name=arena, vehicle_width_m=vehicle.body.width_m)
+    return EpisodeSetup(vehicle, concrete, seed, command.wind)
+
+
+def unix_us() -> int:
+    """Return the calendar time [µs since 1970], for log headers."""
+    return int(utc_now().timestamp() * US_PER_S)
+
+
+def main() -> None:
+    """Entry point of `airl-firmware`."""
+    command = tyro.cli(FirmwareCommand, prog="airl-firmware")
+    run_command(lambda: serve(command) if command.control else stand_alone(command))
+
+
+def stand_alone(command: FirmwareCommand) -> int:
+    """Fly whatever the clients ask for, until Ctrl-C."""
+    console = Console()
+    vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+    episode = setup(command, vehicle, command.arena, command.seed, command.seed)
+    firmware = build(command)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        with quiet_stdout():
+            warm_up(vehicle)
+            firmware.load(episode, command.tlog, unix_us())
+        arena: Arena | None = episode.arena
+        console.print(
+            f"MAVSDK            udpin://{command.companion_host}:{command.ports.api_port}"
+        )
+        console.print(f"QGroundControl    UDP port {command.ports.gcs_port} (connects by itself)")
+        console.print(f"depth camera      {firmware.camera_endpoint}")
+        if arena is not None:
+            console.print(
+                f"goal              {arena.goal[0]:.1f} {arena.goal[1]:.1f} (north east, m)"
+            )
+        console.print("Ctrl-C ends it.")
+        firmware.on_message = lambda m: console.print(
+            f"[{m.severity.name.lower()}] {m.text}", markup=False
+        )
+        while not stop.is_set():
+            firmware.step()
+    finally:
+        firmware.close()
+    return 0
+
+
+def serve(command: FirmwareCommand) -> int:
+    """Fly episodes on request of a harness."""
+    channel = ChildChannel.on_stdio()
+    # The harness decides when to end, also on Ctrl-C: it closes the pipe.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    requests: queue.Queue[Any] = queue.Queue()
+    channel.listen(requests.put, lambda: requests.put(Shutdown()))
+    try:
+        vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+        firmware = build(command)
+        warm_up(vehicle)
+    except UsageError as error:
+        channel.send(Failed(message=str(error)))
+        return EXIT_USAGE
+    service = _Service(command, vehicle, firmware, channel)
+    channel.send(Ready(details={"camera": firmware.camera_endpoint}))
+    try:
+        while service.handle_all(requests):
+            firmware.step()
+    except UsageError as error:
+        channel.send(Failed(message=str(error)))
+        return EXIT_USAGE
+    finally:
+        firmware.close()
+    return 0
+
+
+class _Service:
+    """Requests of the harness on a firmware."""
+
+    def __init__(
+        self,
+        command: FirmwareCommand,
+        vehicle: VehicleProfile,
+        firmware: Firmware,
+        channel: ChildChannel,
+    ) -> None:
+        self._command = command
+        self._vehicle = vehicle
+        self._firmware = firmware
+        self._channel = channel
+        self._episode = -1
+        self._record = Path()
+        self._ticks = 0
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            LoadEpisode: self._load,
+            FinishEpisode: self._finish,
+        }
+        firmware.on_tick = self._report
+        firmware.on_message = self._tell
+
+    def handle_all(self, requests: queue.Queue[Any]) -> bool:
+        """Handle what has arrived; False when it is time to end."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                request = requests.get_nowait()
+                if isinstance(request, Shutdown):
+                    return False
+                self._handlers[type(request)](request)
+        return True
+
+    def _load(self, request: LoadEpisode) -> None:
+        command = self._command
+        episode = setup(command, self._vehicle, request.arena, request.arena_seed, request.seed)
+        tlog = Path(request.tlog) if request.tlog else None
+        loaded = self._firmware.load(episode, tlog, unix_us())
+        self._episode, self._record = request.episode, Path(request.record)
+        goal = episode.arena.goal if episode.arena is not None else np.zeros(2)
+        self._channel.send(
+            Loaded(
+                episode=request.episode,
+                time_us=loaded.time_us,
+                epoch_ns=loaded.epoch_ns,
+                goal=(float(goal[0]), float(goal[1])),
+            )
+        )
+
+    def _finish(self, _: FinishEpisode) -> None:
+        self._firmware.save(self._record)
+        self._channel.send(Saved(path=str(self._record)))
+        self._firmware.discard()
+
+    def _report(self, simulation: Simulation) -> None:
+        self._ticks += 1
+        hit = simulation.plant.collisions
+        if self._ticks % STATE_EVERY and not hit:
+            return
+        truth, flight = simulation.truth, simulation.autopilot.flight
+        x, y, z = (float(c) for c in truth.position)
+        flying_hits = [c.what for c in hit if c.what != "floor" or flight.phase is Phase.AIR]
+        self._channel.send(
+            State(
+                time_us=truth.time_us,
+                position=(x, y, z),
+                speed_m_s=float(np.linalg.norm(truth.velocity)),
+                yaw=quat_yaw(truth.quaternion),
+                battery=truth.battery_remaining,
+                collision=flying_hits[0] if flying_hits else None,
+                mode=flight.mode.name.lower(),
+                armed=flight.phase >= Phase.GROUND,
+                landed=flight.phase < Phase.AIR,
+                slipped_us=self._firmware.slipped_us,
+            )
+        )
+
+    def _tell(self, message: Message) -> None:
+        simulation = self._firmware.simulation
+        time_us = simulation.time_us if simulation is not None else 0
+        self._channel.send(Text(time_us=time_us, severity=int(message.severity), text=message.text))
+
+
+if __name__ == "__main__":
+    main()

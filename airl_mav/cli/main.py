@@ -1,0 +1,34 @@
+"""`airl`: everything around a rehearsal, one subcommand a file."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import tyro
+
+from airl_mav.cli import arena, report
+from airl_mav.cli.common import run_command
+
+Command = (
+    Annotated[arena.ArenaCommand, tyro.conf.subcommand("arena", prefix_name=False)]
+    | Annotated[report.ReportCommand, tyro.conf.subcommand("report", prefix_name=False)]
+)
+
+
+def main() -> None:
+    """Entry point of `airl`."""
+    # tyro's types cannot say that a union of dataclasses gives one of them.
+    command = tyro.cli(Command, prog="airl", description=__doc__)  # type: ignore[arg-type]
+    run_command(lambda: _run(command))
+
+
+def _run(command: object) -> int:
+    if isinstance(command, arena.ArenaCommand):
+        return arena.run(command)
+    if isinstance(command, report.ReportCommand):
+        return report.run(command)
+    raise TypeError(f"no such command: {command!r}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,237 @@
+"""`airl-sitl`: the front door. Rehearses a policy in a simulated vehicle, through real MAVLink."""
+
+from __future__ import annotations
+
+import signal
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+from rich.console import Console
+
+from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, run_command
+from airl_mav.errors import UsageError
+from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
+from airl_mav.flight.setup import Part, Setup
+from airl_mav.harness.progress import RichObserver
+from airl_mav.harness.rehearsal import Plan, ProcessPlan, Rehearsal, RehearsalError
+from airl_mav.harness.run_folder import RunFolder
+from airl_mav.latency.injection import choose_injection
+from airl_mav.policy.registry import policy_description
+from airl_mav.ports import LOOPBACK, Ports
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile
+from companion.pilot import PilotSettings
+from companion.watchdog import WatchdogSettings
+from firmware_sim.plant.wind import WindSettings
+
+ARRIVAL_SHARE = 0.8
+"""The companion flies to this share of the goal radius: it knows its place only by estimate, while
+the referee measures the true one."""
+
+
+@dataclass(frozen=True)
+class SitlCommand:
+    """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report."""
+
+    vehicle: str = "quad"
+    """Vehicle profile: a shipped name, or a path to a .toml."""
+
+    arena: str = "static-obstacles"
+    """Arena profile: a shipped name, or a path to a .toml."""
+
+    policy: str = "greedy"
+    """Policy that decides."""
+
+    computer: str = "workstation"
+    """Computer profile to fly as: a shipped name, or a path to a .toml."""
+
+    workload: str | None = None
+    """Workload of the computer profile whose latency t2 is injected. None: t2 is what this machine
+    takes."""
+
+    episodes: int = 3
+    """Number of episodes, >= 1."""
+
+    seed: int = 1
+    """Seed; episode i uses seed + i for arena, sensors, wind and latency."""
+
+    speed: float = 1.0
+    """Simulated seconds per wall second, > 0. Latencies count in simulated time."""
+
+    goal_radius: float = GOAL_RADIUS_M
+    """The goal is reached closer than this, seen from above, m."""
+
+    time_limit: float = TIME_LIMIT_S
+    """Longest flight from the start of navigation, s."""
+
+    hold: float = PilotSettings.hold_s
+    """t3: how long an action is held before the next observation, s."""
+
+    altitude: float = PilotSettings.altitude_m
+    """Height above the start that is flown, m."""
+
+    watchdog: tyro.conf.OmitArgPrefixes[WatchdogSettings] = field(default_factory=WatchdogSettings)
+    """Bounds on silence."""
+
+    wind: WindSettings = field(default_factory=WindSettings)
+    """Wind; calm by default."""
+
+    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
+    """Ports."""
+
+    out: Path | None = None
+    """Run folder. None: runs/<UTC time>-sitl-<policy>."""
+
+
+def main() -> None:
+    """Entry point of `airl-sitl`."""
+    command = tyro.cli(SitlCommand, prog="airl-sitl")
+    run_command(lambda: run(command))
+
+
+def run(command: SitlCommand, console: Console | None = None) -> int:
+    """Fly all episodes and write the report.
+
+    Args:
+        command: What was asked for.
+        console: Where to print; None means standard output.
+
+    Returns:
+        Exit status: 0 all episodes flown, 1 a process died, 130 Ctrl-C.
+
+    Raises:
+        UsageError: The input cannot be used; nothing was flown.
+    """
+    console = console or Console()
+    setup = check(command)
+    folder = RunFolder.create(
+        command.out,
+        f"sitl-{command.policy}",
+        asdict(command),
+        setup=setup,
+        seeds=[command.seed + i for i in range(command.episodes)],
+    )
+    signal.signal(signal.SIGTERM, _interrupt)
+    console.print(f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {command.policy}")
+    console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
+    console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
+    code = 0
+    with RichObserver(console, command.episodes) as observer:
+        try:
+            with Rehearsal(plan(command, setup), folder, observer) as rehearsal:
+                rehearsal.run()
+        except RehearsalError as error:
+            console.print(f"error: {error}", style="red", markup=False, highlight=False)
+            code = EXIT_BROKEN
+        except KeyboardInterrupt:
+            console.print("interrupted: what was flown is kept", style="yellow")
+            code = EXIT_INTERRUPTED
+        finally:
+            folder.sweep()
+    conclude(folder, console)
+    return code
+
+
+def check(command: SitlCommand) -> Setup:
+    """Check everything that can be wrong before anything starts.
+
+    Returns:
+        What is flown on what.
+
+    Raises:
+        UsageError: Names the option, its value and what is accepted.
+    """
+    _in_range("--episodes", command.episodes, 1, 100_000)
+    _in_range("--seed", command.seed, 0, 2**31)
+    _in_range("--speed", command.speed, 0.01, 20.0)
+    _in_range("--goal-radius", command.goal_radius, 0.2, 50.0)
+    _in_range("--time-limit", command.time_limit, 1.0, 3600.0)
+    _in_range("--hold", command.hold, 0.0, 10.0)
+    _in_range("--altitude", command.altitude, 0.5, 100.0)
+    vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+    arena = load_profile("arenas", command.arena, ArenaSpec)
+    computer = load_computer(command.computer)
+    injection = choose_injection(computer, command.workload)
+    hover_s = command.watchdog.hover_after_s
+    return Setup(
+        level="sitl",
+        vehicle=Part(command.vehicle, vehicle.description),
+        arena=Part(command.arena, arena.description),
+        policy=Part(command.policy, policy_description(command.policy)),
+        computer=Part(command.computer, computer.description),
+        computer_watts=computer.watts,
+        injection=injection,
+        speed=command.speed,
+        between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
+    )
+
+
+def _in_range(option: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise UsageError(f"{option} {value:g}: accepted: {low:g} <= value <= {high:g}")
+
+
+def plan(command: SitlCommand, setup: Setup) -> Plan:
+    """Turn the command into the arguments of the two processes."""
+    ports, wind, watchdog = command.ports, command.wind, command.watchdog
+    firmware = [
+        *("--control", "stdio"),
+        *("--vehicle", command.vehicle),
+        *("--speed", f"{command.speed!r}"),
+        *("--wind.north-m-s", f"{wind.north_m_s!r}", "--wind.east-m-s", f"{wind.east_m_s!r}"),
+        *("--wind.gust-m-s", f"{wind.gust_m_s!r}", "--wind.gust-time-s", f"{wind.gust_time_s!r}"),
+        *("--api-port", f"{ports.api_port}", "--api-local-port", f"{ports.api_local_port}"),
+        *("--gcs-port", f"{ports.gcs_port}", "--gcs-local-port", f"{ports.gcs_local_port}"),
+        *("--camera-port", f"{ports.camera_port}"),
+    ]
+    companion = [
+        *("--control", "stdio"),
+        *("--policy", command.policy),
+        *("--computer", command.computer),
+        *(("--workload", command.workload) if command.workload is not None else ()),
+        *("--connect", f"udpin://{LOOPBACK}:{ports.api_port}"),
+        *("--camera", f"tcp://{LOOPBACK}:{ports.camera_port}"),
+        *("--speed", f"{command.speed!r}"),
+        *("--hold-s", f"{command.hold!r}", "--altitude-m", f"{command.altitude!r}"),
+        *("--goal-radius-m", f"{ARRIVAL_SHARE * command.goal_radius!r}"),
+        *("--decision-timeout-s", f"{watchdog.decision_timeout_s!r}"),
+        *("--leave-after-s", f"{watchdog.leave_after_s!r}"),
+        *("--hover-after-s", f"{watchdog.hover_after_s!r}"),
+    ]
+    return Plan(
+        firmware=ProcessPlan("airl_mav.cli.firmware", firmware),
+        companion=ProcessPlan("airl_mav.cli.companion", companion),
+        arena=command.arena,
+        seed=command.seed,
+        episodes=command.episodes,
+        goal_radius_m=command.goal_radius,
+        time_limit_s=command.time_limit,
+        speed=command.speed,
+        computer_watts=setup.computer_watts,
+    )
+
+
+def conclude(folder: RunFolder, console: Console) -> None:
+    """Print the tables and write the report of what was flown."""
+    # Imported late: the figures take a second to load, and nobody waits for them before a flight.
+    from airl_mav.report.rebuild import rebuild
+    from airl_mav.report.terminal import print_report
+
+    flown, page = rebuild(folder.path)
+    if page is None:
+        console.print(f"no episode was finished; logs in {folder.path}")
+        return
+    print_report(flown, console, page)
+
+
+def _interrupt(*_: object) -> NoReturn:
+    """Treat SIGTERM like Ctrl-C."""
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    main()

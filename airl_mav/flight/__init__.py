@@ -1,0 +1,1 @@
+"""Flights: what was flown, how it ended, how well it went."""

@@ -1,0 +1,122 @@
+"""The referee: when an episode ends, and how it is judged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from airl_mav.constants import US_PER_S
+
+
+GOAL_RADIUS_M = 3.0
+"""Default goal radius [m]: that of the paper's code, seen from above."""
+
+TIME_LIMIT_S = 120.0
+"""Default longest flight from the start of navigation [s]. The paper's code counts 750 steps; its
+slowest policies took 48 s on average."""
+
+
+class Outcome(str, Enum):
+    """How an episode ended."""
+
+    SUCCESS = "success"
+    COLLISION = "collision"
+    TIMEOUT = "timeout"
+    BATTERY = "battery"
+    ABORTED = "aborted"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a flight has to do."""
+
+    goal: tuple[float, float]
+    """North, east [m]."""
+    goal_radius_m: float
+    """The goal is reached closer than this, seen from above [m]."""
+    time_limit_s: float
+    """Longest time from the start of navigation [s]."""
+
+
+@dataclass(frozen=True)
+class TruthSample:
+    """What the referee sees of the true state."""
+
+    time_us: int
+    """Simulated time [µs]."""
+    position: tuple[float, float, float]
+    """NED [m]."""
+    collision: str | None
+    """What was hit, None so far; latched by the plant."""
+    battery_remaining: float
+    """Charge left, 1 to 0."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How and when an episode ended."""
+
+    outcome: Outcome
+    reason: str
+    time_us: int
+    """Simulated time of the sample that decided [µs]."""
+
+
+class Referee:
+    """Judges one episode from its true samples. Pure: no clock, no randomness.
+
+    The tests, in this order (that of the paper's code, with its missing battery test): goal,
+    collision, battery, time limit. The goal and the time limit count from the start of navigation;
+    a collision or an empty battery ends the take-off too. The first verdict stands.
+    """
+
+    def __init__(self, task: Task) -> None:
+        """Take the task. Raises ValueError when no flight could fulfil it."""
+        if not task.goal_radius_m > 0.0:
+            raise ValueError(f"goal_radius_m={task.goal_radius_m}: must be > 0")
+        if not task.time_limit_s > 0.0:
+            raise ValueError(f"time_limit_s={task.time_limit_s}: must be > 0")
+        self.task = task
+        self.navigation_us: int | None = None
+        """When navigation began [µs]; None during the take-off."""
+        self.verdict: Verdict | None = None
+
+    def start_navigation(self, time_us: int) -> None:
+        """Say that take-off is over and the policy flies. Raises ValueError when said twice."""
+        if self.navigation_us is not None:
+            raise ValueError(f"navigation already began at {self.navigation_us} µs")
+        self.navigation_us = time_us
+
+    def abort(self, time_us: int, reason: str) -> Verdict:
+        """End the episode for a reason outside the flight: a crash, Ctrl-C, a lost process."""
+        if self.verdict is None:
+            self.verdict = Verdict(Outcome.ABORTED, reason, time_us)
+        return self.verdict
+
+    def observe(self, sample: TruthSample) -> Verdict | None:
+        """Take the next sample; return the verdict once there is one."""
+        if self.verdict is None:
+            found = self._judge(sample)
+            if found is not None:
+                self.verdict = Verdict(*found, sample.time_us)
+        return self.verdict
+
+    def _judge(self, sample: TruthSample) -> tuple[Outcome, str] | None:
+        """Return outcome and reason of this sample, if it decides."""
+        task = self.task
+        flying = self.navigation_us is not None and sample.time_us >= self.navigation_us
+        if flying:
+            distance = math.hypot(
+                sample.position[0] - task.goal[0], sample.position[1] - task.goal[1]
+            )
+            if distance < task.goal_radius_m:
+                return Outcome.SUCCESS, f"{distance:.2f} m from the goal"
+        if sample.collision is not None:
+            phase = "" if flying else " during the take-off"
+            return Outcome.COLLISION, f"hit {sample.collision}{phase}"
+        if sample.battery_remaining <= 0.0:
+            return Outcome.BATTERY, "battery empty"
+        if flying and sample.time_us - (self.navigation_us or 0) >= task.time_limit_s * US_PER_S:
+            return Outcome.TIMEOUT, f"{distance:.2f} m from the goal after {task.time_limit_s:g} s"
+        return None

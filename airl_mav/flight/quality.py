@@ -1,0 +1,78 @@
+"""Quality of flight of one episode: time, distance, energy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from airl_mav.constants import US_PER_S
+from airl_mav.flight.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A part of a flight."""
+
+    time_s: float
+    distance_m: float
+    """Path length in three dimensions [m]."""
+    energy_j: float
+    """Electrical energy of the vehicle, without its computer [J]."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """The measures of one episode. All but `takeoff` count from the start of navigation."""
+
+    flight_time_s: float
+    distance_m: float
+    """Path length in three dimensions [m]."""
+    energy_j: float
+    """Electrical energy of the vehicle, without its computer [J]."""
+    computer_energy_j: float
+    """Energy of the onboard computer: its watts times the flight time [J]."""
+    mean_speed_m_s: float
+    max_speed_m_s: float
+    takeoff: Leg
+
+
+def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
+    """Measure the part of a flight between two simulated times [µs]."""
+    part = trajectory.between(start_us, end_us)
+    steps_s = np.diff(part.time_us) / US_PER_S
+    return Leg(
+        time_s=(end_us - start_us) / US_PER_S,
+        distance_m=float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum()),
+        energy_j=float(np.sum(part.power_w[1:] * steps_s)),
+    )
+
+
+def measure_quality(
+    trajectory: Trajectory, navigation_us: int, ended_us: int, computer_watts: float
+) -> Quality:
+    """Measure an episode.
+
+    Args:
+        trajectory: The whole episode, take-off included.
+        navigation_us: Start of navigation, simulated time [µs].
+        ended_us: Time of the verdict, simulated [µs].
+        computer_watts: Power of the onboard computer [W].
+
+    Raises:
+        ValueError: The end comes before the start.
+    """
+    if ended_us < navigation_us:
+        raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")
+    leg = measure_leg(trajectory, navigation_us, ended_us)
+    speed = trajectory.between(navigation_us, ended_us).speed()
+    began_us = min(int(trajectory.time_us[0]), navigation_us) if len(trajectory) else navigation_us
+    return Quality(
+        flight_time_s=leg.time_s,
+        distance_m=leg.distance_m,
+        energy_j=leg.energy_j,
+        computer_energy_j=computer_watts * leg.time_s,
+        mean_speed_m_s=leg.distance_m / leg.time_s if leg.time_s else 0.0,
+        max_speed_m_s=float(speed.max()) if speed.size else 0.0,
+        takeoff=measure_leg(trajectory, began_us, navigation_us),
+    )

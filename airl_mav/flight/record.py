@@ -1,0 +1,73 @@
+"""The record of one episode: one JSON line of `episodes.jsonl`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from pydantic import TypeAdapter, ValidationError
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
+
+SCHEMA = 1
+"""Version of the line's schema; docs/run-folder.md describes it."""
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """What is kept of an episode beside its raw arrays."""
+
+    index: int
+    """Number of the episode in its run, from 0; names its arrays and its tlog."""
+    seed: int
+    """Seed of the episode: sensors, wind, latencies."""
+    arena: str
+    arena_seed: int
+    outcome: Outcome
+    reason: str
+    goal: tuple[float, float]
+    """North, east [m]."""
+    goal_radius_m: float
+    time_limit_s: float
+    started_us: int
+    """Simulated time of the reset [µs]: moving obstacles count from here."""
+    navigation_us: int | None
+    """Simulated time at which the policy took over [µs]; None when it never did."""
+    ended_us: int
+    """Simulated time of the verdict [µs]."""
+    wall_s: float | None
+    """Wall time from reset to verdict [s]; None where time is not paced (lockstep)."""
+    slipped_us: int
+    """Simulated time given up because the host could not keep pace [µs]."""
+    battery_remaining: float | None
+    """Charge left at the end, 1 to 0."""
+    quality: Quality | None
+    """None when navigation never began."""
+    notes: tuple[str, ...] = ()
+    """What else happened: failsafes, watchdog trips."""
+    schema: int = SCHEMA
+
+    def to_json(self) -> str:
+        """Return one JSON line, without its newline. Raises ValueError on NaN or infinity."""
+        return json.dumps(asdict(self), allow_nan=False, separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, line: str | bytes) -> EpisodeRecord:
+        """Read one JSON line. Raises ValueError, its message one line, when it is none of ours."""
+        try:
+            data = json.loads(line)
+        except ValueError as error:
+            raise ValueError(f"not JSON: {error}") from None
+        schema = data.get("schema") if isinstance(data, dict) else None
+        if schema != SCHEMA:
+            raise ValueError(f"schema = {schema!r}: accepted: {SCHEMA}")
+        try:
+            return _ADAPTER.validate_python(data)
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(str(part) for part in first["loc"])
+            raise ValueError(f"{field} = {first['input']!r}: {first['msg']}") from None
+
+
+_ADAPTER = TypeAdapter(EpisodeRecord)

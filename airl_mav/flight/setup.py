@@ -1,0 +1,38 @@
+"""What was flown on what: the facts that head every report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from airl_mav.latency.injection import Injection
+
+Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a rehearsal: the vehicle, the arena, the policy, the computer."""
+
+    name: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The parts of a rehearsal, in words."""
+
+    level: Level
+    """Rung of the fidelity ladder."""
+    vehicle: Part
+    arena: Part
+    policy: Part
+    computer: Part
+    computer_watts: float
+    """Power of the onboard computer [W]."""
+    injection: Injection
+    """The decision latency t2: measured, injected or estimated."""
+    speed: float | None
+    """Simulated seconds per wall second; None where time is not paced (lockstep)."""
+    between_commands: str
+    """What the vehicle does between commands: `persist`, `hover-after 60 ms`."""

@@ -1,0 +1,98 @@
+"""Quality of flight over many episodes: means and rates, each with its interval and its n."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+BOOTSTRAP_SEED = 20_210_409
+"""The same episodes always get the same interval."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 95 % interval; None where there is nothing to work it out from."""
+
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int
+    """Number of episodes behind the figure."""
+
+
+@dataclass(frozen=True)
+class Aggregate:
+    """A run in figures. Times, distances and energies are means over the successful episodes."""
+
+    success_rate: Estimate
+    """Fraction, 0 to 1, over all episodes that were not aborted."""
+    flight_time_s: Estimate
+    distance_m: Estimate
+    energy_j: Estimate
+    computer_energy_j: Estimate
+    mean_speed_m_s: Estimate
+    outcomes: dict[Outcome, int]
+    """Number of episodes by outcome, aborted ones included."""
+
+
+def wilson(successes: int, n: int) -> Estimate:
+    """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927)."""
+    if n == 0:
+        return Estimate(None, None, None, 0)
+    interval = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
+    return Estimate(successes / n, float(interval.low), float(interval.high), n)
+
+
+def bootstrap_mean(values: ArrayLike) -> Estimate:
+    """Return the mean of values (n,) with a bootstrap 95 % interval (BCa, seeded).
+
+    One value has no interval. Equal values have one of width zero.
+    """
+    data = np.asarray(values, np.float64)
+    if not data.size:
+        return Estimate(None, None, None, 0)
+    mean = float(data.mean())
+    if data.size == 1:
+        return Estimate(mean, None, None, 1)
+    if np.ptp(data) == 0.0:
+        return Estimate(mean, mean, mean, data.size)
+    interval = stats.bootstrap(
+        (data,),
+        np.mean,
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
+        method="BCa",
+    ).confidence_interval
+    return Estimate(mean, float(interval.low), float(interval.high), data.size)
+
+
+def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
+    """Work out a run's figures. An aborted episode was no test of the policy: it counts nowhere."""
+    outcomes = dict.fromkeys(Outcome, 0)
+    for episode in episodes:
+        outcomes[episode.outcome] += 1
+    flown = [episode for episode in episodes if episode.outcome is not Outcome.ABORTED]
+    good = [
+        episode.quality
+        for episode in flown
+        if episode.outcome is Outcome.SUCCESS and episode.quality is not None
+    ]
+    return Aggregate(
+        success_rate=wilson(outcomes[Outcome.SUCCESS], len(flown)),
+        flight_time_s=bootstrap_mean([quality.flight_time_s for quality in good]),
+        distance_m=bootstrap_mean([quality.distance_m for quality in good]),
+        energy_j=bootstrap_mean([quality.energy_j for quality in good]),
+        computer_energy_j=bootstrap_mean([quality.computer_energy_j for quality in good]),
+        mean_speed_m_s=bootstrap_mean([quality.mean_speed_m_s for quality in good]),
+        outcomes=outcomes,
+    )

@@ -1,0 +1,147 @@
+"""The true path of one episode, sampled at 50 Hz from the plant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from airl_mav.constants import US_PER_S
+
+SAMPLE_US = 20_000
+"""Time between samples [µs]: 50 Hz."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """n samples of the vehicle's true state; world NED, body FRD."""
+
+    time_us: NDArray[np.int64]  # (n,) simulated time, increasing
+    position: NDArray[np.float64]  # (n, 3) NED [m]
+    velocity: NDArray[np.float64]  # (n, 3) NED [m/s]
+    quaternion: NDArray[np.float64]  # (n, 4) [w, x, y, z] body -> world
+    power_w: NDArray[np.float64]  # (n,) electrical power of the vehicle, without its computer
+    """Mean over the time since the sample before, so that power times time adds up to the energy
+    that was integrated at the full tick rate."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and order. Raises ValueError."""
+        n = len(self.time_us)
+        shapes = {"position": (n, 3), "velocity": (n, 3), "quaternion": (n, 4), "power_w": (n,)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name}: shape {getattr(self, name).shape}, expected {shape}")
+        if np.any(np.diff(self.time_us) <= 0):
+            raise ValueError("time_us: must increase")
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(self.time_us)
+
+    def speed(self) -> NDArray[np.float64]:
+        """Return the speed (n,) [m/s], three-dimensional."""
+        speed: NDArray[np.float64] = np.linalg.norm(self.velocity, axis=1)
+        return speed
+
+    def between(self, start_us: int, end_us: int) -> Trajectory:
+        """Return the part from `start_us` to `end_us` [µs], its ends interpolated.
+
+        Samples beyond the recording are not made up: the part ends where the recording does. It
+        is empty when the two do not overlap.
+        """
+        if not len(self):
+            return self
+        start = max(start_us, int(self.time_us[0]))
+        end = min(end_us, int(self.time_us[-1]))
+        if end < start:
+            return self._rows(np.zeros(0, np.int64))
+        inside = self.time_us[(self.time_us > start) & (self.time_us < end)]
+        return self._rows(np.unique(np.concatenate([[start], inside, [end]]).astype(np.int64)))
+
+    def _rows(self, times: NDArray[np.int64]) -> Trajectory:
+        """Return the state at the given times [µs], all inside the recording."""
+        before = np.searchsorted(self.time_us, times, side="left")
+
+        def linear(values: NDArray[np.float64]) -> NDArray[np.float64]:
+            at = [np.interp(times, self.time_us, column) for column in values.T]
+            return np.stack(at, axis=1)
+
+        quaternion = linear(self._continuous_quaternion())
+        quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+        # Power is a mean over the step that ends at a sample: the step a time falls in has it.
+        return Trajectory(
+            times, linear(self.position), linear(self.velocity), quaternion, self.power_w[before]
+        )
+
+    def _continuous_quaternion(self) -> NDArray[np.float64]:
+        """Return the quaternions with signs flipped so that neighbours lie close."""
+        dots = np.sum(self.quaternion[1:] * self.quaternion[:-1], axis=1)
+        signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
+        near: NDArray[np.float64] = self.quaternion * np.concatenate([[1.0], signs])[:, None]
+        return near
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays by field name, for a file."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Trajectory:
+        """Build from arrays by field name. Raises KeyError or ValueError when they do not fit."""
+        return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+
+
+class TrajectoryRecorder:
+    """Collects the true state tick by tick and keeps it at 50 Hz."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._times: list[int] = []
+        self._last_us: int | None = None
+        self._kept_us = 0
+        self._energy_j = 0.0
+
+    def add(
+        self,
+        time_us: int,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        quaternion: ArrayLike,
+        power_w: float,
+        *,
+        keep: bool = False,
+    ) -> None:
+        """Take the state after one tick.
+
+        Args:
+            time_us: Simulated time [µs], later than the call before.
+            position: (3,) NED [m].
+            velocity: (3,) NED [m/s].
+            quaternion: (4,) [w, x, y, z] body -> world.
+            power_w: Electrical power over the tick that ends now [W].
+            keep: Keep this one even between samples: the last moment of an episode.
+
+        Raises:
+            ValueError: Time does not advance.
+        """
+        if self._last_us is not None and time_us <= self._last_us:
+            raise ValueError(f"time_us={time_us}: must be later than {self._last_us}")
+        if self._last_us is not None:
+            self._energy_j += power_w * (time_us - self._last_us) / US_PER_S
+        self._last_us = time_us
+        first = not self._times
+        if not (first or keep or time_us - self._kept_us >= SAMPLE_US):
+            return
+        mean_w = power_w if first else self._energy_j * US_PER_S / (time_us - self._kept_us)
+        self._times.append(time_us)
+        self._rows.append((*map(float, np.concatenate([position, velocity, quaternion])), mean_w))
+        self._kept_us, self._energy_j = time_us, 0.0
+
+    def trajectory(self) -> Trajectory:
+        """Return what was recorded so far."""
+        rows = np.array(self._rows, np.float64).reshape(-1, 11)
+        return Trajectory(
+            np.array(self._times, np.int64), rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10]
+        )

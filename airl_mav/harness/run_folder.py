@@ -1,0 +1,243 @@
+"""The folder a run leaves behind: written so that a kill at any moment loses one episode at most.
+
+docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
+which is written last; arrays without a line belong to an episode that never ended.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from airl_mav.clock import utc_now
+from airl_mav.errors import UsageError
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.setup import Setup
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.harness.atomic import add_arrays, replace_file
+from airl_mav.harness.provenance import describe_machine, git_state, package_versions
+
+SCHEMA = 1
+"""Version of the folder's layout and of `run.json`."""
+
+RUN_FILE = "run.json"
+EPISODES_FILE = "episodes.jsonl"
+LATENCY_FILE = "latency.npz"
+TRAJECTORIES_FILE = "trajectories.npz"
+
+Arrays = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What `run.json` holds."""
+
+    name: str
+    created_utc: str
+    """ISO 8601."""
+    setup: Setup
+    config: dict[str, Any]
+    """Every setting of the run, as given."""
+    seeds: tuple[int, ...]
+    """Seed of each episode planned, by index."""
+    versions: dict[str, str]
+    """Packages by name."""
+    machine: dict[str, Any]
+    git: dict[str, Any] | None
+    """Commit of the checkout, and whether it was changed; None for an installed wheel."""
+    schema: int = SCHEMA
+
+
+_INFO = TypeAdapter(RunInfo)
+
+
+@dataclass(frozen=True)
+class LoadedRun:
+    """A run read back. The mappings are by episode index and may lack episodes."""
+
+    path: Path
+    info: RunInfo
+    episodes: tuple[EpisodeRecord, ...]
+    latency: dict[int, Arrays]
+    trajectories: dict[int, Trajectory]
+
+
+class RunFolder:
+    """A run being written."""
+
+    def __init__(self, path: Path) -> None:
+        """Wrap a folder; use `create` for a new run and `resume` for one that was killed."""
+        self.path = path
+
+    @classmethod
+    def create(
+        cls,
+        out: Path | None,
+        name: str,
+        config: Mapping[str, Any],
+        *,
+        setup: Setup,
+        seeds: Sequence[int] = (),
+    ) -> RunFolder:
+        """Make the folder and write `run.json`.
+
+        Args:
+            out: The folder; None makes `runs/<UTC time>-<name>` in the working directory.
+            name: Name of the run.
+            config: Every setting: plain values, paths, pydantic models, dataclasses.
+            setup: What is flown on what.
+            seeds: Seed of each episode planned.
+
+        Raises:
+            UsageError: `out` already holds a run, or is a file.
+        """
+        now = utc_now()
+        if out is None:
+            path = _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
+        else:
+            path = out
+            if (path / RUN_FILE).exists():
+                raise UsageError(f"--out {path}: already holds a run; accepted: a new folder")
+            try:
+                path.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise UsageError(f"--out {path}: {error.strerror}") from None
+        info = RunInfo(
+            name=name,
+            created_utc=now.isoformat(timespec="seconds"),
+            setup=setup,
+            config=dict(config),
+            seeds=tuple(seeds),
+            versions=package_versions(),
+            machine=describe_machine(),
+            git=git_state(),
+        )
+        plain = _INFO.dump_python(info, mode="json")
+        text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        replace_file(path / RUN_FILE, text.encode())
+        return cls(path)
+
+    @classmethod
+    def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
+        """Open a run that was killed, cut off a half-written line, and say what is there."""
+        run = load(path)
+        lines = path / EPISODES_FILE
+        if lines.exists():
+            data = lines.read_bytes()
+            if (whole := data.rfind(b"\n") + 1) != len(data):
+                os.truncate(lines, whole)
+        return cls(path), run
+
+    def tlog_path(self, index: int) -> Path:
+        """Return the path of an episode's raw MAVLink log."""
+        return self.path / f"flight-{index:03d}.tlog"
+
+    def sweep(self) -> None:
+        """Remove what processes left behind for an episode that was never finished."""
+        for leftover in self.path.glob(".*.npz"):
+            leftover.unlink()
+
+    def save_episode(
+        self, record: EpisodeRecord, trajectory: Trajectory, latency: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Save an episode as it ends; on return it is on the disk.
+
+        Args:
+            record: Its line.
+            trajectory: Its true path.
+            latency: Its raw stamps by column; see docs/run-folder.md.
+        """
+        add_arrays(self.path / TRAJECTORIES_FILE, f"{record.index:03d}/", trajectory.arrays())
+        add_arrays(self.path / LATENCY_FILE, f"{record.index:03d}/", latency)
+        with (self.path / EPISODES_FILE).open("ab") as file:
+            file.write(record.to_json().encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def load(path: Path) -> LoadedRun:
+    """Read a run folder back; a last line cut short by a kill is passed over.
+
+    Raises:
+        UsageError: The folder holds no run, or a file of it cannot be read.
+    """
+    info = _load_info(path / RUN_FILE)
+    episodes = _load_episodes(path / EPISODES_FILE)
+    done = {episode.index for episode in episodes}
+    stamps = _load_arrays(path / LATENCY_FILE)
+    paths = _load_arrays(path / TRAJECTORIES_FILE)
+    try:
+        trajectories = {i: Trajectory.from_arrays(a) for i, a in paths.items() if i in done}
+    except (KeyError, ValueError) as error:
+        raise UsageError(f"{path / TRAJECTORIES_FILE}: {error}") from None
+    latency = {i: arrays for i, arrays in stamps.items() if i in done}
+    return LoadedRun(path, info, episodes, latency, trajectories)
+
+
+def _load_info(path: Path) -> RunInfo:
+    """Read `run.json`."""
+    try:
+        data = json.loads(path.read_bytes())
+    except OSError as error:
+        raise UsageError(f"{path.parent}: no run here: {RUN_FILE}: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(f"{path}: not JSON: {error}") from None
+    schema = data.get("schema") if isinstance(data, dict) else None
+    if schema != SCHEMA:
+        raise UsageError(f"{path}: schema = {schema!r}: accepted: {SCHEMA}")
+    try:
+        return _INFO.validate_python(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = ".".join(str(part) for part in first["loc"])
+        raise UsageError(f"{path}: {field}: {first['msg']}") from None
+
+
+def _load_episodes(path: Path) -> tuple[EpisodeRecord, ...]:
+    """Read the whole lines, in the order of their index; a later line replaces an earlier."""
+    data = path.read_bytes() if path.exists() else b""
+    whole = data[: data.rfind(b"\n") + 1]
+    episodes = {}
+    for number, line in enumerate(whole.splitlines(), start=1):
+        try:
+            record = EpisodeRecord.from_json(line)
+        except ValueError as error:
+            raise UsageError(f"{path}:{number}: {error}") from None
+        episodes[record.index] = record
+    return tuple(episodes[index] for index in sorted(episodes))
+
+
+def _load_arrays(path: Path) -> dict[int, Arrays]:
+    """Read an archive whose keys are `<episode>/<name>`."""
+    episodes: dict[int, Arrays] = {}
+    if not path.exists():
+        return episodes
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            for key in archive.files:
+                index, _, name = key.partition("/")
+                episodes.setdefault(int(index), {})[name] = archive[key]
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{path}: {error}") from None
+    return episodes
+
+
+def _fresh_folder(parent: Path, name: str) -> Path:
+    """Make a new folder; a second one of the same second gets a number."""
+    for attempt in range(1, 1000):
+        path = parent / (name if attempt == 1 else f"{name}-{attempt}")
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return path
+    raise UsageError(f"{parent / name}: a thousand runs in one second")

@@ -1,0 +1,1 @@
+"""How late a decision is: stamps, stages, percentiles, and latencies to inject."""

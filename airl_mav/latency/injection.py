@@ -1,0 +1,118 @@
+"""Which decision latency a rehearsal flies with, and how the report must call it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from airl_mav.errors import UsageError
+from airl_mav.latency.samplers import LatencySampler, build_sampler
+from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
+
+Origin = Literal["measured", "injected", "estimated"]
+
+ESTIMATE = "estimate"
+"""Name that asks for an estimate from multiply-accumulates instead of a workload."""
+
+
+@dataclass(frozen=True)
+class Injection:
+    """The latency t2 of a rehearsal."""
+
+    origin: Origin
+    """`measured`: nothing is injected, t2 is what the machine takes."""
+    label: str
+    """One line for people: as if what was flown."""
+    source: str = ""
+    assumed: str = ""
+    latency: Latency | None = None
+    """What to draw from; None injects nothing."""
+
+    def sampler(self, rng: np.random.Generator) -> LatencySampler | None:
+        """Return the source of latencies, or None when nothing is injected."""
+        return None if self.latency is None else build_sampler(self.latency, rng)
+
+
+NOTHING_INJECTED = Injection("measured", "native speed of the machine that flew; nothing injected")
+
+
+def choose_injection(
+    computer: ComputerProfile,
+    workload: str | None = None,
+    *,
+    policy_sha256: str | None = None,
+    macs: int | None = None,
+) -> Injection:
+    """Choose the latency that a policy flies with on a computer.
+
+    Args:
+        computer: The computer to fly as.
+        workload: A workload of its profile: fly as if the computer ran that network. `estimate`
+            scales the workload nearest in multiply-accumulates. None: what was measured for this
+            very policy on that computer, if anything; otherwise nothing is injected.
+        policy_sha256: Digest of the policy file that flies; leave it out when the policy really
+            runs on that computer, so that nothing is added to what is measured.
+        macs: Multiply-accumulates of one inference of that policy; `estimate` needs them.
+
+    Raises:
+        UsageError: The computer has no such workload, or nothing to estimate from.
+    """
+    if workload is None:
+        for name, work in computer.workloads.items():
+            if policy_sha256 is not None and work.policy_sha256 == policy_sha256:
+                label = f"this policy as timed on {computer.description} ({name})"
+                return Injection("injected", label, work.source, work.assumed, work.latency)
+        return NOTHING_INJECTED
+    if workload == ESTIMATE:
+        return _estimate(computer, macs)
+    if workload not in computer.workloads:
+        known = ", ".join([*computer.workloads, ESTIMATE])
+        raise UsageError(f"workload = {workload!r}: accepted for this computer: {known}")
+    work = computer.workloads[workload]
+    label = f"as if {computer.description} ran {workload} ({_moments(work.latency)})"
+    return Injection("injected", label, work.source, work.assumed, work.latency)
+
+
+def _estimate(computer: ComputerProfile, macs: int | None) -> Injection:
+    """Scale the workload nearest in multiply-accumulates to `macs`."""
+    if not macs or macs < 1:
+        raise UsageError("workload = 'estimate': the policy's card gives no multiply-accumulates")
+    if not computer.workloads:
+        raise UsageError("workload = 'estimate': this computer has no workload to estimate from")
+    name, work = min(
+        computer.workloads.items(), key=lambda item: abs(math.log(item[1].network.macs / macs))
+    )
+    factor = macs / work.network.macs
+    latency = _scaled(work, factor)
+    label = f"estimated from {name} on {computer.description} ({_moments(latency)})"
+    assumed = f"latency proportional to multiply-accumulates, x {factor:.3g}"
+    if work.assumed:
+        assumed = f"{assumed}; {work.assumed}"
+    return Injection("estimated", label, work.source, assumed, latency)
+
+
+def _scaled(work: Workload, factor: float) -> Latency:
+    """Return a workload's latency with every time multiplied by `factor`."""
+    latency = work.latency
+    return latency.model_copy(
+        update={
+            "mean_ms": None if latency.mean_ms is None else latency.mean_ms * factor,
+            "std_ms": None if latency.std_ms is None else latency.std_ms * factor,
+            "min_ms": latency.min_ms * factor,
+            "samples_ms": None
+            if latency.samples_ms is None
+            else tuple(sample * factor for sample in latency.samples_ms),
+        }
+    )
+
+
+def _moments(latency: Latency) -> str:
+    """Return mean and spread as text."""
+    if latency.samples_ms is not None:
+        samples = np.array(latency.samples_ms)
+        return f"{len(samples)} samples, {samples.mean():.3g} ± {samples.std():.2g} ms"
+    spread = f" ± {latency.std_ms:.3g}" if latency.std_ms else ""
+    return f"{latency.mean_ms:.5g}{spread} ms"

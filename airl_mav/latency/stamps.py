@@ -1,0 +1,101 @@
+"""The decision log: one row of stamps a decision. numpy and the standard library only.
+
+Raw integers go into one preallocated block; everything else is worked out after the flight.
+Recording costs about 0.3 µs on a desktop core.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+NO_STAMP = -1
+"""Stands for a time that never came: no frame, a setpoint nobody accepted."""
+
+STAMPS = (
+    "capture_us",
+    "decoded_us",
+    "infer_start_us",
+    "action_ready_us",
+    "sent_us",
+    "held_until_us",
+)
+"""Columns of simulated time [µs], in the order in which they happen."""
+
+ROW = np.dtype([(name, "<i8") for name in STAMPS] + [("setpoint", "<f4", (4,))])
+"""One decision, 64 bytes: the stamps, then the setpoint as the link sends it (float32)."""
+
+_PACK = struct.Struct("<6q4f")
+
+
+class DecisionLog:
+    """Stamps of every decision of one episode. One writer; readers get copies."""
+
+    __slots__ = ("_block", "_bytes", "_count")
+
+    def __init__(self, capacity: int = 4096) -> None:
+        """Reserve room for `capacity` (>= 1) decisions; it doubles when full."""
+        if capacity < 1:
+            raise ValueError(f"capacity={capacity}: must be >= 1")
+        self._block = np.zeros(capacity * ROW.itemsize, np.uint8)
+        self._bytes = self._block.data
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Return the number of decisions recorded."""
+        return self._count
+
+    def record(
+        self,
+        capture_us: int,
+        decoded_us: int,
+        infer_start_us: int,
+        action_ready_us: int,
+        sent_us: int,
+        held_until_us: int,
+        setpoint: tuple[float, float, float, float],
+    ) -> None:
+        """Append one decision. Times in simulated µs, `NO_STAMP` for one that never came.
+
+        Args:
+            capture_us: Exposure of the frame the decision saw.
+            decoded_us: That frame was decoded in the companion.
+            infer_start_us: Observation encoding and inference began.
+            action_ready_us: The action is known, any injected latency included.
+            sent_us: The setpoint was handed to MAVSDK.
+            held_until_us: End of the time that the action is held before the next observation.
+            setpoint: Velocity north, east, down (or forward, right, down) [m/s] and yaw [rad] or
+                yaw rate [rad/s]: the four numbers the autopilot receives.
+        """
+        offset = self._count * ROW.itemsize
+        if offset == len(self._bytes):
+            self._grow()
+        _PACK.pack_into(
+            self._bytes,
+            offset,
+            capture_us,
+            decoded_us,
+            infer_start_us,
+            action_ready_us,
+            sent_us,
+            held_until_us,
+            *setpoint,
+        )
+        self._count += 1
+
+    def _grow(self) -> None:
+        """Double the block: amortised, a record stays O(1)."""
+        self._block = np.concatenate([self._block, np.zeros_like(self._block)])
+        self._bytes = self._block.data
+
+    def columns(self) -> dict[str, NDArray[np.int64] | NDArray[np.float32]]:
+        """Return a copy of each column by name: stamps int64 (n,), `setpoint` float32 (n, 4)."""
+        count = self._count
+        rows = self._block[: count * ROW.itemsize].view(ROW)
+        return {name: rows[name].copy() for name in ROW.names or ()}
+
+    def clear(self) -> None:
+        """Forget all decisions and keep the room."""
+        self._count = 0

@@ -1,0 +1,153 @@
+"""The computer profile: what an onboard computer costs, draws, and how late it decides.
+
+A computer has latencies per workload (a network on a runtime), never one number.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from airl_mav.errors import UsageError
+from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.profiles.loading import load_profile, profiles_dir
+
+LONGEST_MS = 60_000.0
+"""A decision slower than a minute flies nothing: taken for a mistake in the file [ms]."""
+
+Distribution = Literal["fixed", "lognormal", "normal-truncated", "samples"]
+
+
+class Network(ProfileModel):
+    """The network that was timed."""
+
+    layers: int | None = quantity(
+        "convolution layers of the paper's template (and as many dense ones)",
+        "1",
+        ge=1,
+        le=100,
+        default=None,
+    )
+    filters: int | None = quantity(
+        "filters of each convolution and units of each dense layer",
+        "1",
+        ge=1,
+        le=4096,
+        default=None,
+    )
+    image_height_px: int = quantity("image height", "px", ge=1, le=4096)
+    image_width_px: int = quantity("image width", "px", ge=1, le=4096)
+    parameters: int = quantity("weights and biases", "1", ge=1)
+    macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
+    runtime: str = Field(description="what ran it: framework and version")
+
+
+class Latency(ProfileModel):
+    """The distribution of t2: inference start -> action ready.
+
+    `fixed`: always `mean_ms`. `lognormal`: `min_ms` plus a log-normal, with `mean_ms` and `std_ms`
+    those of the sum. `normal-truncated`: a normal of `mean_ms` and `std_ms`, cut off below
+    `min_ms` (so its own mean lies a little higher). `samples`: measured values, drawn again.
+    """
+
+    distribution: Distribution
+    mean_ms: float | None = quantity("mean", "ms", gt=0, le=LONGEST_MS, default=None)
+    std_ms: float | None = quantity("standard deviation", "ms", ge=0, le=LONGEST_MS, default=None)
+    min_ms: float = quantity("least latency", "ms", ge=0, le=LONGEST_MS, default=0.0)
+    samples_ms: tuple[Annotated[float, Field(gt=0, le=LONGEST_MS)], ...] | None = Field(
+        default=None, description="measured latencies", json_schema_extra={"unit": "ms"}
+    )
+    samples_file: str | None = Field(
+        default=None,
+        description="text file of measured latencies beside the profile, one a line in ms",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Latency:
+        sampled = (self.samples_ms is not None) + (self.samples_file is not None)
+        if self.distribution == "samples":
+            if sampled != 1:
+                raise ValueError("distribution 'samples' takes one of samples_ms, samples_file")
+            if self.samples_ms is not None and not self.samples_ms:
+                raise ValueError("samples_ms: empty; accepted: one value or more")
+            if self.mean_ms is not None or self.std_ms is not None:
+                raise ValueError("mean_ms and std_ms follow from the samples: leave them out")
+            return self
+        if sampled:
+            raise ValueError(f"samples do not go with distribution {self.distribution!r}")
+        if self.mean_ms is None:
+            raise ValueError(f"distribution {self.distribution!r} needs mean_ms")
+        if self.distribution == "fixed":
+            if self.std_ms:
+                raise ValueError(f"std_ms = {self.std_ms:g}: 'fixed' has no spread")
+        elif self.std_ms is None:
+            raise ValueError(f"distribution {self.distribution!r} needs std_ms")
+        elif self.min_ms >= self.mean_ms:
+            raise ValueError(f"min_ms = {self.min_ms:g}: accepted: below mean_ms {self.mean_ms:g}")
+        return self
+
+
+class Workload(ProfileModel):
+    """One network on one runtime, as this computer ran it."""
+
+    network: Network
+    policy_sha256: str | None = Field(
+        default=None, description="digest of the policy file that was timed, if it was one of ours"
+    )
+    latency: Latency
+    source: str = Field(description="where the latency comes from")
+    assumed: str = Field(default="", description="what the source does not give and we assume")
+
+
+class ComputerProfile(ProfileModel):
+    """An onboard computer."""
+
+    description: str = Field(description="one line for people")
+    cpu: str = Field(description="processor")
+    watts: float = quantity("electrical power while flying", "W", ge=0, le=10_000)
+    price_usd: float = quantity("price", "USD", ge=0, le=1_000_000)
+    source: str = Field(description="where the numbers come from")
+    workloads: dict[str, Workload] = Field(
+        default_factory=dict, description="what it was timed with, by name"
+    )
+
+
+def load_computer(name: str) -> ComputerProfile:
+    """Load a computer profile, shipped or by path, with its sample files read in.
+
+    Raises:
+        UsageError: See `load_profile`; also when a sample file is missing or holds anything but
+            latencies in (0, 60000] ms.
+    """
+    profile = load_profile("computers", name, ComputerProfile)
+    folder = Path(name).parent if name.endswith(".toml") else profiles_dir() / "computers"
+    workloads = {
+        key: work.model_copy(update={"latency": _with_samples(work.latency, folder)})
+        for key, work in profile.workloads.items()
+    }
+    return profile.model_copy(update={"workloads": workloads})
+
+
+def _with_samples(latency: Latency, folder: Path) -> Latency:
+    """Replace `samples_file`, relative to `folder`, by the values that it holds."""
+    if latency.samples_file is None:
+        return latency
+    path = folder / latency.samples_file
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        values = np.array([float(text) for line in lines if (text := line.split("#")[0].strip())])
+    except OSError as error:
+        raise UsageError(f"{path}: samples_file: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(f"{path}: {error}; accepted: one latency a line, ms") from None
+    if not values.size:
+        raise UsageError(f"{path}: no samples; accepted: one latency a line, ms")
+    # Negated, so that a NaN counts as outside.
+    outside = values[~((values > 0) & (values <= LONGEST_MS))]
+    if outside.size:
+        raise UsageError(f"{path}: {outside[0]:g}: accepted: 0 < value <= {LONGEST_MS:g} ms")
+    samples = tuple(float(value) for value in values)
+    return latency.model_copy(update={"samples_ms": samples, "samples_file": None})

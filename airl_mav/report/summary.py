@@ -1,0 +1,71 @@
+"""The figures of a run, worked out once for every form of the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.constants import US_PER_S
+from airl_mav.flight.statistics import Aggregate, aggregate
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.latency.percentiles import Summary, summarize
+from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
+from airl_mav.latency.stamps import NO_STAMP
+
+TICK_LATENESS = "tick_lateness_us"
+"""Name of the array of a paced run that says how late each tick began [µs]."""
+
+
+@dataclass(frozen=True)
+class RealTime:
+    """How well a run kept pace with the wall clock."""
+
+    tick_lateness: Summary
+    factor: float | None
+    """Simulated seconds per wall second over all episodes; None where time was not paced."""
+    slipped_us: int
+    """Simulated time given up [µs]."""
+    setpoint_to_motor: Summary
+    setpoints: int
+    """Setpoints sent."""
+    unmatched: int
+    """Setpoints sent that the autopilot's log does not hold."""
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """Everything that a report's tables say."""
+
+    stages: dict[str, Summary]
+    """By stage key."""
+    samples: dict[str, Samples]
+    """Raw durations behind them [µs]."""
+    quality: Aggregate
+    real_time: RealTime
+
+
+def summarize_run(run: LoadedRun) -> RunSummary:
+    """Work out the figures of a run."""
+    samples = pool(stage_samples(stamps) for stamps in run.latency.values())
+    stages = {stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES}
+    return RunSummary(stages, samples, aggregate(run.episodes), _real_time(run, stages))
+
+
+def _real_time(run: LoadedRun, stages: dict[str, Summary]) -> RealTime:
+    """Work out how the run kept pace."""
+    nothing: NDArray[np.int64] = np.zeros(0, np.int64)
+    lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
+    accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
+    paced = [episode for episode in run.episodes if episode.wall_s]
+    wall_s = sum(episode.wall_s or 0.0 for episode in paced)
+    flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
+    return RealTime(
+        tick_lateness=summarize(np.concatenate([nothing, *lateness])),
+        factor=flown_us / US_PER_S / wall_s if wall_s else None,
+        slipped_us=sum(episode.slipped_us for episode in run.episodes),
+        setpoint_to_motor=stages["setpoint_to_motor"],
+        setpoints=sum(len(stamps) for stamps in accepted),
+        unmatched=sum(int(np.count_nonzero(stamps == NO_STAMP)) for stamps in accepted),
+    )

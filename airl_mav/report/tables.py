@@ -1,0 +1,233 @@
+"""The tables of a report as text cells: the terminal and the page show the same ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.setup import Part
+from airl_mav.flight.statistics import Estimate
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
+from airl_mav.latency.stages import SHOWN_STAGES
+from airl_mav.report.summary import RealTime, RunSummary
+
+US_PER_MS = 1_000.0
+NONE = "–"
+TOO_FEW_CELL = "too few"
+FEW_FLIGHTS = 10
+"""Below this a bootstrap interval covers clearly less than its 95 %."""
+
+OUTCOME_WORDS = {
+    Outcome.SUCCESS: "goal reached",
+    Outcome.COLLISION: "collision",
+    Outcome.TIMEOUT: "time limit",
+    Outcome.BATTERY: "battery empty",
+    Outcome.ABORTED: "aborted",
+}
+
+ORIGIN_WORDS = {
+    "measured": "measured",
+    "injected": "injected",
+    "estimated": "estimated",
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    title: str
+    unit: str = ""
+    number: bool = True
+    """Set right, in figures of equal width."""
+    page_only: bool = False
+    """Left out where there is little room: in the terminal."""
+
+
+@dataclass(frozen=True)
+class TableView:
+    """A table of text cells."""
+
+    key: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+
+
+def ms(value_us: float | None, digits: int = 2) -> str:
+    """Return a duration [µs] as milliseconds."""
+    return NONE if value_us is None else f"{value_us / US_PER_MS:,.{digits}f}"
+
+
+def percentile_cell(value_us: float | None, n: int) -> str:
+    """Return a percentile [µs] as milliseconds, or that its samples are too few."""
+    return TOO_FEW_CELL if value_us is None and n else ms(value_us)
+
+
+def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
+    """Return what was flown on what, as (term, text)."""
+    setup = run.info.setup
+    injection = setup.injection
+    latency = f"{ORIGIN_WORDS[injection.origin]}: {injection.label}"
+    pace = "not paced: as fast as it goes" if setup.speed is None else f"{setup.speed:g} x"
+    rows = [
+        ("vehicle", _part(setup.vehicle)),
+        ("arena", _part(setup.arena)),
+        ("policy", _part(setup.policy)),
+        ("computer", f"{_part(setup.computer)}, {setup.computer_watts:g} W"),
+        ("decision latency t2", latency),
+        ("source of t2", injection.source),
+        ("assumed of t2", injection.assumed),
+        ("level", setup.level),
+        ("speed", pace),
+        ("between commands", setup.between_commands),
+    ]
+    return tuple((term, text) for term, text in rows if text)
+
+
+def _part(part: Part) -> str:
+    """Return a part's name and description."""
+    return f"{part.name} – {part.description}" if part.description else part.name
+
+
+def latency_table(summary: RunSummary) -> TableView:
+    """Return the latencies by stage."""
+    columns = (
+        Column("stage", number=False),
+        Column("n"),
+        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+        Column("from → to", number=False, page_only=True),
+    )
+    rows, short = [], False
+    for stage in SHOWN_STAGES:
+        s = summary.stages[stage.key]
+        tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
+        short = short or TOO_FEW_CELL in tail
+        cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
+        rows.append((stage.title, *cells, stage.meaning))
+    notes = ["Milliseconds of simulated time."]
+    if short:
+        notes.append(
+            f"{TOO_FEW_CELL}: a p90 needs {MIN_SAMPLES[90.0]} samples, a p99 {MIN_SAMPLES[99.0]}."
+        )
+    return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+
+
+def episodes_table(run: LoadedRun) -> TableView:
+    """Return the quality of each flight."""
+    columns = (
+        Column("#"),
+        Column("seed"),
+        Column("outcome", number=False),
+        Column("time", "s"),
+        Column("distance", "m"),
+        Column("energy", "kJ"),
+        Column("speed", "m/s"),
+        Column("top speed", "m/s", page_only=True),
+        Column("computer", "J", page_only=True),
+        Column("take-off", "s, kJ", page_only=True),
+        Column("battery", "%", page_only=True),
+        Column("why", number=False, page_only=True),
+    )
+    rows = tuple(_episode_row(episode) for episode in run.episodes)
+    notes = ("From the start of navigation; the take-off apart. Energy without the computer's.",)
+    return TableView("episodes", "Flights", columns, rows, notes)
+
+
+def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
+    """Return an episode's cells."""
+    q = episode.quality
+    figures = (
+        (NONE,) * 7
+        if q is None
+        else (
+            f"{q.flight_time_s:.2f}",
+            f"{q.distance_m:.2f}",
+            f"{q.energy_j / 1e3:.2f}",
+            f"{q.mean_speed_m_s:.2f}",
+            f"{q.max_speed_m_s:.2f}",
+            f"{q.computer_energy_j:,.0f}",
+            f"{q.takeoff.time_s:.2f}, {q.takeoff.energy_j / 1e3:.2f}",
+        )
+    )
+    battery = episode.battery_remaining
+    left = NONE if battery is None else f"{100.0 * battery:.1f}"
+    why = "; ".join([episode.reason, *episode.notes])
+    words = OUTCOME_WORDS[episode.outcome]
+    return (f"{episode.index}", f"{episode.seed}", words, *figures, left, why)
+
+
+def quality_table(summary: RunSummary) -> TableView:
+    """Return the quality of flight over all episodes, with intervals."""
+    columns = (
+        Column("measure", number=False),
+        Column("value"),
+        Column("95 % interval"),
+        Column("n"),
+    )
+    q = summary.quality
+    rows = (
+        _estimate_row("success rate", "%", q.success_rate, 100.0, 0),
+        _estimate_row("flight time", "s", q.flight_time_s, 1.0, 2),
+        _estimate_row("distance", "m", q.distance_m, 1.0, 2),
+        _estimate_row("energy, vehicle", "kJ", q.energy_j, 1e-3, 2),
+        _estimate_row("energy, computer", "J", q.computer_energy_j, 1.0, 0),
+        _estimate_row("mean speed", "m/s", q.mean_speed_m_s, 1.0, 2),
+    )
+    notes = [
+        "Means over the flights that reached the goal; n is their number (for the success rate: "
+        "all flights but aborted ones). Intervals: Wilson for the rate, bootstrap for the means."
+    ]
+    if 1 < q.flight_time_s.n < FEW_FLIGHTS:
+        notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
+    return TableView("quality", "Quality of flight", columns, rows, tuple(notes))
+
+
+def _estimate_row(
+    title: str, unit: str, estimate: Estimate, scale: float, digits: int
+) -> tuple[str, ...]:
+    """Return an estimate's cells."""
+
+    def show(value: float | None) -> str:
+        return NONE if value is None else f"{scale * value:,.{digits}f}"
+
+    interval = NONE if estimate.low is None else f"{show(estimate.low)} … {show(estimate.high)}"
+    value = NONE if estimate.value is None else f"{show(estimate.value)} {unit}"
+    return title, value, interval, f"{estimate.n}"
+
+
+def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
+    """Return how the run kept pace with the wall clock."""
+    columns = (Column("measure", number=False), Column("value"), Column("n"))
+    rt = summary.real_time
+    rows = [
+        *_tail_rows("tick lateness", rt.tick_lateness),
+        ("real-time factor", _factor(run, rt), f"{len(run.episodes)}"),
+        ("simulated time given up", f"{ms(rt.slipped_us)} ms", f"{len(run.episodes)}"),
+        *_tail_rows("setpoint → motor", rt.setpoint_to_motor),
+        ("setpoints never accepted", f"{rt.unmatched:,}", f"{rt.setpoints:,}"),
+    ]
+    return TableView("real-time", "Real time", columns, tuple(rows))
+
+
+def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
+    """Return median, p99 and maximum of a set of durations as rows; one row when there is none."""
+    n = summary.n
+    if not n:
+        return [(title, NONE, "0")]
+    p99 = percentile_cell(summary.p99, n)
+    return [
+        (f"{title}, p50", f"{ms(summary.p50)} ms", f"{n:,}"),
+        (f"{title}, p99", p99 if p99 == TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
+        (f"{title}, max", f"{ms(summary.max)} ms", f"{n:,}"),
+    ]
+
+
+def _factor(run: LoadedRun, real_time: RealTime) -> str:
+    """Return the real-time factor beside the one asked for."""
+    if real_time.factor is None or run.info.setup.speed is None:
+        return "not paced"
+    return f"{real_time.factor:.3f} (asked {run.info.setup.speed:g})"

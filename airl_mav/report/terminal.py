@@ -1,0 +1,87 @@
+"""The report in the terminal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.report.summary import summarize_run
+from airl_mav.report.tables import (
+    NONE,
+    OUTCOME_WORDS,
+    TOO_FEW_CELL,
+    TableView,
+    episodes_table,
+    latency_table,
+    quality_table,
+    real_time_table,
+    setup_rows,
+)
+
+STYLES = {
+    OUTCOME_WORDS[Outcome.SUCCESS]: "green",
+    OUTCOME_WORDS[Outcome.COLLISION]: "red",
+    OUTCOME_WORDS[Outcome.TIMEOUT]: "yellow",
+    OUTCOME_WORDS[Outcome.BATTERY]: "magenta",
+    OUTCOME_WORDS[Outcome.ABORTED]: "dim",
+    TOO_FEW_CELL: "dim",
+    NONE: "dim",
+}
+
+
+def print_report(run: LoadedRun, console: Console, report: Path | None = None) -> None:
+    """Print what was flown, the tables, and where the page lies.
+
+    Args:
+        run: The run.
+        console: Where to.
+        report: Path of the HTML page, if there is one.
+    """
+    summary = summarize_run(run)
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style="dim", no_wrap=True)
+    facts.add_column(overflow="fold")
+    for term, text in setup_rows(run):
+        facts.add_row(term, Text(text))
+    console.print()
+    console.print(facts)
+    views = (
+        latency_table(summary),
+        episodes_table(run),
+        quality_table(summary),
+        real_time_table(run, summary),
+    )
+    for view in views:
+        console.print()
+        console.print(rich_table(view))
+        for note in view.notes:
+            console.print(Text(note, style="dim"))
+    if report is not None:
+        console.print()
+        console.print(Text.assemble(("report  ", "dim"), str(report)), soft_wrap=True)
+
+
+def rich_table(view: TableView) -> Table:
+    """Return a table for the terminal, without the columns meant for a page."""
+    table = Table(
+        title=view.title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    shown = [i for i, column in enumerate(view.columns) if not column.page_only]
+    for i in shown:
+        column = view.columns[i]
+        title = f"{column.title} [{column.unit}]" if column.unit else column.title
+        table.add_column(Text(title), justify="right" if column.number else "left", no_wrap=True)
+    for row in view.rows:
+        table.add_row(*(Text(row[i], style=STYLES.get(row[i], "")) for i in shown))
+    return table

@@ -1,0 +1,113 @@
+"""Figures that follow the reader's light or dark setting.
+
+A figure is drawn once, in the light colours. As SVG its colours become CSS variables with a dark
+value each; as PNG it stays light, for slides and papers.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from dataclasses import dataclass
+
+import matplotlib as mpl
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
+
+INK = "#21262d"
+"""Titles, labels, ticks."""
+MUTED = "#68707a"
+"""Secondary text."""
+RULE = "#d5d9de"
+"""Grid and axis lines."""
+PAPER = "#fffffe"
+"""Background; not quite white, so that white things keep their own."""
+SERIES = "#2868a8"
+"""Data."""
+SERIES_SOFT = "#a9c8e6"
+"""Data, filled areas."""
+MARK = "#b4540a"
+"""What to look at: percentiles, phase limits."""
+
+HALO = "#fffffd"
+"""Edge of a drawn path, against whatever lies below it."""
+
+DARK = {
+    INK: "#e4e7eb",
+    MUTED: "#9aa3ad",
+    RULE: "#3a4149",
+    PAPER: "#181c20",
+    SERIES: "#78b2ea",
+    SERIES_SOFT: "#2f5378",
+    MARK: "#f0a35a",
+    HALO: "#98a1ab",
+    FLOOR_COLOUR: "#23282e",
+    GRID_COLOUR: "#31383f",
+    START_COLOUR: "#6aa7e8",
+    GOAL_COLOUR: "#45b36b",
+    STATIC_COLOURS[0]: "#7f8a95",
+}
+"""The dark value of each light colour, the arena picture's included."""
+
+PNG_DPI = 160
+SVG_DPI = 120
+_FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure in both forms."""
+
+    name: str
+    """File name without suffix."""
+    alt: str
+    """What it shows, in words."""
+    svg: str
+    png: bytes
+
+    def data_uri(self) -> str:
+        """Return the SVG for an `img`."""
+        return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure on the theme's background, apart from any global state."""
+    figure = Figure(figsize=(width_in, height_in), facecolor=PAPER, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def render(figure: Figure, name: str, alt: str) -> Picture:
+    """Render a figure. The bytes depend on the figure alone: no dates, no random identifiers."""
+    png = render_png(figure)
+    svg = io.StringIO()
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
+        figure.savefig(svg, format="svg", dpi=SVG_DPI, metadata={"Date": None, "Creator": None})
+    return Picture(name, alt, themed(svg.getvalue()), png)
+
+
+def render_png(figure: Figure) -> bytes:
+    """Render a figure as PNG in the light colours, and settle its layout."""
+    if (engine := figure.get_layout_engine()) is not None:
+        # Once for both forms: laying out costs more than drawing.
+        engine.execute(figure)
+        figure.set_layout_engine("none")
+    png = io.BytesIO()
+    figure.savefig(png, format="png", dpi=PNG_DPI)
+    return png.getvalue()
+
+
+def themed(svg: str) -> str:
+    """Return an SVG whose theme colours and font follow the reader's setting."""
+    light = "".join(f"--c{i}:{colour};" for i, colour in enumerate(DARK))
+    dark = "".join(f"--c{i}:{colour};" for i, colour in enumerate(DARK.values()))
+    query = "@media screen and (prefers-color-scheme:dark)"
+    style = f"<style>svg{{{light}}}{query}{{svg{{{dark}}}}}</style>"
+    for i, colour in enumerate(DARK):
+        svg = svg.replace(colour, f"var(--c{i})")
+    svg = _FONT.sub(r"\1 system-ui, sans-serif", svg)
+    head = svg.index(">", svg.index("<svg")) + 1
+    return svg[svg.index("<svg") : head] + style + svg[head:]

@@ -1,0 +1,114 @@
+"""Where depth frames come from: the newest one, and when it was decoded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import zmq
+
+from airl_mav.camera.frame import Frame, FrameError
+from airl_mav.clock import Clock, WallClock
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    """A frame and the time at which the companion had it."""
+
+    frame: Frame
+    received_us: int
+    """Simulated time when the frame was decoded [µs]."""
+
+
+class FrameSource(Protocol):
+    """A depth camera as the companion sees it: only the newest frame counts."""
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the newest frame so far, without waiting; None before the first."""
+        ...
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen.
+
+        Args:
+            newer_than_sequence: Sequence of the frame already seen; -1 = none.
+            timeout_s: Longest wait [wall s].
+
+        Returns:
+            The newest frame, or None when the time is over.
+        """
+        ...
+
+
+class ZmqFrameSource:
+    """Frames published by a simulator or a camera driver over ZeroMQ (tcp, ipc).
+
+    ZeroMQ keeps only the newest message, also while nobody asks, and reconnects by itself. To be
+    used from one thread at a time.
+    """
+
+    def __init__(
+        self, endpoint: str, clock: Clock, context: zmq.Context[zmq.Socket[bytes]] | None = None
+    ) -> None:
+        """Connect; the publisher may start later.
+
+        Args:
+            endpoint: Where the frames are published, as "tcp://192.168.1.2:5560".
+            clock: Simulated time, for the stamps.
+            context: A ZeroMQ context to share; None = one of its own.
+
+        Raises:
+            ValueError: The endpoint is none.
+        """
+        self.malformed = 0
+        """Messages that were no frames."""
+        self.clock = clock
+        """May be replaced between missions, by one that shares the simulator's epoch."""
+        self._newest: ReceivedFrame | None = None
+        self._owns_context = context is None
+        self._context = zmq.Context() if context is None else context
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.CONFLATE, 1)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.subscribe(b"")
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError as error:
+            self.close()
+            raise ValueError(
+                f"camera endpoint {endpoint!r}: {error}; accepted: tcp://HOST:PORT, ipc://PATH"
+            ) from error
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the newest frame so far, without waiting; None before the first."""
+        while self._socket.poll(0):
+            data = self._socket.recv()
+            try:
+                frame = Frame.from_bytes(data)
+            except FrameError:
+                self.malformed += 1
+            else:
+                self._newest = ReceivedFrame(frame, self.clock.time_us())
+        return self._newest
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen; see `FrameSource`.
+
+        A lower sequence also counts as newer: the simulator was restarted.
+        """
+        stopwatch = WallClock()
+        while True:
+            newest = self.latest()
+            if newest is not None and newest.frame.sequence != newer_than_sequence:
+                return newest
+            left_ms = 1e3 * timeout_s - 1e-3 * stopwatch.time_us()
+            if left_ms <= 0.0:
+                return None
+            self._socket.poll(math.ceil(left_ms))
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._socket.close(linger=0)
+        if self._owns_context:
+            self._context.term()

@@ -1,0 +1,187 @@
+"""The MAVLink 2 codec: the only module that touches pymavlink.
+
+Of pymavlink only the generated `common` dialect is used: message classes, constants and the
+decoder of one whole frame. Framing is done here, because pymavlink's own parser throws away
+everything that a damaged header claims as its payload, and waits for it to arrive.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TypeAlias
+
+from pymavlink.dialects.v20 import common as dialect
+
+__all__ = [
+    "COMPONENT_ID",
+    "SYSTEM_ID",
+    "Decoder",
+    "Encoder",
+    "WireMessage",
+    "dialect",
+    "message_id",
+    "param_value",
+    "payload",
+]
+
+WireMessage: TypeAlias = dialect.MAVLink_message
+"""A decoded message, or one to be packed."""
+
+SYSTEM_ID = 1
+"""MAVLink system id of the vehicle (PX4's MAV_SYS_ID default)."""
+
+COMPONENT_ID: int = dialect.MAV_COMP_ID_AUTOPILOT1
+
+_MARKER_V1, _MARKER_V2 = 0xFE, 0xFD
+_HEADER_V1, _HEADER_V2 = 6, 10
+_CHECKSUM, _SIGNATURE = 2, 13
+_FLAG_SIGNED = 0x01
+
+_PARAM_VALUE = struct.Struct("<4sHH16sB")
+
+
+def message_id(name: str) -> int:
+    """Return the message id of a name such as "ATTITUDE". Raises AttributeError when unknown."""
+    number: int = getattr(dialect, f"MAVLINK_MSG_ID_{name}")
+    return number
+
+
+def payload(message: WireMessage) -> bytes:
+    """Return the payload of a received message as it came: trailing zeros are cut (MAVLink 2)."""
+    frame: bytearray = message.get_msgbuf()
+    start = _HEADER_V2 if frame[0] == _MARKER_V2 else _HEADER_V1
+    return bytes(frame[start : start + frame[1]])
+
+
+class _ParamValue(dialect.MAVLink_param_value_message):  # type: ignore[misc]
+    """PARAM_VALUE whose four value bytes are sent as given.
+
+    An INT32 parameter travels as the bytes of a float (PX4's bytewise encoding). Integers whose
+    bits form a signalling NaN would change on their way through a Python float.
+    """
+
+    raw_value: bytes
+
+    def pack(self, mav: dialect.MAVLink, force_mavlink1: bool = False) -> bytes:
+        """Return the frame."""
+        body = _PARAM_VALUE.pack(
+            self.raw_value, self.param_count, self.param_index, self._param_id_raw, self.param_type
+        )
+        frame: bytes = self._pack(mav, self.crc_extra, body, force_mavlink1=force_mavlink1)
+        return frame
+
+
+def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> WireMessage:
+    """Return a PARAM_VALUE.
+
+    Args:
+        name: Parameter name, at most 16 characters.
+        raw: The value's four bytes, little endian.
+        kind: MAV_PARAM_TYPE of those bytes.
+        count: Number of parameters.
+        index: The parameter's index; 65535 = it has none.
+    """
+    message = _ParamValue(name.encode("ascii"), 0.0, kind, count, index)
+    message.raw_value = raw
+    return message
+
+
+class Encoder:
+    """Packs the messages of one link: the vehicle's ids and the link's own sequence numbers."""
+
+    def __init__(self, system_id: int = SYSTEM_ID, component_id: int = COMPONENT_ID) -> None:
+        self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+
+    def pack(self, message: WireMessage) -> bytes:
+        """Return the frame of a message.
+
+        Raises struct.error or OverflowError when a field does not fit its type.
+        """
+        frame: bytes = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) & 0xFF
+        return frame
+
+
+class Decoder:
+    """Finds MAVLink 1 and 2 frames in arbitrary bytes. Never raises, never grows.
+
+    After a damaged frame the search goes on at its second byte, so a valid frame hidden behind a
+    false or cut header is not lost. Signatures are not checked: there is no key.
+    """
+
+    def __init__(self, *, datagrams: bool) -> None:
+        """Start empty.
+
+        Args:
+            datagrams: True when every chunk holds whole frames (UDP); False for a byte stream
+                (serial), where a frame may be continued in the next chunk.
+        """
+        self.malformed = 0
+        """Runs of bytes that belong to no valid frame."""
+        self.unknown = 0
+        """Frames whose message the dialect lacks, so that their checksum cannot be checked."""
+        self._datagrams = datagrams
+        self._rest = b""
+        self._in_garbage = False
+        self._mav = dialect.MAVLink(None)
+
+    def feed(self, data: bytes) -> list[WireMessage]:
+        """Return the messages completed by a chunk of bytes."""
+        buffer = self._rest + data
+        self._rest = b""
+        found: list[WireMessage] = []
+        start = 0
+        while start < len(buffer):
+            end = _frame_end(buffer, start)
+            if end is not None and end > len(buffer):
+                if not self._datagrams:
+                    # Bounded: a frame claims at most 280 bytes.
+                    self._rest = buffer[start:]
+                    return found
+                end = None
+            message = None if end is None else self._decode(buffer, start, end)
+            if end is None or message is None:
+                self._reject()
+                start += 1
+                continue
+            self._in_garbage = False
+            start = end
+            if isinstance(message, dialect.MAVLink_unknown):
+                self.unknown += 1
+            else:
+                found.append(message)
+        if self._datagrams:
+            self._in_garbage = False
+        return found
+
+    def _reject(self) -> None:
+        if not self._in_garbage:
+            self.malformed += 1
+            self._in_garbage = True
+
+    def _decode(self, buffer: bytes, start: int, end: int) -> WireMessage | None:
+        try:
+            message = self._mav.decode(bytearray(buffer[start:end]))
+        except (dialect.MAVError, struct.error):
+            return None
+        if isinstance(message, dialect.MAVLink_unknown):
+            # No checksum to trust: believe it only where a frame may really end.
+            fits = end == len(buffer) or buffer[end] in (_MARKER_V1, _MARKER_V2)
+            return message if fits else None
+        return message
+
+
+def _frame_end(buffer: bytes, start: int) -> int | None:
+    """Return where the frame at `start` ends (maybe past the buffer), None if there is none."""
+    marker, left = buffer[start], len(buffer) - start
+    if marker == _MARKER_V1:
+        length = buffer[start + 1] if left > 1 else 0
+        return start + _HEADER_V1 + length + _CHECKSUM
+    if marker != _MARKER_V2:
+        return None
+    length = buffer[start + 1] if left > 1 else 0
+    flags = buffer[start + 2] if left > 2 else 0
+    if flags & ~_FLAG_SIGNED:
+        return None  # incompatible with anything known: the specification says to drop it
+    signature = _SIGNATURE if flags & _FLAG_SIGNED else 0
+    return start + _HEADER_V2 + length + _CHECKSUM + signature

@@ -1,0 +1,192 @@
+"""Where frames come from and go to: UDP as PX4 does it, or memory."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+from collections import deque
+from typing import Protocol
+
+from airl_mav.errors import UsageError
+
+Address = tuple[str, int]
+"""IPv4 host and UDP port."""
+
+MAX_DATAGRAM = 4096
+"""Longest datagram read; MAVLink frames are at most 280 bytes, some senders join several."""
+
+MAX_DATAGRAMS_PER_CALL = 256
+"""Datagrams read per `receive`: a flood must not hold up the flight controller."""
+
+_MARKERS = (0xFD, 0xFE)
+
+
+class Endpoint(Protocol):
+    """One end of a MAVLink link. Nothing blocks and nothing raises while flying."""
+
+    datagrams: bool
+    """True when each chunk from `receive` holds whole frames."""
+    send_errors: int
+    """Chunks that could not be sent."""
+
+    def receive(self) -> list[bytes]:
+        """Return all chunks that have arrived, oldest first."""
+        ...
+
+    def send(self, data: bytes) -> None:
+        """Send one frame."""
+        ...
+
+    def fileno(self) -> int | None:
+        """Return the descriptor to wait on, or None when there is none."""
+        ...
+
+    def close(self) -> None:
+        """Release the resources; harmless when called again."""
+        ...
+
+
+class MemoryEndpoint:
+    """Two queues in one process: for lockstep and tests."""
+
+    datagrams = True
+
+    def __init__(self) -> None:
+        self.inbox: deque[bytes] = deque()
+        """Chunks for the vehicle; the other side appends."""
+        self.outbox: deque[bytes] = deque()
+        """Frames from the vehicle; the other side takes from the left."""
+        self.send_errors = 0
+
+    def receive(self) -> list[bytes]:
+        """Return all chunks put into `inbox`, oldest first."""
+        chunks = []
+        while self.inbox:
+            chunks.append(self.inbox.popleft())
+        return chunks
+
+    def send(self, data: bytes) -> None:
+        """Append one frame to `outbox`."""
+        self.outbox.append(data)
+
+    def take(self) -> list[bytes]:
+        """Return and forget all frames sent so far, oldest first."""
+        frames = list(self.outbox)
+        self.outbox.clear()
+        return frames
+
+    def fileno(self) -> None:
+        """Return None: there is nothing to wait on."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class UdpEndpoint:
+    """A bound UDP socket with a preset remote, like a PX4 SITL link.
+
+    Frames go to the preset remote from the first tick, without anybody having been heard. A peer
+    that talks from another address gets everything too: the newest such peer, until another one
+    talks. So an onboard program on the usual port and one more client can share the link.
+    """
+
+    datagrams = True
+
+    def __init__(
+        self,
+        local: Address,
+        remote: Address | None,
+        *,
+        local_option: str,
+        remote_option: str,
+        insecure: bool = False,
+    ) -> None:
+        """Bind.
+
+        Args:
+            local: Address to bind; port 0 = any free one.
+            remote: Where to send unasked; None = only to peers that talk.
+            local_option: The command line option that moves the local port, for messages.
+            remote_option: The command line option that moves the remote, for messages.
+            insecure: Allow addresses that other machines can reach.
+
+        Raises:
+            UsageError: An address is unusable, taken, or reachable from outside without
+                `insecure`.
+        """
+        self.send_errors = 0
+        _check_address(local, local_option, lowest_port=0, insecure=insecure)
+        if remote is not None:
+            _check_address(remote, remote_option, lowest_port=1, insecure=insecure)
+        self._remote = remote
+        self._peer: Address | None = None
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            self._socket.bind(local)
+        except OSError as error:
+            self._socket.close()
+            raise UsageError(_bind_problem(local, local_option, error)) from error
+        self.local: Address = self._socket.getsockname()
+
+    @property
+    def peer(self) -> Address | None:
+        """The newest talker that is not the preset remote, None before any."""
+        return self._peer
+
+    def receive(self) -> list[bytes]:
+        """Return the datagrams that have arrived, oldest first, and learn who talks."""
+        chunks: list[bytes] = []
+        for _ in range(MAX_DATAGRAMS_PER_CALL):
+            try:
+                data, address = self._socket.recvfrom(MAX_DATAGRAM)
+            except BlockingIOError:
+                break
+            except OSError:
+                continue  # an earlier send was refused (ICMP): nothing arrived
+            if address not in (self._remote, self._peer) and data and data[0] in _MARKERS:
+                self._peer = address
+            chunks.append(data)
+        return chunks
+
+    def send(self, data: bytes) -> None:
+        """Send one frame to the preset remote and to the learned peer."""
+        for address in (self._remote, self._peer):
+            if address is None:
+                continue
+            try:
+                self._socket.sendto(data, address)
+            except OSError:
+                self.send_errors += 1
+
+    def fileno(self) -> int | None:
+        """Return the socket's descriptor, None once closed."""
+        number = self._socket.fileno()
+        return None if number < 0 else number
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def _check_address(address: Address, option: str, *, lowest_port: int, insecure: bool) -> None:
+    host, port = address
+    try:
+        parsed = ipaddress.IPv4Address(host)
+    except ValueError as error:
+        raise UsageError(f"{option}: host {host!r}: must be an IPv4 address") from error
+    if not lowest_port <= port <= 65_535:
+        raise UsageError(f"{option}: port {port}: must be in {lowest_port}..65535")
+    if not parsed.is_loopback and not insecure:
+        raise UsageError(
+            f"{option}: {host}:{port} can be reached from other machines and MAVLink is "
+            "unauthenticated (no signing yet): add --insecure to allow it on a trusted network"
+        )
+
+
+def _bind_problem(local: Address, option: str, error: OSError) -> str:
+    where = f"UDP port {local[1]} on {local[0]}"
+    if error.errno == errno.EADDRINUSE:
+        return f"{where} is taken (another simulator?): choose another with {option}"
+    return f"{where} cannot be used ({error.strerror}): choose another with {option}"

@@ -1,0 +1,47 @@
+"""AUTOPILOT_VERSION: who we say we are, and what we really can do."""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.mavlink.codec import WireMessage, dialect
+
+CAPABILITIES: int = (
+    dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
+"""Of a real PX4's 0xE8FF only what is true here: no missions, fence, rally points, FTP, attitude
+setpoints or flight termination."""
+
+FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
+"""The PX4 release whose behaviour is emulated: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
+
+BOARD_VERSION = 1
+"""As PX4 SITL reports."""
+
+CUSTOM_VERSION = b"airl-mav"
+"""Where a real PX4 puts the first 8 bytes of its git hash."""
+
+UID = 0x4149_524C_4D41_5601
+"""Constant hardware id: every emulated vehicle is the same piece of hardware."""
+
+_ZEROS_8 = (0,) * 8
+
+
+def autopilot_version(state: AutopilotState) -> WireMessage:  # noqa: ARG001 - a stream builder
+    """Return AUTOPILOT_VERSION."""
+    return dialect.MAVLink_autopilot_version_message(
+        CAPABILITIES,
+        FIRMWARE_VERSION,
+        FIRMWARE_VERSION,
+        0,
+        BOARD_VERSION,
+        tuple(CUSTOM_VERSION),
+        _ZEROS_8,
+        _ZEROS_8,
+        0,
+        0,
+        UID,
+    )

@@ -1,0 +1,112 @@
+"""PX4 flight modes on the wire: custom_mode, base_mode and system_status of HEARTBEAT.
+
+Source: PX4 src/modules/commander/px4_custom_mode.h and Commander.cpp (DO_SET_MODE),
+src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from firmware_sim.autopilot.state import Arming, CommanderStatus, Mode
+from firmware_sim.mavlink.codec import dialect
+
+MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL = 4, 6, 3
+
+_MAIN_SUB: dict[Mode, tuple[int, int]] = {
+    Mode.HOLD: (MAIN_AUTO, 3),
+    Mode.TAKEOFF: (MAIN_AUTO, 2),
+    Mode.LAND: (MAIN_AUTO, 6),
+    Mode.RETURN: (MAIN_AUTO, 5),
+    Mode.OFFBOARD: (MAIN_OFFBOARD, 0),
+    Mode.POSITION: (MAIN_POSCTL, 0),
+}
+
+_AUTO_MODES = {sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO}
+
+# Modes of a real PX4 that need a pilot's sticks or a mission: known by name, never available.
+_UNAVAILABLE_MAIN = {1: "Manual", 2: "Altitude", 5: "Acro", 7: "Stabilized"}
+_UNAVAILABLE_AUTO = {
+    0: "Mission",
+    4: "Mission",
+    8: "Follow Target",
+    9: "Precision Landing",
+    **{sub: f"External {sub - 10}" for sub in range(11, 19)},
+}
+
+
+def custom_mode(mode: Mode) -> int:
+    """Return PX4's custom_mode: main mode << 16 | sub mode << 24."""
+    main, sub = _MAIN_SUB[mode]
+    return main << 16 | sub << 24
+
+
+def base_mode(status: CommanderStatus) -> int:
+    """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
+    bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+    if _MAIN_SUB[status.mode][0] == MAIN_AUTO:
+        bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+    if status.mode is Mode.POSITION:
+        bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+    if status.arming is Arming.ARMED:
+        bits |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
+    return bits
+
+
+def system_status(status: CommanderStatus) -> int:
+    """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe."""
+    state: int
+    if status.arming is Arming.ARMED:
+        state = dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE
+    elif status.arming is Arming.STANDBY:
+        state = dialect.MAV_STATE_STANDBY
+    else:
+        state = dialect.MAV_STATE_UNINIT
+    return state
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRequest:
+    """What a DO_SET_MODE asks for: at most one field is set.
+
+    Neither set: PX4 accepts and changes nothing (its answer to an unknown main mode).
+    """
+
+    mode: Mode | None = None
+    refusal: str | None = None
+    """Why the mode cannot be flown, as PX4 words it for the operator."""
+
+
+def _unavailable(name: str) -> ModeRequest:
+    return ModeRequest(refusal=f"Switching to {name} is currently not available")
+
+
+def requested_mode(base: int, main: int, sub: int) -> ModeRequest:
+    """Return what DO_SET_MODE's parameters 1..3 (MAV_MODE_FLAG bits, main, sub mode) mean."""
+    if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+        return _from_base_mode(base)
+    if main == MAIN_AUTO:
+        if sub in _AUTO_MODES:
+            return ModeRequest(_AUTO_MODES[sub])
+        if sub in _UNAVAILABLE_AUTO:
+            return _unavailable(_UNAVAILABLE_AUTO[sub])
+        return ModeRequest(refusal="Unsupported auto mode")
+    if main == MAIN_OFFBOARD:
+        return ModeRequest(Mode.OFFBOARD)
+    if main == MAIN_POSCTL:
+        return ModeRequest(Mode.POSITION)
+    if main in _UNAVAILABLE_MAIN:
+        return _unavailable(_UNAVAILABLE_MAIN[main])
+    return ModeRequest()
+
+
+def _from_base_mode(base: int) -> ModeRequest:
+    """PX4's reading of the bits of clients that know no custom modes."""
+    if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
+        return _unavailable(_UNAVAILABLE_AUTO[4])
+    if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
+        return ModeRequest()
+    if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
+        return ModeRequest(Mode.POSITION)
+    stabilized = base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+    return _unavailable(_UNAVAILABLE_MAIN[7 if stabilized else 1])

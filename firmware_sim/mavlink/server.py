@@ -1,0 +1,207 @@
+"""The vehicle's MAVLink side: links, streams and services in front of an autopilot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from airl_mav.frames import Geodetic
+from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.autopilot.state import AutopilotState, Message
+from firmware_sim.mavlink import identity
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
+from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters
+from firmware_sim.mavlink.services import (
+    commands,
+    data_streams,
+    ftp,
+    heartbeats,
+    mission,
+    ping,
+    setpoints,
+    timesync,
+)
+from firmware_sim.mavlink.services.context import Context, Handler
+from firmware_sim.mavlink.services.params import ParameterService
+from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
+from firmware_sim.mavlink.streams.status import system_time
+from firmware_sim.mavlink.streams.vibration import VibrationMeter
+from firmware_sim.mavlink.texts import TextEncoder
+from firmware_sim.mavlink.tlog import TlogWriter
+
+_STATELESS: dict[str, Handler] = {
+    **commands.HANDLERS,
+    **data_streams.HANDLERS,
+    **ftp.HANDLERS,
+    **heartbeats.HANDLERS,
+    **mission.HANDLERS,
+    **ping.HANDLERS,
+    **setpoints.HANDLERS,
+    **timesync.HANDLERS,
+}
+
+
+_DISCARD_CALLS = 4
+"""Reads per link that surely empty it: four times 256 datagrams exceed a socket's buffer."""
+
+
+class _Session:
+    """One link and what is remembered about it."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.context: Context | None = None
+        """None while there is no autopilot."""
+        self.parameters = ParameterService()
+        self.texts = TextEncoder()
+        self.handlers = _STATELESS | self.parameters.handlers
+        self.announced_origin: Geodetic | None = None
+
+
+class MavlinkServer:
+    """Speaks MAVLink on all links for one autopilot.
+
+    Per tick: `receive`, then the autopilot's step, then `send`, all on one thread and with
+    simulated time passed in. Nothing blocks; nothing that arrives raises. Without an autopilot
+    the vehicle is off: it says nothing and hears nothing.
+    """
+
+    def __init__(
+        self, links: Sequence[LinkConfig], port: AutopilotPort | None = None, *, boot_unix_us: int
+    ) -> None:
+        """Open the links.
+
+        Args:
+            links: The links; each streams its default rates from the first `send` on.
+            port: The autopilot, None = not yet.
+            boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+        """
+        self._boot_unix_us = boot_unix_us
+        self._port: AutopilotPort | None = None
+        self._now_us = 0
+        self._vibration = VibrationMeter()
+        self._texts: list[Message] = []
+        self._sessions = [self._open(config) for config in links]
+        if port is not None:
+            self.attach(port)
+
+    def attach(self, port: AutopilotPort) -> None:
+        """Exchange the autopilot, between two episodes.
+
+        Rates that clients have set stay; unsent texts, running parameter lists and what arrived
+        for the old autopilot (stale setpoints) go. Simulated time may start anew.
+        """
+        if self._port is not None:
+            self._discard_received()
+        self._port = port
+        self._texts.clear()
+        self._vibration = VibrationMeter()
+        for session in self._sessions:
+            session.context = Context(
+                session.link, port, self._now_us, self._texts.append, self._broadcast
+            )
+            session.parameters.restart()
+            session.announced_origin = None
+            session.link.scheduler.restart()
+
+    def receive(self, now_us: int) -> int:
+        """Read and carry out everything that has arrived; return how many messages took effect.
+
+        Args:
+            now_us: Simulated time [µs].
+        """
+        self._now_us = now_us
+        effective = 0
+        for session in self._sessions:
+            for message in session.link.receive():
+                if self._dispatch(session, message):
+                    effective += 1
+                else:
+                    session.link.ignored += 1
+        return effective
+
+    def send(self, now_us: int) -> None:
+        """Send texts, pending parameters and the streams that are due; call once per tick.
+
+        Args:
+            now_us: Simulated time [µs].
+        """
+        self._now_us = now_us
+        port = self._port
+        if port is None:
+            return
+        state = port.state()
+        self._vibration.update(state)
+        texts = [*self._texts, *port.take_messages()]
+        self._texts.clear()
+        for session in self._sessions:
+            link = session.link
+            for text in texts:
+                for chunk in session.texts.encode(text):
+                    link.send(chunk)
+            if state.origin is not None and state.origin != session.announced_origin:
+                session.announced_origin = state.origin
+                link.send_stream("GPS_GLOBAL_ORIGIN", state)
+            session.parameters.send_pending(link, port.parameters)
+            for name in link.scheduler.due(now_us):
+                link.send_stream(name, state)
+
+    def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
+        """Write both directions of a link to a tlog from now on; None ends it.
+
+        The writer stays the caller's to close. Raises ValueError when there is no such link.
+        """
+        (session,) = (session for session in self._sessions if session.link.name == link)
+        session.link.tap = None if tlog is None else self._tap(tlog)
+
+    def counters(self) -> dict[str, LinkCounters]:
+        """Return the traffic per link name."""
+        return {session.link.name: session.link.counters for session in self._sessions}
+
+    def filenos(self) -> list[int]:
+        """Return the descriptors that become readable when something arrives."""
+        numbers = (session.link.fileno() for session in self._sessions)
+        return [number for number in numbers if number is not None]
+
+    def close(self) -> None:
+        """Close the endpoints."""
+        for session in self._sessions:
+            session.link.close()
+
+    def _open(self, config: LinkConfig) -> _Session:
+        builders: dict[str, Builder] = {
+            **BUILDERS,
+            "AUTOPILOT_VERSION": identity.autopilot_version,
+            "SYSTEM_TIME": system_time(self._boot_unix_us),
+            "VIBRATION": lambda state: self._vibration.message(state),
+            "BATTERY_STATUS": self._battery_status,
+            "TIMESYNC": timesync.request,
+            "PING": ping.PingRequests().message,
+        }
+        return _Session(Link(config, builders))
+
+    def _dispatch(self, session: _Session, message: WireMessage) -> bool:
+        if (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, COMPONENT_ID):
+            return False  # our own words, echoed
+        handler, context = session.handlers.get(message.get_type()), session.context
+        if handler is None or context is None:
+            return False
+        context.now_us = self._now_us
+        return handler(message, context)
+
+    def _discard_received(self) -> None:
+        for session in self._sessions:
+            for _ in range(_DISCARD_CALLS):
+                session.link.ignored += len(session.link.receive())
+
+    def _broadcast(self, message: WireMessage) -> None:
+        for session in self._sessions:
+            session.link.send(message)
+
+    def _battery_status(self, state: AutopilotState) -> WireMessage | None:
+        if self._port is None:
+            return None
+        charge = sensors.charge_state(state.battery.remaining, self._port.parameters)
+        return sensors.battery_status(state, charge)
+
+    def _tap(self, tlog: TlogWriter) -> Callable[[bytes], None]:
+        return lambda frame: tlog.write(self._now_us, frame)

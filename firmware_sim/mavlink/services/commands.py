@@ -1,0 +1,241 @@
+"""COMMAND_LONG, COMMAND_INT and SET_MODE.
+
+Answers and refusals follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
+running PX4 1.16. Every command addressed to the vehicle is acknowledged to its sender, on the
+link it came from; the same command may come twice (clients repeat), so actions are idempotent.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from firmware_sim.autopilot.state import Message, Mode, Result, Severity
+from firmware_sim.mavlink.codec import SYSTEM_ID, WireMessage, dialect, message_id
+from firmware_sim.mavlink.modes import requested_mode
+from firmware_sim.mavlink.scheduler import OFF
+from firmware_sim.mavlink.services.context import (
+    ANY,
+    Context,
+    Handler,
+    for_vehicle,
+    sender,
+)
+from firmware_sim.mavlink.streams.units import INT32_MAX
+
+FORCE_MAGIC = 21_196
+"""MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
+
+_RELATIVE_FRAMES = (
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+)
+_INTERVAL_DISABLED, _INTERVAL_UNAVAILABLE = -1, 0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A COMMAND_LONG or COMMAND_INT."""
+
+    number: int
+    """MAV_CMD."""
+    params: tuple[float, float, float, float, float, float, float]
+    """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
+    frame: int | None = None
+    """MAV_FRAME of a COMMAND_INT."""
+
+    def integer(self, number: int) -> int | None:
+        """Return parameter 1..7 rounded, None when it is not a finite number."""
+        value = self.params[number - 1]
+        return round(value) if math.isfinite(value) else None
+
+
+Action = Callable[[Command, Context], Result]
+
+
+def _arm_disarm(command: Command, context: Context) -> Result:
+    force = command.integer(2) == FORCE_MAGIC
+    if command.integer(1) == 1:
+        return context.port.arm(force=force)
+    if command.integer(1) == 0:
+        return context.port.disarm(force=force)
+    text = f"Unsupported ARM_DISARM param: {command.params[0]:.3f}"
+    context.announce(Message(Severity.CRITICAL, text))
+    return Result.UNSUPPORTED
+
+
+def _takeoff(command: Command, context: Context) -> Result:
+    """Parameter 7: altitude above mean sea level [m], above home in a relative frame."""
+    altitude = command.params[6]
+    if not math.isfinite(altitude):
+        return context.port.takeoff(None)
+    if command.frame in _RELATIVE_FRAMES:
+        return context.port.takeoff(altitude)
+    home = context.port.state().home
+    if home is None:
+        return Result.TEMPORARILY_REJECTED
+    return context.port.takeoff(altitude - home.altitude_m)
+
+
+def _land(_command: Command, context: Context) -> Result:
+    return context.port.set_mode(Mode.LAND)
+
+
+def _return(_command: Command, context: Context) -> Result:
+    return context.port.set_mode(Mode.RETURN)
+
+
+def _set_mode(command: Command, context: Context) -> Result:
+    base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
+    request = requested_mode(base, main, sub)
+    if request.refusal is not None:
+        context.announce(Message(Severity.CRITICAL, request.refusal))
+        return Result.TEMPORARILY_REJECTED
+    if request.mode is None:
+        return Result.ACCEPTED  # PX4 too accepts a main mode it does not know, and does nothing
+    return context.port.set_mode(request.mode)
+
+
+def _set_home(command: Command, context: Context) -> Result:
+    if command.integer(1) == 1:
+        return context.port.set_home_here()
+    return Result.DENIED  # another place than the present one
+
+
+def _reboot(command: Command, _context: Context) -> Result:
+    """PX4 SITL has no board to reset: doing nothing is all it accepts, armed or not."""
+    return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
+
+
+def _set_message_interval(command: Command, context: Context) -> Result:
+    """Parameter 1: message id; 2: interval [µs], 0 = default, negative = off."""
+    name = _stream_name(command, context)
+    interval = command.params[1]
+    if name is None:
+        return Result.UNSUPPORTED
+    if not math.isfinite(interval):
+        return Result.DENIED
+    scheduler = context.link.scheduler
+    if interval < 0.0:
+        interval_us = OFF
+    elif interval == 0.0:
+        interval_us = scheduler.default_us(name)
+    else:
+        interval_us = min(max(1, round(interval)), INT32_MAX)
+    scheduler.set_interval(name, interval_us, context.now_us)
+    return Result.ACCEPTED
+
+
+def _get_message_interval(command: Command, context: Context) -> Result:
+    number = command.integer(1)
+    if number is None or not 0 <= number <= 0xFFFF:
+        return Result.DENIED
+    return _send_interval(number, context)
+
+
+def _request_message(command: Command, context: Context) -> Result:
+    """Parameter 1: message id. Known but nothing to say yet: DENIED, as PX4."""
+    name = _stream_name(command, context)
+    if name is not None:
+        sent = context.link.send_stream(name, context.port.state())
+        return Result.ACCEPTED if sent else Result.DENIED
+    if command.integer(1) == dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
+        asked = command.integer(2)
+        return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
+    return Result.UNSUPPORTED
+
+
+def _request(name: str) -> Action:
+    """Return the action of an old command that asks for one certain message."""
+
+    def action(_command: Command, context: Context) -> Result:
+        sent = context.link.send_stream(name, context.port.state())
+        return Result.ACCEPTED if sent else Result.DENIED
+
+    return action
+
+
+_REQUEST_CAPABILITIES: int = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
+_REQUEST_PROTOCOL: int = dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
+    dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
+    dialect.MAV_CMD_NAV_LAND: _land,
+    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _return,
+    dialect.MAV_CMD_DO_SET_MODE: _set_mode,
+    dialect.MAV_CMD_DO_SET_HOME: _set_home,
+    dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
+    dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_message_interval,
+    dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_message_interval,
+    dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
+    dialect.MAV_CMD_GET_HOME_POSITION: _request("HOME_POSITION"),
+    _REQUEST_CAPABILITIES: _request("AUTOPILOT_VERSION"),
+}
+"""Everything else is UNSUPPORTED, MAV_CMD_REQUEST_PROTOCOL_VERSION too: its answer is not in
+pymavlink's dialect, and clients then go by the MAVLink 2 frames they see."""
+
+
+def handle_command_long(message: WireMessage, context: Context) -> bool:
+    """Carry out and acknowledge a COMMAND_LONG."""
+    params = tuple(getattr(message, f"param{number}") for number in range(1, 8))
+    return _handle(message, Command(message.command, params), context)
+
+
+def handle_command_int(message: WireMessage, context: Context) -> bool:
+    """Carry out and acknowledge a COMMAND_INT."""
+    four = (message.param1, message.param2, message.param3, message.param4)
+    params = (*four, message.x / 1e7, message.y / 1e7, message.z)
+    return _handle(message, Command(message.command, params, message.frame), context)
+
+
+def handle_set_mode(message: WireMessage, context: Context) -> bool:
+    """Carry out a SET_MODE, the old message without acknowledgement."""
+    if message.target_system != SYSTEM_ID:
+        return False
+    main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
+    nan = math.nan
+    params = (float(message.base_mode), float(main), float(sub), nan, nan, nan, nan)
+    _set_mode(Command(dialect.MAV_CMD_DO_SET_MODE, params), context)
+    return True
+
+
+HANDLERS: dict[str, Handler] = {
+    "COMMAND_LONG": handle_command_long,
+    "COMMAND_INT": handle_command_int,
+    "SET_MODE": handle_set_mode,
+}
+
+
+def _handle(message: WireMessage, command: Command, context: Context) -> bool:
+    if not _is_addressed(message, command):
+        return False
+    action = ACTIONS.get(command.number)
+    result = Result.UNSUPPORTED if action is None else action(command, context)
+    context.link.send(
+        dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *sender(message))
+    )
+    return True
+
+
+def _is_addressed(message: WireMessage, command: Command) -> bool:
+    if command.number in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
+        return message.target_system in (SYSTEM_ID, ANY)
+    return for_vehicle(message)
+
+
+def _stream_name(command: Command, context: Context) -> str | None:
+    """Return the stream whose message id is parameter 1, None when there is none."""
+    number = command.integer(1)
+    return next((name for name in context.link.builders if message_id(name) == number), None)
+
+
+def _send_interval(number: int, context: Context) -> Result:
+    interval = _INTERVAL_UNAVAILABLE
+    for name in context.link.builders:
+        if message_id(name) == number:
+            interval = context.link.scheduler.interval_us(name)
+            interval = _INTERVAL_DISABLED if interval == OFF else interval
+    context.link.send(dialect.MAVLink_message_interval_message(number, interval))
+    return Result.ACCEPTED

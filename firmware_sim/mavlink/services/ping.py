@@ -1,0 +1,33 @@
+"""PING: asks all peers from time to time and answers theirs."""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.services.context import ANY, Context, Handler, sender
+
+
+def handle_ping(message: WireMessage, context: Context) -> bool:
+    """Return a request (target 0/0) to its sender; an answer to our own request ends here."""
+    if (message.target_system, message.target_component) != (ANY, ANY):
+        return False
+    context.link.send(
+        dialect.MAVLink_ping_message(message.time_usec, message.seq, *sender(message))
+    )
+    return True
+
+
+HANDLERS: dict[str, Handler] = {"PING": handle_ping}
+
+
+class PingRequests:
+    """Builds one link's PING stream."""
+
+    def __init__(self) -> None:
+        self._sequence = 0
+
+    def message(self, state: AutopilotState) -> WireMessage:
+        """Return the next request."""
+        request = dialect.MAVLink_ping_message(state.time_us, self._sequence, ANY, ANY)
+        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
+        return request

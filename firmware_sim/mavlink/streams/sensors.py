@@ -1,0 +1,135 @@
+"""What the sensors and outputs say: IMU, pressure, GPS, battery, motors, vibration."""
+
+from __future__ import annotations
+
+import math
+
+from airl_mav import atmosphere
+from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.autopilot.state import Arming, AutopilotState
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.streams.units import (
+    INT16_MAX,
+    UINT16_MAX,
+    boot_ms,
+    centidegrees,
+    deg_e7,
+    int16,
+    int32,
+    mm,
+    saturate,
+    uint16,
+    uint32,
+)
+
+_IMU_FIELDS = 0b1_1011_1111_1111
+"""HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
+
+_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
+"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
+
+_CHARGE_WARNINGS = (
+    ("BAT_LOW_THR", dialect.MAV_BATTERY_CHARGE_STATE_LOW),
+    ("BAT_CRIT_THR", dialect.MAV_BATTERY_CHARGE_STATE_CRITICAL),
+    ("BAT_EMERGEN_THR", dialect.MAV_BATTERY_CHARGE_STATE_EMERGENCY),
+)
+"""Threshold parameters, from the highest to the lowest."""
+
+
+def highres_imu(state: AutopilotState) -> WireMessage:
+    """Newest IMU sample with the estimated biases removed, as PX4 sends it; mag and baro raw."""
+    estimate = state.estimate
+    return dialect.MAVLink_highres_imu_message(
+        state.time_us,
+        *(state.accel - estimate.accel_bias).tolist(),
+        *(state.gyro - estimate.gyro_bias).tolist(),
+        *state.mag.tolist(),
+        state.pressure_hpa,
+        0.0,
+        atmosphere.altitude_m(state.pressure_hpa),
+        state.temperature_c,
+        _IMU_FIELDS,
+    )
+
+
+def scaled_pressure(state: AutopilotState) -> WireMessage:
+    """Static pressure [hPa] and temperature [0.01 °C]."""
+    return dialect.MAVLink_scaled_pressure_message(
+        boot_ms(state.time_us), state.pressure_hpa, 0.0, int16(state.temperature_c * 100.0)
+    )
+
+
+def gps_raw_int(state: AutopilotState) -> WireMessage | None:
+    """Newest GPS fix; nothing before the first. Dilution of precision is unknown."""
+    fix = state.gps
+    if fix is None:
+        return None
+    north, east, _ = fix.velocity_ned.tolist()
+    return dialect.MAVLink_gps_raw_int_message(
+        state.time_us,
+        fix.fix_type,
+        deg_e7(fix.position.latitude_deg),
+        deg_e7(fix.position.longitude_deg),
+        mm(fix.position.altitude_m),
+        UINT16_MAX,
+        UINT16_MAX,
+        uint16(math.hypot(north, east) * 100.0),
+        centidegrees(math.atan2(east, north)),
+        saturate(fix.satellites, 0, 254, 255),
+        mm(fix.position.altitude_m),
+        uint32(fix.eph_m * 1e3),
+        uint32(fix.epv_m * 1e3),
+    )
+
+
+def battery_status(state: AutopilotState, charge_state: int) -> WireMessage:
+    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge.
+
+    Args:
+        state: The snapshot.
+        charge_state: MAV_BATTERY_CHARGE_STATE.
+    """
+    battery = state.battery
+    voltages = [UINT16_MAX] * 10
+    voltages[0] = uint16(battery.voltage_v * 1e3)
+    return dialect.MAVLink_battery_status_message(
+        0,
+        dialect.MAV_BATTERY_FUNCTION_ALL,
+        dialect.MAV_BATTERY_TYPE_LIPO,
+        INT16_MAX,
+        voltages,
+        int16(battery.current_a * 100.0, unknown=-1),
+        int32(battery.consumed_mah, unknown=-1),
+        -1,
+        percent(battery.remaining),
+        0,
+        charge_state,
+    )
+
+
+def charge_state(remaining: float, parameters: ParameterStore) -> int:
+    """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, by PX4's warning thresholds."""
+    state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
+    for name, warning in _CHARGE_WARNINGS:
+        threshold = parameters.by_name(name)
+        if threshold is None:
+            return int(dialect.MAV_BATTERY_CHARGE_STATE_UNDEFINED)
+        if remaining < threshold.value:
+            state = warning
+    return state
+
+
+def servo_output_raw(state: AutopilotState) -> WireMessage:
+    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
+    if state.status.arming is Arming.ARMED:
+        pulses = [_PWM_MIN + saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
+    else:
+        pulses = [_PWM_DISARMED] * len(state.motors)
+    return dialect.MAVLink_servo_output_raw_message(
+        state.time_us & 0xFFFF_FFFF, 0, *pulses, 0, 0, 0, 0
+    )
+
+
+def percent(share: float) -> int:
+    """Return a share 0..1 as percent for an int8 field, -1 when unknown."""
+    return saturate(share * 100.0, 0, 100, -1)

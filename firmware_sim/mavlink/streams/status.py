@@ -1,0 +1,137 @@
+"""How the vehicle is: heartbeat, health, landed state, estimator, clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from firmware_sim.autopilot.state import Arming, AutopilotState, Landed
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.modes import base_mode, custom_mode, system_status
+from firmware_sim.mavlink.streams.sensors import percent
+from firmware_sim.mavlink.streams.units import NAN, boot_ms, int16, uint16
+
+_MAVLINK_VERSION = 3
+"""HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
+
+_LANDED = {
+    Landed.ON_GROUND: dialect.MAV_LANDED_STATE_ON_GROUND,
+    Landed.IN_AIR: dialect.MAV_LANDED_STATE_IN_AIR,
+    Landed.TAKEOFF: dialect.MAV_LANDED_STATE_TAKEOFF,
+    Landed.LANDING: dialect.MAV_LANDED_STATE_LANDING,
+}
+
+_SENSORS_ALWAYS = (
+    dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+    | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
+    | dialect.MAV_SYS_STATUS_EXTENSION_USED
+)
+_SENSORS_PRESENT = (
+    _SENSORS_ALWAYS
+    | dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
+    | dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    | dialect.MAV_SYS_STATUS_SENSOR_GPS
+    | dialect.MAV_SYS_STATUS_AHRS
+    | dialect.MAV_SYS_STATUS_PREARM_CHECK
+)
+
+_ESTIMATOR_GOOD = (
+    dialect.ESTIMATOR_ATTITUDE
+    | dialect.ESTIMATOR_VELOCITY_HORIZ
+    | dialect.ESTIMATOR_VELOCITY_VERT
+    | dialect.ESTIMATOR_POS_HORIZ_REL
+    | dialect.ESTIMATOR_POS_VERT_ABS
+    | dialect.ESTIMATOR_PRED_POS_HORIZ_REL
+)
+_ESTIMATOR_GOOD_GLOBAL = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
+
+
+def heartbeat(state: AutopilotState) -> WireMessage:
+    """A PX4 quadrotor and its mode."""
+    status = state.status
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_QUADROTOR,
+        dialect.MAV_AUTOPILOT_PX4,
+        base_mode(status),
+        custom_mode(status.mode),
+        system_status(status),
+        _MAVLINK_VERSION,
+    )
+
+
+def extended_sys_state(state: AutopilotState) -> WireMessage:
+    """Landed state; the vehicle is no VTOL."""
+    return dialect.MAVLink_extended_sys_state_message(
+        dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
+    )
+
+
+def sys_status(state: AutopilotState) -> WireMessage:
+    """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%]."""
+    health: int = _SENSORS_ALWAYS
+    if bool(state.mag.any()):
+        health |= dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
+    if state.pressure_hpa > 0.0:
+        health |= dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    if state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX:
+        health |= dialect.MAV_SYS_STATUS_SENSOR_GPS
+    if state.estimate.healthy:
+        health |= dialect.MAV_SYS_STATUS_AHRS
+    if state.status.arming is not Arming.BOOT:
+        health |= dialect.MAV_SYS_STATUS_PREARM_CHECK
+    battery = state.battery
+    return dialect.MAVLink_sys_status_message(
+        _SENSORS_PRESENT,
+        _SENSORS_PRESENT,
+        health,
+        uint16(state.load * 1e3),
+        uint16(battery.voltage_v * 1e3),
+        int16(battery.current_a * 100.0, unknown=-1),
+        percent(battery.remaining),
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+    )
+
+
+def estimator_status(state: AutopilotState) -> WireMessage:
+    """Which outputs are good, innovation test ratios (1 = rejection gate), accuracies [m]."""
+    estimate = state.estimate
+    flags: int = 0
+    if estimate.healthy:
+        flags = _ESTIMATOR_GOOD | (_ESTIMATOR_GOOD_GLOBAL if state.origin is not None else 0)
+    horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
+    north, east, down = estimate.sigma[:3].tolist()
+    return dialect.MAVLink_estimator_status_message(
+        estimate.time_us,
+        flags,
+        max(horizontal, vertical),
+        horizontal,
+        height,
+        mag,
+        NAN,
+        NAN,
+        math.hypot(north, east),
+        down,
+    )
+
+
+def mission_current(state: AutopilotState) -> WireMessage:  # noqa: ARG001 - a builder
+    """There is no mission."""
+    return dialect.MAVLink_mission_current_message(0, 0, dialect.MISSION_STATE_NO_MISSION)
+
+
+def system_time(boot_unix_us: int) -> Callable[[AutopilotState], WireMessage]:
+    """Return the builder of SYSTEM_TIME for a calendar time of boot [µs since 1970, UTC]."""
+
+    def build(state: AutopilotState) -> WireMessage:
+        return dialect.MAVLink_system_time_message(
+            boot_unix_us + state.time_us, boot_ms(state.time_us)
+        )
+
+    return build

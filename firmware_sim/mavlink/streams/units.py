@@ -1,0 +1,70 @@
+"""Numbers as MAVLink fields want them: scaled, rounded, saturated, or the "unknown" value."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+NAN: Final = math.nan
+INT16_MAX: Final = 32_767
+INT32_MAX: Final = 2_147_483_647
+UINT16_MAX: Final = 65_535
+UINT32_MAX: Final = 4_294_967_295
+
+TWO_PI: Final = 2.0 * math.pi
+
+
+def saturate(value: float, low: int, high: int, unknown: int) -> int:
+    """Return `value` rounded and clamped to low..high; `unknown` for NaN."""
+    if value != value:
+        return unknown
+    if value >= high:
+        return high
+    return low if value <= low else round(value)
+
+
+def int16(value: float, unknown: int = 0) -> int:
+    """Return a value for an int16 field."""
+    return saturate(value, -INT16_MAX - 1, INT16_MAX, unknown)
+
+
+def int32(value: float, unknown: int = 0) -> int:
+    """Return a value for an int32 field."""
+    return saturate(value, -INT32_MAX - 1, INT32_MAX, unknown)
+
+
+def uint16(value: float, unknown: int = UINT16_MAX) -> int:
+    """Return a value for a uint16 field whose maximum means unknown."""
+    return saturate(value, 0, UINT16_MAX - 1, unknown)
+
+
+def uint32(value: float, unknown: int = 0) -> int:
+    """Return a value for a uint32 field."""
+    return saturate(value, 0, UINT32_MAX, unknown)
+
+
+def boot_ms(time_us: int) -> int:
+    """Return time_boot_ms [ms] of simulated time [µs]; wraps after 49 days as the field does."""
+    return time_us // 1_000 & UINT32_MAX
+
+
+def deg_e7(angle_deg: float) -> int:
+    """Return an angle [deg] as degE7."""
+    return int32(angle_deg * 1e7)
+
+
+def mm(length_m: float) -> int:
+    """Return a length [m] as int32 millimetres."""
+    return int32(length_m * 1e3)
+
+
+def cm_s(speed_m_s: float) -> int:
+    """Return a velocity [m/s] as int16 cm/s."""
+    return int16(speed_m_s * 1e2)
+
+
+def centidegrees(angle_rad: float) -> int:
+    """Return an angle [rad] as centidegrees 0..35999, UINT16_MAX when unknown."""
+    if not math.isfinite(angle_rad):
+        return UINT16_MAX
+    return round(math.degrees(angle_rad % TWO_PI) * 100.0) % 36_000

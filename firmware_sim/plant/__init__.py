@@ -1,0 +1,1 @@
+"""The vehicle, its sensors and its camera in the arena."""

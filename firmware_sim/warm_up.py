@@ -1,0 +1,34 @@
+"""Compile every kernel before the first tick that counts.
+
+The first start after an install compiles (tens of seconds); later ones load the compiled code from
+disk. Either way it must not happen in flight: a tick has 4 ms.
+"""
+
+from __future__ import annotations
+
+from airl_mav.arena.generate import generate
+from airl_mav.clock import SimClock
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.plant.wind import WindSettings
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+TICKS = 400
+"""Enough for the estimator to converge and the vehicle to arm and spin."""
+
+
+def warm_up(vehicle: VehicleProfile) -> None:
+    """Fly a moment in simulated time, through everything a real flight uses."""
+    spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
+    arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
+    setup = EpisodeSetup(vehicle, arena, 0, WindSettings())
+    simulation = Simulation(setup, start_us=0, clock=SimClock())
+    try:
+        for _ in range(TICKS):
+            simulation.tick()
+            simulation.capture_due(lambda _frame: None)
+            if simulation.autopilot.arm(force=False) == 0:
+                simulation.autopilot.takeoff(2.0)
+    finally:
+        simulation.close()

@@ -1,0 +1,85 @@
+"""The wire format of a depth frame."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from airl_mav.camera.frame import MAX_MM, Frame, FrameError, depth_to_z16
+from airl_mav.camera.intrinsics import Intrinsics
+
+lengths = st.floats(allow_nan=False)
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> Frame:
+    width, height = draw(st.integers(0, 12)), draw(st.integers(0, 12))
+    k = Intrinsics(width, height, draw(lengths), draw(lengths), draw(lengths))
+    depth = draw(arrays(np.uint16, (height, width)))
+    sequence = draw(st.integers(0, 2**64 - 1))
+    return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), depth, k)
+
+
+@given(frames())
+def test_round_trip(frame: Frame) -> None:
+    back = Frame.from_bytes(frame.to_bytes())
+    assert (back.sequence, back.capture_time_us) == (frame.sequence, frame.capture_time_us)
+    assert back.intrinsics == frame.intrinsics
+    assert back.depth_mm.dtype == np.uint16
+    np.testing.assert_array_equal(back.depth_mm, frame.depth_mm)
+
+
+def test_wire_layout() -> None:
+    """Another language can read it: 48 bytes of header, then rows of little-endian millimetres."""
+    depth = np.array([[1, 256, 65535], [0, 2, 3]], np.uint16)
+    wire = Frame(7, 123_456, depth, Intrinsics(3, 2, 1.5, 1.0, 0.5)).to_bytes()
+    assert wire[:4] == b"ADF1"
+    assert struct.unpack_from("<QqHH", wire, 4) == (7, 123_456, 3, 2)
+    assert struct.unpack_from("<ddd", wire, 24) == (1.5, 1.0, 0.5)
+    assert wire[48:] == bytes([1, 0, 0, 1, 255, 255, 0, 0, 2, 0, 3, 0])
+
+
+def test_pixels_that_are_not_contiguous_go_out_in_order() -> None:
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6)[:, ::2]
+    frame = Frame(0, 0, depth, Intrinsics(3, 4, 1.0, 1.0, 1.0))
+    np.testing.assert_array_equal(Frame.from_bytes(frame.to_bytes()).depth_mm, depth)
+
+
+@given(st.binary(max_size=200))
+def test_other_bytes_are_refused(data: bytes) -> None:
+    with pytest.raises(FrameError):
+        Frame.from_bytes(data)
+
+
+@given(frames(), st.data())
+def test_damaged_frames_are_refused(frame: Frame, data: st.DataObject) -> None:
+    wire = frame.to_bytes()
+    cut = data.draw(st.integers(0, len(wire) - 1))
+    for damaged in (wire[:cut], wire + b"\0", b"ADF2" + wire[4:]):
+        with pytest.raises(FrameError):
+            Frame.from_bytes(damaged)
+
+
+def test_a_size_that_the_pixels_do_not_fill_is_refused() -> None:
+    wire = bytearray(Frame(0, 0, np.ones((2, 3), np.uint16), Intrinsics(3, 2, 1, 1, 1)).to_bytes())
+    struct.pack_into("<HH", wire, 20, 65535, 65535)
+    with pytest.raises(FrameError, match="65535x65535"):
+        Frame.from_bytes(bytes(wire))
+
+
+def test_z16_rounds_clips_and_keeps_no_return() -> None:
+    depth = np.array([[0.0, 0.001, 0.0014, 0.0016, 19.9996, 65.535, 70.0]], np.float32)
+    expected = [[0, 1, 1, 2, 20000, MAX_MM, MAX_MM]]
+    assert depth_to_z16(depth).tolist() == expected
+
+
+@given(arrays(np.float32, 20, elements=st.floats(0.0, 65.0, width=32)))
+def test_z16_is_within_half_a_millimetre(depth: np.ndarray) -> None:
+    frame = Frame(0, 0, depth_to_z16(depth).reshape(4, 5), Intrinsics(5, 4, 1, 1, 1))
+    assert frame.depth_m().dtype == np.float32
+    np.testing.assert_allclose(frame.depth_m().ravel(), depth, atol=0.00051)
