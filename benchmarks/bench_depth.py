@@ -3,6 +3,7 @@
 Run as `python benchmarks/bench_depth.py`. Both draw the same arena from the same poses: a
 50 x 50 m room with 5 m walls, the vehicle among boxes, pillars and spheres, 90 degrees, 20 m. The
 kernel is called from a compiled loop, as in training, and through `render`, as in the plant.
+TinyRenderer shades a colour image as well; it has no way to leave that out.
 """
 
 from __future__ import annotations

@@ -31,6 +31,9 @@ POLL_S = 0.05
 """How often a condition is looked at while waiting for it [s]."""
 
 
+HEALTH_SETTLE_S = 0.5
+"""Good health must last so long before arming: more than two of PX4's 5 Hz reports [s]."""
+
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
@@ -166,13 +169,16 @@ class MavsdkLink:
     def arm(self, timeout_s: float) -> None:
         """Wait until the flight controller reports good health, then arm.
 
-        Its health is told a few times a second, so the first request may still come too early:
-        it is repeated.
+        Its health is told a few times a second: right after a reboot, old news may still be good
+        news. So it must have been good for a while, and a refused request is repeated.
         """
         deadline_us = self._deadline(timeout_s)
-        while not self.healthy:
+        good_since_us = self.clock.time_us()
+        while self.clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
             self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm")
             self._pause()
+            if not self.healthy:
+                good_since_us = self.clock.time_us()
         while True:
             try:
                 self._action.arm()

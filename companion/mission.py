@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -115,5 +116,6 @@ def save_log(log: DecisionLog, path: Path) -> None:
     """Write a decision log to an .npz: a temporary name first, then renamed."""
     temporary = path.with_suffix(".tmp")
     with temporary.open("wb") as file:
-        np.savez(file, **log.columns())
+        columns: dict[str, Any] = dict(log.columns())
+        np.savez(file, **columns)
     temporary.replace(path)

@@ -13,7 +13,6 @@ defence, each for the case that the one before cannot see:
 from __future__ import annotations
 
 import faulthandler
-import sys
 import threading
 from dataclasses import dataclass
 
@@ -23,6 +22,9 @@ from companion.link import STOP, BodyVelocity, Link, LinkError
 
 POLL_US = 10_000
 """How often deadlines are looked at [µs]."""
+
+STDERR = 2
+"""File descriptor for the last words of a process that is ended."""
 
 STARVED_S = 5.0
 """When this thread has not run for so long, the process ends [s of wall time]."""
@@ -98,7 +100,7 @@ class Watchdog:
     def _run(self) -> None:
         try:
             while not self._done.is_set():
-                faulthandler.dump_traceback_later(STARVED_S, exit=True, file=sys.__stderr__)
+                faulthandler.dump_traceback_later(STARVED_S, exit=True, file=STDERR)
                 for _ in range(25):
                     if self._done.is_set():
                         return

@@ -129,7 +129,9 @@ class Simulation:
     def save(self, path: Path, extra: dict[str, NDArray[Any]]) -> None:
         """Write the episode's arrays to an .npz: a temporary name first, then renamed."""
         estimates = np.array(self._estimates, np.float64).reshape(-1, 11)
-        arrays = {f"trajectory/{k}": v for k, v in self._trajectory.trajectory().arrays().items()}
+        arrays: dict[str, Any] = {
+            f"trajectory/{k}": v for k, v in self._trajectory.trajectory().arrays().items()
+        }
         arrays |= {f"setpoints/{k}": v for k, v in self.setpoints.arrays().items()}
         arrays |= {
             "estimate/time_us": estimates[:, 0].astype(np.int64),

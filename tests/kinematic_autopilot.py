@@ -30,7 +30,6 @@ from firmware_sim.interfaces import BatterySample, GpsFix
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
-OFFBOARD_LOSS_US = US_PER_S
 VELOCITY_GAIN = 5.0
 LAND_SPEED_M_S = 4.0
 FALLBACK_SPEED_M_S = 0.75
@@ -54,7 +53,10 @@ class Parameters:
 
     def __init__(self, values: dict[str, int | float] | None = None) -> None:
         self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
-        self._names = list(self.values)
+
+    @property
+    def _names(self) -> list[str]:
+        return sorted(self.values)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -105,6 +107,9 @@ class KinematicAutopilot:
         self.takeoffs: list[float | None] = []
         self.commands: list[str] = []
         self.messages: list[Message] = []
+        self.offboard_loss_us = US_PER_S
+        self.frozen = False
+        """Only time passes: lets a test read what it has set."""
         self._target_height = 0.0
 
     # --- the port ---
@@ -209,6 +214,8 @@ class KinematicAutopilot:
     def step(self) -> None:
         """Advance by one tick."""
         self.time_us += TICK_US
+        if self.frozen:
+            return
         if self.arming is Arming.BOOT and self.time_us >= self.ready_us:
             self.arming = Arming.STANDBY
             self.origin = self.home = ORIGIN
@@ -265,7 +272,10 @@ class KinematicAutopilot:
         return Setpoint(NOTHING, np.zeros(3), math.nan, math.nan)
 
     def _fresh(self) -> bool:
-        return bool(self.setpoints) and self.time_us - self.setpoints[-1][1] < OFFBOARD_LOSS_US
+        return bool(self.setpoints) and self._setpoint_age_us() < self.offboard_loss_us
+
+    def _setpoint_age_us(self) -> int:
+        return self.time_us - self.setpoints[-1][1]
 
     def _say(self, severity: Severity, text: str) -> None:
         self.messages.append(Message(severity, text))

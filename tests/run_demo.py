@@ -81,6 +81,10 @@ def demo_episode(
         sample = TruthSample(now, tuple(position), _hit(arena, position, now - started_us), charge)
         ended = referee.observe(sample)
         recorder.add(now, position, velocity, [1.0, 0.0, 0.0, 0.0], power, keep=ended is not None)
+    # A recording goes on until the vehicle is down, off the way it flew.
+    for _ in range(50):
+        now, position = now + TICK_US, position + np.array([0.1, -0.1, 0.02])
+        recorder.add(now, position, [5.0, -5.0, 1.0], [1.0, 0.0, 0.0, 0.0], 430.0)
     trajectory = recorder.trajectory()
     verdict = referee.verdict
     record = EpisodeRecord(

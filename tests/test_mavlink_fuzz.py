@@ -25,15 +25,13 @@ HANDLED = (
 
 
 def still_answers(bench: Bench, link: str) -> None:
-    """Assert that a command on the link is acknowledged, and that streams go on."""
+    """Assert that a command on the link is acknowledged and that streams go on."""
     client = RawClient(getattr(bench, link))
     client.received()
     client.command(512, dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    bench.run(1.1)
-    messages = [m.get_type() for m in client.received()]
-    assert "COMMAND_ACK" in messages
-    assert "AUTOPILOT_VERSION" in messages
-    assert "HEARTBEAT" in messages
+    bench.run(0.2)
+    messages = {m.get_type() for m in client.received()}
+    assert {"COMMAND_ACK", "AUTOPILOT_VERSION", "SERVO_OUTPUT_RAW"} <= messages
 
 
 @pytest.mark.parametrize("link", LINKS)

@@ -589,6 +589,7 @@ def test_the_hash_is_px4s_and_stops_a_list(rig: Rig) -> None:
     assert as_int(message) & 0xFFFF_FFFF == expected
     rig.client.send(dialect.MAVLink_param_request_list_message(1, 1))
     rig.bench.tick()
+    assert len(rig.client.received("PARAM_VALUE")) == 3
     assert set_parameter(rig, "_HASH_CHECK", b"\0\0\0\0", 5) == []
     rig.bench.run(0.1)
     assert rig.client.received("PARAM_VALUE") == []

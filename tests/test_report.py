@@ -199,9 +199,9 @@ def test_the_same_run_gives_the_same_page(
 
 
 def test_the_path_on_the_map_is_where_the_vehicle_was(
-    demo: tuple[LoadedRun, dict[int, Arena]],
+    page: str, demo: tuple[LoadedRun, dict[int, Arena]]
 ) -> None:
-    """The end marker of a collision lies on the pixel of the last position."""
+    """The end marker of a collision lies on the pixel of the vehicle's place at the verdict."""
     run, arenas = demo
     episode = next(e for e in run.episodes if e.outcome is Outcome.COLLISION)
     with Image.open(run.path / f"flight-{episode.index:03d}-map.png") as image:
@@ -209,7 +209,8 @@ def test_the_path_on_the_map_is_where_the_vehicle_was(
     b = arenas[episode.index].bounds
     wall = np.abs(pixels - (153, 0, 0)).sum(axis=2) < 30
     rows, columns = np.flatnonzero(wall.sum(axis=1) > 200), np.flatnonzero(wall.sum(axis=0) > 200)
-    north, east = run.trajectories[episode.index].position[-1, :2]
+    path = run.trajectories[episode.index]
+    north, east = path.position[path.time_us == episode.ended_us][0, :2]
     # The wall band's outer edges; the walls are drawn 1.2 % of the longer side thick.
     thick = 0.012 * max(b.north_max - b.north_min, b.east_max - b.east_min)
     scale = (columns[-1] - columns[0] + 1) / (b.east_max - b.east_min + 2 * thick)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -217,3 +218,36 @@ def test_the_commit_of_a_checkout(tmp_path: Path) -> None:
     assert git_state(tmp_path) == {"commit": commit, "changed": False}
     (tmp_path / "f").write_text("2")
     assert git_state(tmp_path) == {"commit": commit, "changed": True}
+
+
+def test_the_example_in_the_documentation_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = Path(__file__).parents[1] / "docs" / "run-folder.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (folder,) = re.findall(r'Path\("(.*?)"\)', code)
+    monkeypatch.chdir(tmp_path)
+    write_demo_run(tmp_path / folder, episodes=2)
+    exec(compile(code, page.name, "exec"), {})  # noqa: S102 - our own page
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["collision", "success"]
+
+
+def test_the_documentation_names_every_field(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[1] / "docs" / "run-folder.md").read_text(encoding="utf-8")
+    folder, _ = write_demo_run(tmp_path / "run", episodes=1)
+    info = json.loads((folder.path / "run.json").read_text())
+    line = json.loads((folder.path / EPISODES_FILE).read_text())
+    run = load(folder.path)
+    names = {
+        *info,
+        *info["setup"],
+        *info["setup"]["injection"],
+        *info["machine"],
+        *line,
+        *line["quality"],
+        *run.latency[0],
+    }
+    names |= set(run.trajectories[0].arrays())
+    names -= {"setup", "injection"}  # Described part by part.
+    assert not [name for name in names if f"{name}`" not in text]

@@ -63,4 +63,5 @@ class Frame:
 
 def depth_to_z16(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
     """Turn metres (0 = no return) into Z16 millimetres, rounded, clipped to 65,535 mm."""
-    return np.clip(np.rint(depth_m * MM_PER_M), 0, MAX_MM).astype(np.uint16)
+    z16: NDArray[np.uint16] = np.clip(np.rint(depth_m * MM_PER_M), 0, MAX_MM).astype(np.uint16)
+    return z16

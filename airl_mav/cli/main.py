@@ -17,8 +17,7 @@ Command = (
 
 def main() -> None:
     """Entry point of `airl`."""
-    # tyro's types cannot say that a union of dataclasses gives one of them.
-    command = tyro.cli(Command, prog="airl", description=__doc__)  # type: ignore[arg-type]
+    command = tyro.cli(Command, prog="airl", description=__doc__)
     run_command(lambda: _run(command))
 
 

@@ -8,7 +8,6 @@ from enum import Enum
 
 from airl_mav.constants import US_PER_S
 
-
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m]: that of the paper's code, seen from above."""
 

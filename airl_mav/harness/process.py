@@ -94,8 +94,9 @@ class Child:
         if process.stdin is not None:
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()
-        for insist in (lambda: None, process.terminate, process.kill):
-            insist()
+        for insist in (None, process.terminate, process.kill):
+            if insist is not None:
+                insist()
             try:
                 process.wait(GRACE_S)
                 break

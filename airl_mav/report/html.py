@@ -13,6 +13,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
+from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.atomic import replace_file
 from airl_mav.harness.run_folder import LoadedRun
 from airl_mav.latency.stages import SHOWN_STAGES
@@ -131,22 +132,26 @@ def _flights(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[Flight]:
     """Draw the flights that get pictures, in the order they were flown."""
     ranked = sorted(run.episodes, key=lambda e: (e.outcome is Outcome.SUCCESS, e.index))
     chosen = sorted(ranked[:MAX_PICTURED], key=lambda e: e.index)
-    top_speed = max(
-        (float(path.speed().max()) for path in run.trajectories.values() if len(path)), default=1.0
-    )
+    # Up to the verdict: what is recorded after it is the landing.
+    paths = {
+        episode.index: path.between(int(path.time_us[0]), episode.ended_us)
+        for episode in run.episodes
+        if (path := run.trajectories.get(episode.index)) is not None and len(path)
+    }
+    top_speed = max((float(path.speed().max(initial=0.0)) for path in paths.values()), default=0.0)
     return [
-        _flight(run, episode, arenas.get(episode.index), top_speed or 1.0) for episode in chosen
+        _flight(episode, paths.get(episode.index), arenas.get(episode.index), top_speed or 1.0)
+        for episode in chosen
     ]
 
 
 def _flight(
-    run: LoadedRun, episode: EpisodeRecord, arena: Arena | None, top_speed: float
+    episode: EpisodeRecord, path: Trajectory | None, arena: Arena | None, top_speed: float
 ) -> Flight:
     """Draw one flight."""
-    trajectory = run.trajectories.get(episode.index)
-    pictures = [map_figure(episode, trajectory, arena, top_speed)]
-    if trajectory is not None and len(trajectory) > 1:
-        pictures.append(time_figure(episode, trajectory))
+    pictures = [map_figure(episode, path, arena, top_speed)]
+    if path is not None and len(path) > 1:
+        pictures.append(time_figure(episode, path))
     return Flight(
         index=episode.index,
         seed=episode.seed,

@@ -25,7 +25,7 @@ from firmware_sim.plant.wind import Wind, WindSettings
 from firmware_sim.plant.world import FLOOR, World
 
 REST_SPEED_M_S = 0.1
-"""Touching the floor slower than this is resting, not a collision (AirSim's kRestingVelocityMax)."""
+"""Touching the floor slower than this is resting, no collision (AirSim's kRestingVelocityMax)."""
 
 IDLE_POWER_W = 5.0
 """Avionics on the ground, motors off [W]."""
@@ -178,9 +178,14 @@ class Plant:
         self.world.move_obstacles(self._time_us - self._start_us)
         client.stepSimulation()
         after = self._read()
-        accel = tuple((b - a) / TICK_S for a, b in zip(m.velocity, after.velocity, strict=True))
+        before, now = m.velocity, after.velocity
+        accel = (
+            (now[0] - before[0]) / TICK_S,
+            (now[1] - before[1]) / TICK_S,
+            (now[2] - before[2]) / TICK_S,
+        )
         self._watch_contacts(m.velocity)
-        self._use_power(accel, after.velocity, wind, any(s > 0.05 for s in self._speeds))
+        self._use_power(accel, now, wind)
         self._motion = after
         felt = (accel[0], accel[1], accel[2] - GRAVITY_M_S2)
         self._specific_force = np.array(rotate(conjugate(after.q), felt))
@@ -260,14 +265,19 @@ class Plant:
                 self.collisions.append(Collision(self._time_us, name, speed))
         self._touching = touching
 
-    def _use_power(self, accel: tuple[float, ...], velocity: Vec, wind: Vec, turning: bool) -> None:
-        acceleration = (accel[0], accel[1], accel[2])
-        payload = self._profile.power.payload_g
-        self._power_w = (
-            power_w(velocity, acceleration, wind, payload, self._coefficients)
-            if turning
-            else IDLE_POWER_W
-        )
+    def _use_power(self, accel: Vec, velocity: Vec, wind: Vec) -> None:
+        """Draw this tick's power from the battery."""
+        power = self._profile.power
+        if self._touching:
+            # The model is one of flight, and an impact is no electrical load. Standing, rotors
+            # take the induced power of their thrust, P ~ T^1.5 (momentum theory).
+            a = self._airframe
+            thrust, _ = wrench(*self._speeds, a)
+            share = float(thrust / (a.mass * GRAVITY_M_S2))
+            self._power_w = IDLE_POWER_W + power.b9_hover * share**1.5
+        else:
+            flown = power_w(velocity, accel, wind, power.payload_g, self._coefficients)
+            self._power_w = flown
         sample = self._battery_sample()
         self._remaining = drain(
             self._remaining, sample.current_a, self._profile.battery.capacity_mah, TICK_S

@@ -6,7 +6,7 @@ import math
 
 from airl_mav import atmosphere
 from airl_mav.frames import geodetic_to_local, local_to_geodetic, quat_to_matrix, quat_yaw
-from firmware_sim.autopilot.state import Arming, AutopilotState
+from firmware_sim.autopilot.state import Arming, AutopilotState, Estimate
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.streams.units import (
     NAN,
@@ -49,9 +49,9 @@ def local_position_ned(state: AutopilotState) -> WireMessage | None:
 
 
 def global_position_int(state: AutopilotState) -> WireMessage | None:
-    """Position on the globe, height above home, NED velocity; nothing before the origin is set."""
+    """Position on the globe, height above home, NED velocity; nothing without an origin."""
     estimate = state.estimate
-    if state.origin is None:
+    if state.origin is None or not all(map(math.isfinite, estimate.position.tolist())):
         return None
     here = local_to_geodetic(estimate.position, state.origin)
     velocity = estimate.velocity.tolist()
@@ -71,7 +71,6 @@ def global_position_int(state: AutopilotState) -> WireMessage | None:
 def odometry(state: AutopilotState) -> WireMessage:
     """Pose in local NED, velocity in body FRD, variances on the diagonals (NaN elsewhere)."""
     estimate = state.estimate
-    rotation = quat_to_matrix(estimate.quaternion)
     variance = (estimate.sigma[:9] ** 2).tolist()
     pose_covariance = [NAN] * 21
     velocity_covariance = [NAN] * 21
@@ -86,7 +85,7 @@ def odometry(state: AutopilotState) -> WireMessage:
         dialect.MAV_FRAME_BODY_FRD,
         *estimate.position.tolist(),
         estimate.quaternion.tolist(),
-        *(rotation.T @ estimate.velocity).tolist(),
+        *_in_body(estimate),
         *estimate.angular_velocity.tolist(),
         pose_covariance,
         velocity_covariance,
@@ -183,6 +182,13 @@ def gps_global_origin(state: AutopilotState) -> WireMessage | None:
         mm(origin.altitude_m),
         state.time_us,
     )
+
+
+def _in_body(estimate: Estimate) -> list[float]:
+    """Return the velocity [m/s] in body FRD; plain floats, so that inf raises no warning."""
+    north, east, down = estimate.velocity.tolist()
+    columns = quat_to_matrix(estimate.quaternion).T.tolist()
+    return [n * north + e * east + d * down for n, e, d in columns]
 
 
 def _height_above_home(state: AutopilotState) -> float:
