@@ -68,10 +68,6 @@ class Firmware:
         self.discard()
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
         simulation = Simulation(setup, start_us=start_us, clock=self.clock)
-        # Building took wall time: the episode starts now.
-        behind_us = self.clock.time_us() - start_us
-        if behind_us > 0:
-            self.clock.slip(behind_us)
         self.simulation = simulation
         simulation.autopilot.on_message = self.on_message
         simulation.tick()
@@ -84,6 +80,10 @@ class Firmware:
         # collection would stall the 250 Hz loop by tens of milliseconds.
         gc.collect()
         gc.freeze()
+        # All this took wall time, which is no part of the episode: it starts now.
+        behind_us = self.clock.time_us() - simulation.time_us
+        if behind_us > 0:
+            self.clock.slip(behind_us)
         return Loaded(start_us, self.clock.epoch_ns)
 
     def step(self) -> None:

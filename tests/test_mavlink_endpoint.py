@@ -167,8 +167,9 @@ def test_reachable_from_outside_only_when_asked_for(
     [
         ((LOOPBACK, 70_000), None, "--api-local-port: port 70000: must be in 0..65535"),
         ((LOOPBACK, 0), (LOOPBACK, 0), "--api-remote: port 0: must be in 1..65535"),
-        (("not-an-address", 1), None, "--api-local-port: host 'not-an-address'"),
-        (("127.0.0.1", 0), ("::1", 5), "--api-remote: host '::1': must be an IPv4 address"),
+        (("no.such.host.invalid", 1), None, "--api-local-port: host 'no.such.host.invalid'"),
+        (("127.0.0.1", 0), ("::1", 5), "--api-remote: host '::1': no such IPv4 host"),
+        (("x" * 300, 0), None, "no such IPv4 host"),
     ],
 )
 def test_unusable_addresses(
@@ -176,6 +177,10 @@ def test_unusable_addresses(
 ) -> None:
     with pytest.raises(UsageError, match=message):
         endpoint(endpoints, remote, local=local)
+
+
+def test_host_names_are_resolved(endpoints: list[UdpEndpoint]) -> None:
+    assert endpoint(endpoints, ("localhost", 5), local=("localhost", 0)).local[0] == LOOPBACK
 
 
 def test_an_address_of_another_machine_cannot_be_bound(endpoints: list[UdpEndpoint]) -> None:

@@ -11,7 +11,7 @@ from typing import Protocol
 from airl_mav.errors import UsageError
 
 Address = tuple[str, int]
-"""IPv4 host and UDP port."""
+"""IPv4 host (name or number) and UDP port."""
 
 MAX_DATAGRAM = 4096
 """Longest datagram read; MAVLink frames are at most 280 bytes, some senders join several."""
@@ -116,9 +116,9 @@ class UdpEndpoint:
                 `insecure`.
         """
         self.send_errors = 0
-        _check_address(local, local_option, lowest_port=0, insecure=insecure)
+        local = _usable(local, local_option, lowest_port=0, insecure=insecure)
         if remote is not None:
-            _check_address(remote, remote_option, lowest_port=1, insecure=insecure)
+            remote = _usable(remote, remote_option, lowest_port=1, insecure=insecure)
         self._remote = remote
         self._peer: Address | None = None
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -170,19 +170,21 @@ class UdpEndpoint:
         self._socket.close()
 
 
-def _check_address(address: Address, option: str, *, lowest_port: int, insecure: bool) -> None:
+def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) -> Address:
+    """Return the address with its host name resolved. Raises UsageError when it will not do."""
     host, port = address
-    try:
-        parsed = ipaddress.IPv4Address(host)
-    except ValueError as error:
-        raise UsageError(f"{option}: host {host!r}: must be an IPv4 address") from error
     if not lowest_port <= port <= 65_535:
         raise UsageError(f"{option}: port {port}: must be in {lowest_port}..65535")
-    if not parsed.is_loopback and not insecure:
+    try:
+        number = socket.gethostbyname(host)
+    except (OSError, UnicodeError) as error:
+        raise UsageError(f"{option}: host {host!r}: no such IPv4 host") from error
+    if not ipaddress.IPv4Address(number).is_loopback and not insecure:
         raise UsageError(
             f"{option}: {host}:{port} can be reached from other machines and MAVLink is "
             "unauthenticated (no signing yet): add --insecure to allow it on a trusted network"
         )
+    return number, port
 
 
 def _bind_problem(local: Address, option: str, error: OSError) -> str:
