@@ -98,8 +98,8 @@ class Loaded(_Line):
     type: Literal["loaded"] = "loaded"
     episode: int
     time_us: int
-    epoch_ns: int
-    """Host monotonic time of simulated time 0."""
+    epoch_ns: int | None
+    """Host monotonic time of simulated time 0; None when time is not paced."""
     goal: tuple[float, float]
 
 

@@ -1,4 +1,4 @@
-"""The firmware process: simulation, MAVLink and camera, paced by the wall clock."""
+"""The firmware process: simulation, MAVLink and camera, tick after tick."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.clock import WallClock
 from airl_mav.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.state import Message
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
-from firmware_sim.pacing import Pacer
+from firmware_sim.pacing import Pacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -27,24 +26,23 @@ class Loaded:
     """An episode that has just been set up."""
 
     time_us: int
-    epoch_ns: int
+    epoch_ns: int | None
+    """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
 
 
 class Firmware:
     """Flies one episode after the other; its links and its camera stay."""
 
-    def __init__(
-        self, server: MavlinkServer, camera: CameraServer | None, clock: WallClock
-    ) -> None:
+    def __init__(self, server: MavlinkServer, camera: CameraServer | None, pacing: Pacing) -> None:
         self.server = server
-        self.clock = clock
+        self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
         """Called after every tick, if set."""
         self.on_message: Callable[[Message], None] | None = None
         """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
-        self._pacer = Pacer(clock)
+        self._pacing = pacing
         self._tlog: TlogWriter | None = None
 
     @property
@@ -55,7 +53,7 @@ class Firmware:
     @property
     def slipped_us(self) -> int:
         """Simulated time given up since the start because the host could not keep up [µs]."""
-        return self._pacer.slipped_us
+        return self._pacing.slipped_us
 
     def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> Loaded:
         """Replace the episode: a new arena, the vehicle at rest, the autopilot booting.
@@ -75,16 +73,13 @@ class Firmware:
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
             self.server.log_to(self._tlog)
-        self._pacer.take_lateness()
         # What lives for the whole episode need not be searched by the garbage collector: a full
         # collection would stall the 250 Hz loop by tens of milliseconds.
         gc.collect()
         gc.freeze()
         # All this took wall time, which is no part of the episode: it starts now.
-        behind_us = self.clock.time_us() - simulation.time_us
-        if behind_us > 0:
-            self.clock.slip(behind_us)
-        return Loaded(start_us, self.clock.epoch_ns)
+        self._pacing.restart(simulation.time_us)
+        return Loaded(start_us, self._pacing.epoch_ns)
 
     def step(self) -> None:
         """Wait for the next tick's wall time, then run it."""
@@ -93,7 +88,7 @@ class Firmware:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
         sockets = server.filenos()
-        self._pacer.wait(simulation.time_us, sockets, self._receive)
+        self._pacing.wait(simulation.time_us, sockets, self._receive)
         server.receive(self.clock.time_us())
         simulation.tick()
         server.send(simulation.time_us)
@@ -109,7 +104,7 @@ class Firmware:
         """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
         if self.simulation is None:
             return
-        lateness = self._pacer.take_lateness()
+        lateness = self._pacing.take_lateness()
         self.simulation.save(path, {"tick/lateness_us": np.asarray(lateness, np.int64)})
         self._close_tlog()
 

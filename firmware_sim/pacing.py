@@ -1,14 +1,15 @@
-"""Keep simulated time level with the wall clock, and measure how well that works."""
+"""How simulated time relates to the wall clock: level with it, or as fast as it goes."""
 
 from __future__ import annotations
 
 import select
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.clock import WallClock
+from airl_mav.clock import Clock, SimClock, WallClock
 
 MAX_LAG_US = 200_000
 """Further behind than this, simulated time gives up the difference instead of racing through it:
@@ -18,21 +19,62 @@ SPIN_US = 150
 """The last stretch before a tick is polled: select() overshoots by about this much [µs]."""
 
 
-class Pacer:
-    """Waits for each tick's wall time while watching sockets."""
+class Pacing(Protocol):
+    """Decides when the next tick runs."""
 
-    def __init__(self, clock: WallClock) -> None:
-        self._clock = clock
-        self._lateness: list[int] = []
-        self.slipped_us = 0
-        """Simulated time given up because the host could not keep up."""
+    slipped_us: int
+    """Simulated time given up because the host could not keep up [µs]."""
+
+    @property
+    def clock(self) -> Clock:
+        """Simulated time, between ticks too where it is tied to the wall clock."""
+        ...
+
+    @property
+    def epoch_ns(self) -> int | None:
+        """Host monotonic time of simulated time 0 [ns]; None when the two are not tied."""
+        ...
+
+    def restart(self, tick_us: int) -> None:
+        """Say that simulated `tick_us` is now: what came before took time of no episode."""
+        ...
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
-        """Return at the wall time of simulated `tick_us`; call `readable` when a socket talks.
+        """Return when simulated `tick_us` is due; call `readable` when a socket talks before."""
+        ...
+
+    def take_lateness(self) -> NDArray[np.int64]:
+        """Return how late each tick began since the last call [µs of simulated time]."""
+        ...
+
+
+class WallPacing:
+    """Every tick at its wall time."""
+
+    def __init__(self, speed: float) -> None:
+        """Take the speed: simulated seconds per wall second, > 0."""
+        self.clock = WallClock(speed)
+        self.slipped_us = 0
+        self._lateness: list[int] = []
+
+    @property
+    def epoch_ns(self) -> int:
+        """Host monotonic time of simulated time 0 [ns]."""
+        return self.clock.epoch_ns
+
+    def restart(self, tick_us: int) -> None:
+        """Say that simulated `tick_us` is now, unless it still lies ahead."""
+        behind_us = self.clock.time_us() - tick_us
+        if behind_us > 0:
+            self.clock.slip(behind_us)
+        self._lateness.clear()
+
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
+        """Return at the wall time of simulated `tick_us`.
 
         What arrives early is handled at once, stamped with its own time, and waits for the tick.
         """
-        clock = self._clock
+        clock = self.clock
         while (wait_s := clock.wall_seconds_until(tick_us)) > 0.0:
             timeout = max(0.0, wait_s - SPIN_US * 1e-6)
             ready, _, _ = select.select(sockets, [], [], timeout)
@@ -50,3 +92,26 @@ class Pacer:
         lateness = np.array(self._lateness, np.int64)
         self._lateness.clear()
         return lateness
+
+
+class Unpaced:
+    """No waiting: simulated time runs as fast as the ticks are computed."""
+
+    epoch_ns = None
+    slipped_us = 0
+
+    def __init__(self) -> None:
+        self.clock = SimClock()
+
+    def restart(self, tick_us: int) -> None:
+        """Set the clock to `tick_us`."""
+        self.clock.sleep_until(tick_us)
+
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
+        """Set the clock to `tick_us`; sockets are read once a tick by the caller anyway."""
+        del sockets, readable
+        self.clock.sleep_until(tick_us)
+
+    def take_lateness(self) -> NDArray[np.int64]:
+        """Return nothing: no tick is late."""
+        return np.zeros(0, np.int64)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 
 @contextlib.contextmanager
@@ -14,10 +14,13 @@ def quiet_stdout() -> Iterator[None]:
     """Point file descriptor 1 at the null device for a while."""
     sys.stdout.flush()
     kept = os.dup(1)
+    null = os.open(os.devnull, os.O_WRONLY)
     try:
-        with Path(os.devnull).open("wb") as null:
-            os.dup2(null.fileno(), 1)
+        os.dup2(null, 1)
         yield
+        # What C has buffered meanwhile must go the same way, not out at exit.
+        ctypes.CDLL(None).fflush(None)
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+        os.close(null)

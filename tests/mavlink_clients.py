@@ -14,6 +14,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.constants import TICK_US, US_PER_S
+from firmware_sim.autopilot.state import Mode, Result
 from firmware_sim.mavlink.endpoint import Endpoint, MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -93,6 +94,54 @@ class RawClient:
 def text_of(messages: list[Any]) -> list[tuple[int, str]]:
     """Return (severity, text) of each STATUSTEXT."""
     return [(m.severity, m.text) for m in messages if m.get_type() == "STATUSTEXT"]
+
+
+class Rig:
+    """A ready vehicle and a raw client on its onboard link."""
+
+    def __init__(self, autopilot: KinematicAutopilot | None = None) -> None:
+        self.bench = Bench(autopilot=autopilot)
+        self.autopilot = self.bench.autopilot
+        self.client = RawClient(self.bench.onboard)
+        self.station = RawClient(self.bench.gcs)
+        self.bench.run(0.2)
+        self.client.received()
+        self.station.received()
+
+    def exchange(self, message: Any) -> list[Any]:
+        """Send a message, run one tick, return everything that came back."""
+        self.client.send(message)
+        self.bench.tick()
+        return self.client.received()
+
+    def command(self, number: int, *params: float) -> tuple[int, list[Any]]:
+        """Send a COMMAND_LONG; return its result and everything that came back in that tick."""
+        self.client.command(number, *params)
+        self.bench.tick()
+        return self.acknowledged(number)
+
+    def acknowledged(self, number: int) -> tuple[int, list[Any]]:
+        messages = self.client.received()
+        (ack,) = [m for m in messages if m.get_type() == "COMMAND_ACK"]
+        assert ack.command == number
+        assert (ack.target_system, ack.target_component) == CLIENT_IDS
+        return ack.result, messages
+
+    def climb(self) -> None:
+        """Arm, take off, hold."""
+        assert self.command(400, 1)[0] == Result.ACCEPTED
+        assert self.command(22)[0] == Result.ACCEPTED
+        self.bench.run(3.0)
+        assert self.autopilot.mode is Mode.HOLD
+        self.client.received()
+
+    def set_local(self, mask: int, frame: int = 1, **fields: float) -> None:
+        """Send SET_POSITION_TARGET_LOCAL_NED; fields not given are 0."""
+        order = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
+        values = [fields.get(name, 0.0) for name in order]
+        self.client.send(
+            dialect.MAVLink_set_position_target_local_ned_message(7, 1, 1, frame, mask, *values)
+        )
 
 
 class Pacer:

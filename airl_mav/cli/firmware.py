@@ -42,11 +42,14 @@ from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.px4_links import px4_server
+from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.plant.wind import WindSettings
-from firmware_sim.quiet import quiet_stdout
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
+
+MAX_SPEED = 100.0
+"""Greatest --speed; what a host cannot keep up with is given up and reported."""
 
 STATE_EVERY = 10
 """The harness hears the true state every so many ticks: 25 Hz."""
@@ -65,8 +68,12 @@ class FirmwareCommand:
     seed: int = 1
     """Seed of arena, sensors and wind."""
 
-    speed: float = 1.0
-    """Simulated seconds per wall second, > 0."""
+    speed: float | Literal["max"] = 1.0
+    """Simulated seconds per wall second, > 0; max: as fast as it goes, for clients that do not
+    live by the wall clock."""
+
+    duration: float | None = None
+    """End after so much simulated time, s. None: on Ctrl-C."""
 
     wind: WindSettings = field(default_factory=WindSettings)
     """Wind; calm by default."""
@@ -99,8 +106,7 @@ def build(command: FirmwareCommand) -> Firmware:
     Raises:
         UsageError: A port is taken, an address unusable, the speed not positive.
     """
-    if not 0.0 < command.speed <= 100.0:
-        raise UsageError(f"--speed {command.speed:g}: accepted: 0 < value <= 100")
+    pacing = pacing_of(command.speed)
     ports = command.ports
     server = px4_server(
         bind=command.bind,
@@ -116,7 +122,16 @@ def build(command: FirmwareCommand) -> Firmware:
     except UsageError:
         server.close()
         raise
-    return Firmware(server, camera, WallClock(command.speed))
+    return Firmware(server, camera, pacing)
+
+
+def pacing_of(speed: float | Literal["max"]) -> Pacing:
+    """Return the pacing of a --speed. Raises UsageError when it is not positive."""
+    if isinstance(speed, str):
+        return Unpaced()
+    if not 0.0 < speed <= MAX_SPEED:
+        raise UsageError(f"--speed {speed:g}: accepted: 0 < value <= {MAX_SPEED:g}, or max")
+    return WallPacing(speed)
 
 
 def setup(
@@ -149,9 +164,8 @@ def stand_alone(command: FirmwareCommand) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
-        with quiet_stdout():
-            warm_up(vehicle)
-            firmware.load(episode, command.tlog, unix_us())
+        warm_up(vehicle)
+        firmware.load(episode, command.tlog, unix_us())
         arena: Arena | None = episode.arena
         console.print(
             f"MAVSDK            udpin://{command.companion_host}:{command.ports.api_port}"
@@ -166,11 +180,27 @@ def stand_alone(command: FirmwareCommand) -> int:
         firmware.on_message = lambda m: console.print(
             f"[{m.severity.name.lower()}] {m.text}", markup=False
         )
-        while not stop.is_set():
-            firmware.step()
+        fly(firmware, stop, command.duration, console)
     finally:
         firmware.close()
     return 0
+
+
+def fly(
+    firmware: Firmware, stop: threading.Event, duration_s: float | None, console: Console
+) -> None:
+    """Run ticks until told to stop, or for a duration of simulated time [s]; say how fast."""
+    start_us, stopwatch = firmware.clock.time_us(), WallClock()
+    end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)
+    while not stop.is_set() and (end_us is None or firmware.clock.time_us() < end_us):
+        firmware.step()
+    flown_s, wall_s = (
+        (firmware.clock.time_us() - start_us) / US_PER_S,
+        stopwatch.time_us() / US_PER_S,
+    )
+    console.print(
+        f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time"
+    )
 
 
 def serve(command: FirmwareCommand) -> int:

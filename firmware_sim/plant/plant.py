@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import pybullet
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, TICK_US
@@ -20,6 +19,7 @@ from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from airl_mav.vehicle.rotor import spin, wrench
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
+from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.sensors import Kinematics, SensorSuite
 from firmware_sim.plant.wind import Wind, WindSettings
 from firmware_sim.plant.world import FLOOR, World

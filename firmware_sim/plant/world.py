@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pybullet
-import pybullet_utils.bullet_client as bullet_client
 
 from airl_mav.arena.geometry import Arena, Shape
 from airl_mav.constants import GRAVITY_M_S2, TICK_S
@@ -17,6 +15,7 @@ from airl_mav.frames import (
     quat_ned_frd_to_enu_flu,
     quat_wxyz_to_xyzw,
 )
+from firmware_sim.plant.bullet import connect, pybullet
 
 WALL_THICKNESS_M = 0.2
 
@@ -29,7 +28,7 @@ class World:
 
     def __init__(self, arena: Arena | None) -> None:
         """Build the bodies of an arena; None = an endless floor."""
-        self.client: Any = bullet_client.BulletClient(pybullet.DIRECT)
+        self.client: Any = connect()
         self.client.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         self.client.setTimeStep(TICK_S)
         self.names: dict[int, str] = {}
