@@ -76,6 +76,13 @@ class Abort(_Line):
     """Stop and land; False after a crash: there is nothing left to land."""
 
 
+class Resync(_Line):
+    """The simulator has given up simulated time: its clock has a new epoch."""
+
+    type: Literal["resync"] = "resync"
+    epoch_ns: int | None
+
+
 class Shutdown(_Line):
     """End the process."""
 
@@ -117,6 +124,9 @@ class State(_Line):
     armed: bool
     landed: bool
     slipped_us: int
+    """Simulated time given up since the start because the host could not keep up."""
+    epoch_ns: int | None
+    """Host monotonic time of simulated time 0; moves when simulated time is given up."""
 
 
 class Text(_Line):
@@ -164,7 +174,7 @@ class Failed(_Line):
 
 
 Request = Annotated[
-    LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
+    LoadEpisode | FinishEpisode | Fly | Abort | Resync | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
     Ready | Loaded | State | Text | Saved | Progress | Ended | Failed,

@@ -63,8 +63,7 @@ class ZmqFrameSource:
         """
         self.malformed = 0
         """Messages that were no frames."""
-        self.clock = clock
-        """May be replaced between missions, by one that shares the simulator's epoch."""
+        self._clock = clock
         self._newest: ReceivedFrame | None = None
         self._owns_context = context is None
         self._context = zmq.Context() if context is None else context
@@ -89,7 +88,7 @@ class ZmqFrameSource:
             except FrameError:
                 self.malformed += 1
             else:
-                self._newest = ReceivedFrame(frame, self.clock.time_us())
+                self._newest = ReceivedFrame(frame, self._clock.time_us())
         return self._newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:

@@ -95,8 +95,7 @@ class MavsdkLink:
             UsageError: The URL is invalid or its port is taken.
         """
         self.url = url
-        self.clock = clock
-        """May be replaced between missions, by one that shares the simulator's epoch."""
+        self._clock = clock
         self._abandon = abandon or threading.Event()
         # MAVSDK's own log goes to standard output; its findings reach us as results.
         log_subscribe(lambda *_: True)
@@ -173,12 +172,12 @@ class MavsdkLink:
         news. So it must have been good for a while, and a refused request is repeated.
         """
         deadline_us = self._deadline(timeout_s)
-        good_since_us = self.clock.time_us()
-        while self.clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
+        good_since_us = self._clock.time_us()
+        while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
             self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm")
             self._pause()
             if not self.healthy:
-                good_since_us = self.clock.time_us()
+                good_since_us = self._clock.time_us()
         while True:
             try:
                 self._action.arm()
@@ -236,18 +235,18 @@ class MavsdkLink:
             raise LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
-        return self.clock.time_us() + int(timeout_s * US_PER_S)
+        return self._clock.time_us() + int(timeout_s * US_PER_S)
 
     def _check(self, deadline_us: int, message: str) -> None:
         if not self.connected:
             raise LinkError("the flight controller is no longer heard")
         if self._abandon.is_set():
             raise LinkError("abandoned")
-        if self.clock.time_us() >= deadline_us:
+        if self._clock.time_us() >= deadline_us:
             raise LinkError(message)
 
     def _pause(self, seconds: float = POLL_S) -> None:
-        self.clock.sleep_until(self.clock.time_us() + int(seconds * US_PER_S))
+        self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))
 
 
 def _reason(error: Exception) -> str:

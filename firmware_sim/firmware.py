@@ -51,6 +51,11 @@ class Firmware:
         return self._camera.endpoint if self._camera is not None else ""
 
     @property
+    def epoch_ns(self) -> int | None:
+        """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
+        return self._pacing.epoch_ns
+
+    @property
     def slipped_us(self) -> int:
         """Simulated time given up since the start because the host could not keep up [µs]."""
         return self._pacing.slipped_us
@@ -79,7 +84,7 @@ class Firmware:
         gc.freeze()
         # All this took wall time, which is no part of the episode: it starts now.
         self._pacing.restart(simulation.time_us)
-        return Loaded(start_us, self._pacing.epoch_ns)
+        return Loaded(start_us, self.epoch_ns)
 
     def step(self) -> None:
         """Wait for the next tick's wall time, then run it."""

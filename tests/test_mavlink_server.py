@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from kinematic_autopilot import KinematicAutopilot
-from mavlink_clients import Bench, RawClient, Rig, text_of
+from mavlink_clients import RawClient, Rig, text_of
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.state import Arming, Landed, Message, Severity
+from firmware_sim.autopilot.state import Arming, Message, Severity
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
 
-NAN = math.nan
-ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
+ACCEPTED = 0
 
 
 @pytest.fixture
@@ -49,20 +49,22 @@ def test_a_new_autopilot_takes_over_the_links(rig: Rig) -> None:
 
 
 def test_without_an_autopilot_the_vehicle_is_off() -> None:
-    bench = Bench()
-    client = RawClient(bench.onboard)
-    bench.server._port = None
-    for session in bench.server._sessions:
-        session.context = None
+    endpoint = MemoryEndpoint()
+    server = MavlinkServer([onboard_link(endpoint)], boot_unix_us=0)
+    client = RawClient(endpoint)
     client.command(400, 1)
-    assert bench.server.receive(0) == 0
-    bench.server.send(0)
+    assert server.receive(0) == 0
+    server.send(0)
     assert client.received() == []
-    assert bench.server.counters()["onboard"].ignored == 1
-    bench.server.attach(bench.autopilot)
-    bench.run(1.0)
-    assert client.count()["HEARTBEAT"] == 1
-    assert bench.autopilot.landed is Landed.ON_GROUND
+    assert server.counters()["onboard"].ignored == 1
+
+    autopilot = KinematicAutopilot()
+    server.attach(autopilot)
+    client.command(400, 1)
+    assert server.receive(0) == 1
+    server.send(0)
+    assert {"COMMAND_ACK", "HEARTBEAT"} <= set(client.count())
+    assert autopilot.commands == ["arm force=False"]
 
 
 def test_counters(rig: Rig) -> None:

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as dialect
 from firmware_sim.autopilot.state import Mode
 
 NAN = math.nan
-ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
+ACCEPTED = 0
 
 
 @pytest.fixture

@@ -14,7 +14,17 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from airl_mav.channel import Abort, ChildChannel, Ended, Failed, Fly, Progress, Ready, Shutdown
+from airl_mav.channel import (
+    Abort,
+    ChildChannel,
+    Ended,
+    Failed,
+    Fly,
+    Progress,
+    Ready,
+    Resync,
+    Shutdown,
+)
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_USAGE, run_command
 from airl_mav.clock import Clock, WallClock
 from airl_mav.errors import UsageError
@@ -131,21 +141,23 @@ def serve(command: CompanionCommand) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     requests: queue.Queue[Any] = queue.Queue()
     stop, abandon = threading.Event(), threading.Event()
+    clock = WallClock(command.speed)
 
     def handle(request: Any) -> None:
+        if isinstance(request, Fly | Resync) and request.epoch_ns is not None:
+            clock.epoch_ns = request.epoch_ns
         if isinstance(request, Abort):
             (stop if request.land else abandon).set()
             stop.set()
-        else:
-            if isinstance(request, Fly):
-                stop.clear()
-                abandon.clear()
+        elif isinstance(request, Fly):
+            stop.clear()
+            abandon.clear()
+        if isinstance(request, Fly | Shutdown):
             requests.put(request)
 
     # Without its harness a companion has no business in the air, whatever it is doing: its
     # setpoints end and the flight controller's offboard-loss failsafe takes over.
     channel.listen(handle, lambda: os._exit(EXIT_BROKEN))
-    clock: Clock = WallClock(command.speed)
     try:
         policy = load_policy(command.policy, command.pilot.hold_s)
         sampler(command, command.seed)
@@ -156,8 +168,6 @@ def serve(command: CompanionCommand) -> int:
         channel.send(Failed(message=str(error)))
         return EXIT_USAGE
     while not isinstance(request := requests.get(), Shutdown):
-        clock = WallClock(command.speed, request.epoch_ns)
-        link.clock = frames.clock = clock
         try:
             if not link.connected:
                 link.connect(command.connect_timeout)

@@ -305,6 +305,7 @@ class _Service:
                 armed=flight.phase >= Phase.GROUND,
                 landed=flight.phase < Phase.AIR,
                 slipped_us=self._firmware.slipped_us,
+                epoch_ns=self._firmware.epoch_ns,
             )
         )
 

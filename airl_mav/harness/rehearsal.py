@@ -22,6 +22,7 @@ from airl_mav.channel import (
     LoadEpisode,
     Progress,
     Ready,
+    Resync,
     Saved,
     State,
     Text,
@@ -36,6 +37,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.process import Child, Exited
 from airl_mav.harness.run_folder import RunFolder
 from airl_mav.latency.matching import match_setpoints, stamps_of
+from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.summary import TICK_LATENESS
 
 FIRMWARE, COMPANION = "firmware", "companion"
@@ -256,6 +258,8 @@ class Rehearsal:
         referee = episode.referee
         if episode.state is None:
             episode.first_slipped_us = state.slipped_us
+        if episode.state is not None and state.slipped_us != episode.state.slipped_us:
+            self._children[COMPANION].send(Resync(epoch_ns=state.epoch_ns))
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         if referee.verdict is not None:
@@ -396,18 +400,22 @@ class Rehearsal:
 def join_stamps(
     decisions: dict[str, NDArray[Any]], setpoints: dict[str, NDArray[Any]]
 ) -> dict[str, NDArray[Any]]:
-    """Return the decision log with the times at which the autopilot accepted and applied each."""
+    """Return the decision log with the times at which the autopilot accepted and applied each.
+
+    Where the host could not keep up, simulated time was set back to the tick that was due: a
+    decision across such a moment has no interval that means anything, and gets no stamps here.
+    """
+    sent, accepted = decisions["sent_us"], setpoints["accepted_us"]
     index = match_setpoints(
-        decisions["sent_us"],
+        np.maximum.accumulate(sent),
         decisions["setpoint"],
-        setpoints["accepted_us"],
+        np.maximum.accumulate(accepted),
         setpoints["setpoint"],
     )
-    return {
-        **decisions,
-        "accepted_us": stamps_of(index, setpoints["accepted_us"]),
-        "motor_us": stamps_of(index, setpoints["motor_us"]),
-    }
+    accepted_us, motor_us = stamps_of(index, accepted), stamps_of(index, setpoints["motor_us"])
+    broken = (accepted_us < sent) | (motor_us < accepted_us)
+    accepted_us[broken] = motor_us[broken] = NO_STAMP
+    return {**decisions, "accepted_us": accepted_us, "motor_us": motor_us}
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:
