@@ -1,4 +1,4 @@
-"""Keep C libraries off the terminal: pybullet prints a banner from C at import and connect."""
+"""Keep C libraries off the terminal: pybullet prints banners from C at import and connect."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def quiet_stdout() -> Iterator[None]:
-    """Point file descriptor 1 at the null device for a while."""
+def quiet_terminal() -> Iterator[None]:
+    """Point standard output and standard error at the null device for a while."""
     sys.stdout.flush()
-    kept = os.dup(1)
+    sys.stderr.flush()
+    kept = [(number, os.dup(number)) for number in (1, 2)]
     null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(null, 1)
+        for number, _ in kept:
+            os.dup2(null, number)
         yield
         # What C has buffered meanwhile must go the same way, not out at exit.
         ctypes.CDLL(None).fflush(None)
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        for number, copy in kept:
+            os.dup2(copy, number)
+            os.close(copy)
         os.close(null)

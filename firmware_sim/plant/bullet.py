@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_sim.quiet import quiet_stdout
+from firmware_sim.quiet import quiet_terminal
 
-with quiet_stdout():
+with quiet_terminal():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
@@ -15,5 +15,5 @@ __all__ = ["connect", "pybullet"]
 
 def connect() -> Any:
     """Return a client of a new physics server in this process."""
-    with quiet_stdout():
+    with quiet_terminal():
         return BulletClient(pybullet.DIRECT)

@@ -40,7 +40,8 @@ class Rate:
         """Return True once for every period that has passed."""
         if time_us < self._count * self._period_us:
             return False
-        self._count = int(time_us // self._period_us) + 1
+        # Rounding may put a time that lies on the end of a period into that period.
+        self._count = max(self._count, int(time_us // self._period_us)) + 1
         return True
 
 
