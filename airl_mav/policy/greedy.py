@@ -34,7 +34,10 @@ class GreedySettings:
     free_distance_m: float = 6.0
     """A heading that is free this far is as good as any."""
     period_s: float = 0.5
-    """Time until the next decision."""
+    """Time until the next decision that the speed limit counts on."""
+    turn_gain_1_s: float = 1.2
+    """Yaw rate per angle still to turn. Gain times the true time between decisions must stay well
+    below 2, or the heading oscillates: this one stands decisions 1 s apart."""
     headings: int = 37
     """Number of headings tried across the field of view."""
 
@@ -77,7 +80,7 @@ class GreedyPolicy:
 
     def _turn(self, angle: float) -> float:
         limit = self._settings.max_yaw_rate_rad_s
-        return max(-limit, min(limit, angle / self._settings.period_s))
+        return max(-limit, min(limit, self._settings.turn_gain_1_s * angle))
 
     def _speed(self, free_m: float, goal_m: float) -> float:
         """Return the speed from which the vehicle can stop in time after one more period."""
