@@ -5,10 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from airl_mav.clock import Clock
 from airl_mav.latency.samplers import LatencySampler
@@ -110,12 +106,3 @@ def _let_go(link: MavsdkLink) -> list[str]:
     except LinkError as error:
         return [str(error)]
     return []
-
-
-def save_log(log: DecisionLog, path: Path) -> None:
-    """Write a decision log to an .npz: a temporary name first, then renamed."""
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        columns: dict[str, Any] = dict(log.columns())
-        np.savez(file, **columns)
-    temporary.replace(path)

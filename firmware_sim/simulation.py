@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.atomic import save_arrays
 from airl_mav.camera.frame import Frame
 from airl_mav.clock import Clock
 from airl_mav.constants import TICK_US
@@ -127,7 +128,7 @@ class Simulation:
         self._estimates.append((e.time_us, *e.position, *e.velocity, *e.quaternion))
 
     def save(self, path: Path, extra: dict[str, NDArray[Any]]) -> None:
-        """Write the episode's arrays to an .npz: a temporary name first, then renamed."""
+        """Write the episode's arrays, and `extra` ones, to an .npz."""
         estimates = np.array(self._estimates, np.float64).reshape(-1, 11)
         arrays: dict[str, Any] = {
             f"trajectory/{k}": v for k, v in self._trajectory.trajectory().arrays().items()
@@ -140,10 +141,7 @@ class Simulation:
             "estimate/quaternion": estimates[:, 7:11],
         }
         arrays |= extra
-        temporary = path.with_suffix(".tmp")
-        with temporary.open("wb") as file:
-            np.savez(file, **arrays)
-        temporary.replace(path)
+        save_arrays(path, arrays)
 
     def close(self) -> None:
         """Release the physics server."""

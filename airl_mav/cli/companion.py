@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
+from airl_mav.atomic import save_arrays
 from airl_mav.channel import (
     Abort,
     ChildChannel,
@@ -34,7 +35,7 @@ from airl_mav.policy.registry import load_policy
 from airl_mav.profiles.computer import load_computer
 from companion.camera import ZmqFrameSource
 from companion.link import LinkError, MavsdkLink
-from companion.mission import MissionResult, fly_mission, save_log
+from companion.mission import MissionResult, fly_mission
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
 
@@ -128,7 +129,7 @@ def stand_alone(command: CompanionCommand) -> int:
         frames.close()
         link.close()
     if command.log is not None:
-        save_log(result.log, command.log)
+        save_arrays(command.log, result.log.columns())
     for note in result.notes:
         console.print(note, style="yellow", markup=False)
     console.print(f"{result.reason}; {len(result.log)} decisions")
@@ -199,7 +200,7 @@ def _announce(channel: ChildChannel, clock: Clock) -> Any:
 
 def _ended(result: MissionResult, request: Fly) -> Ended:
     """Save the decision log and return the event that says so."""
-    save_log(result.log, Path(request.record))
+    save_arrays(Path(request.record), result.log.columns())
     return Ended(reason=result.reason, notes=result.notes, path=request.record)
 
 

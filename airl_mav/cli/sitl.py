@@ -14,8 +14,9 @@ from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, run_command
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
+from airl_mav.harness.episode import Plan, ProcessPlan
 from airl_mav.harness.progress import RichObserver
-from airl_mav.harness.rehearsal import Plan, ProcessPlan, Rehearsal, RehearsalError
+from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
 from airl_mav.harness.run_folder import RunFolder
 from airl_mav.latency.injection import choose_injection
 from airl_mav.policy.registry import policy_description

@@ -67,7 +67,7 @@ class RichObserver:
         """Show that an episode begins."""
         self._goal = goal
         self._phase = "booting"
-        self._show(f"episode {index + 1}, seed {seed}")
+        self._show(f"flight {index:03d}, seed {seed}")
 
     def phase(self, phase: str, time_us: int) -> None:
         """Show the phase in the live line."""
@@ -86,7 +86,7 @@ class RichObserver:
     def text(self, text: Text) -> None:
         """Print what the autopilot says, if it is a warning or worse."""
         if text.severity <= _WARNING:
-            self._console.print(f"  autopilot: {text.text}", style="yellow", markup=False)
+            self._say(f"  autopilot: {text.text}")
 
     def finished(self, record: EpisodeRecord) -> None:
         """Print an episode's line and advance the bar."""
@@ -98,16 +98,22 @@ class RichObserver:
                 f"{quality.energy_j / 1e3:6.2f} kJ  "
             )
         self._console.print(
-            f"  episode {record.index + 1:>3}  seed {record.seed:<5} "
+            f"  flight {record.index:03d}  seed {record.seed:<5} "
             f"{record.outcome.value:<10}{figures}{record.reason}",
             style=_STYLE[record.outcome],
             markup=False,
             highlight=False,
+            soft_wrap=True,
         )
         for note in record.notes:
-            self._console.print(f"    {note}", style="yellow", markup=False, highlight=False)
+            self._say(f"    {note}")
+        # Into a file or a pipe, lines must not wait for the end of the run.
+        self._console.file.flush()
         if self._task is not None:
             self._progress.advance(self._task)
+
+    def _say(self, text: str) -> None:
+        self._console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
     def _show(self, text: str) -> None:
         if self._task is not None:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
 
 from airl_mav.channel import (
     Abort,
@@ -31,14 +27,10 @@ from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample, Verdict
-from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.harness.episode import Episode, Plan, save_episode
 from airl_mav.harness.process import Child, Exited
 from airl_mav.harness.run_folder import RunFolder
-from airl_mav.latency.matching import match_setpoints, stamps_of
-from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.report.summary import TICK_LATENESS
 
 FIRMWARE, COMPANION = "firmware", "companion"
 
@@ -57,29 +49,6 @@ TAKEOFF_LIMIT_S = 90.0
 
 class RehearsalError(Exception):
     """The run cannot go on; the message says why."""
-
-
-@dataclass(frozen=True)
-class ProcessPlan:
-    """How to start one process: module and arguments."""
-
-    module: str
-    arguments: list[str]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything a rehearsal needs to know."""
-
-    firmware: ProcessPlan
-    companion: ProcessPlan
-    arena: str
-    seed: int
-    episodes: int
-    goal_radius_m: float
-    time_limit_s: float
-    speed: float
-    computer_watts: float
 
 
 class Observer(Protocol):
@@ -108,24 +77,6 @@ class Observer(Protocol):
     def finished(self, record: EpisodeRecord) -> None:
         """An episode has been saved."""
         ...
-
-
-@dataclass
-class _Episode:
-    """What is known of the running episode."""
-
-    index: int
-    seed: int
-    loaded: Loaded
-    referee: Referee
-    stopwatch: WallClock
-    wall_us: int | None = None
-    """Wall time from the reset to the verdict."""
-    state: State | None = None
-    verdict_state: State | None = None
-    ended: Ended | None = None
-    first_slipped_us: int = 0
-    notes: list[str] = field(default_factory=list)
 
 
 class Rehearsal:
@@ -203,7 +154,7 @@ class Rehearsal:
         )
         loaded = self._wait_for(Loaded, REPLY_TIMEOUT_S)
         task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
-        episode = _Episode(index, seed, loaded, Referee(task), WallClock())
+        episode = Episode(index, seed, loaded, Referee(task), WallClock())
         self._observer.episode(index, seed, loaded.goal)
         self._children[COMPANION].send(
             Fly(
@@ -234,7 +185,7 @@ class Rehearsal:
         if broken is not None:
             raise broken
 
-    def _follow(self, episode: _Episode, _name: str, event: Event) -> bool:
+    def _follow(self, episode: Episode, _name: str, event: Event) -> bool:
         """Take one event of a flight; True when it is over."""
         referee = episode.referee
         if isinstance(event, State):
@@ -254,7 +205,7 @@ class Rehearsal:
             return True
         return False
 
-    def _see(self, episode: _Episode, state: State) -> None:
+    def _see(self, episode: Episode, state: State) -> None:
         referee = episode.referee
         if episode.state is None:
             episode.first_slipped_us = state.slipped_us
@@ -277,13 +228,13 @@ class Rehearsal:
                 crashed = verdict.outcome in (Outcome.COLLISION, Outcome.BATTERY)
                 self._children[COMPANION].send(Abort(land=not crashed))
 
-    def _judge(self, episode: _Episode, verdict: Verdict) -> None:
+    def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
             episode.wall_us = episode.stopwatch.time_us()
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
-    def _watch_failsafe(self, episode: _Episode) -> None:
+    def _watch_failsafe(self, episode: Episode) -> None:
         """The companion is gone: watch what the flight controller does, until it is down."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
 
@@ -302,49 +253,9 @@ class Rehearsal:
         except RehearsalError as error:
             episode.notes.append(str(error))
 
-    # --- saving
-
-    def _save(self, episode: _Episode, record_path: Path, decisions_path: Path) -> None:
-        arrays = _read(record_path)
-        trajectory = Trajectory.from_arrays(_part(arrays, "trajectory"))
-        latency = _part(arrays, "estimate", keep_prefix=True)
-        latency[TICK_LATENESS] = arrays["tick/lateness_us"]
-        if decisions_path.exists():
-            latency |= join_stamps(_read(decisions_path), _part(arrays, "setpoints"))
-        record = self._record(episode, trajectory)
-        self._folder.save_episode(record, trajectory, latency)
-        record_path.unlink()
-        decisions_path.unlink(missing_ok=True)
+    def _save(self, episode: Episode, record_path: Path, decisions_path: Path) -> None:
+        record = save_episode(episode, self._plan, self._folder, record_path, decisions_path)
         self._observer.finished(record)
-
-    def _record(self, episode: _Episode, trajectory: Trajectory) -> EpisodeRecord:
-        plan, referee, loaded = self._plan, episode.referee, episode.loaded
-        verdict = referee.verdict or referee.abort(loaded.time_us, "no verdict")
-        state = episode.verdict_state
-        quality = None
-        if referee.navigation_us is not None and verdict.time_us >= referee.navigation_us:
-            quality = measure_quality(
-                trajectory, referee.navigation_us, verdict.time_us, plan.computer_watts
-            )
-        return EpisodeRecord(
-            index=episode.index,
-            seed=episode.seed,
-            arena=plan.arena,
-            arena_seed=episode.seed,
-            outcome=verdict.outcome,
-            reason=verdict.reason,
-            goal=loaded.goal,
-            goal_radius_m=plan.goal_radius_m,
-            time_limit_s=plan.time_limit_s,
-            started_us=loaded.time_us,
-            navigation_us=referee.navigation_us,
-            ended_us=verdict.time_us,
-            wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
-            slipped_us=state.slipped_us - episode.first_slipped_us if state else 0,
-            battery_remaining=state.battery if state else None,
-            quality=quality,
-            notes=tuple(episode.notes),
-        )
 
     # --- events
 
@@ -395,41 +306,3 @@ class Rehearsal:
         tail = child.log_tail()
         detail = f"\n{tail}" if tail else ""
         raise RehearsalError(f"the {name} process died: {exited} (log: {child.log}){detail}")
-
-
-def join_stamps(
-    decisions: dict[str, NDArray[Any]], setpoints: dict[str, NDArray[Any]]
-) -> dict[str, NDArray[Any]]:
-    """Return the decision log with the times at which the autopilot accepted and applied each.
-
-    Where the host could not keep up, simulated time was set back to the tick that was due: a
-    decision across such a moment has no interval that means anything, and gets no stamps here.
-    """
-    sent, accepted = decisions["sent_us"], setpoints["accepted_us"]
-    index = match_setpoints(
-        np.maximum.accumulate(sent),
-        decisions["setpoint"],
-        np.maximum.accumulate(accepted),
-        setpoints["setpoint"],
-    )
-    accepted_us, motor_us = stamps_of(index, accepted), stamps_of(index, setpoints["motor_us"])
-    broken = (accepted_us < sent) | (motor_us < accepted_us)
-    accepted_us[broken] = motor_us[broken] = NO_STAMP
-    return {**decisions, "accepted_us": accepted_us, "motor_us": motor_us}
-
-
-def _read(path: Path) -> dict[str, NDArray[Any]]:
-    with np.load(path, allow_pickle=False) as archive:
-        return {key: archive[key] for key in archive.files}
-
-
-def _part(
-    arrays: dict[str, NDArray[Any]], prefix: str, *, keep_prefix: bool = False
-) -> dict[str, NDArray[Any]]:
-    cut = 0 if keep_prefix else len(prefix) + 1
-    return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}
-
-
-def plan_config(plan: Plan) -> dict[str, Any]:
-    """Return a plan as plain values for `run.json`."""
-    return asdict(plan)

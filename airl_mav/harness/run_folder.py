@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from airl_mav.atomic import add_arrays, replace_file
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.atomic import add_arrays, replace_file
 from airl_mav.harness.provenance import describe_machine, git_state, package_versions
 
 SCHEMA = 1
@@ -33,6 +33,9 @@ RUN_FILE = "run.json"
 EPISODES_FILE = "episodes.jsonl"
 LATENCY_FILE = "latency.npz"
 TRAJECTORIES_FILE = "trajectories.npz"
+
+TICK_LATENESS = "tick_lateness_us"
+"""Name of the array of a paced run that says how late each tick began [µs]."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -143,7 +146,7 @@ class RunFolder:
 
     def sweep(self) -> None:
         """Remove what processes left behind for an episode that was never finished."""
-        for leftover in self.path.glob(".*.npz"):
+        for leftover in self.path.glob(".*.npz*"):
             leftover.unlink()
 
     def save_episode(

@@ -10,11 +10,11 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.atomic import replace_file
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.atomic import replace_file
 from airl_mav.harness.run_folder import LoadedRun
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.report.figures import latency_figure, latency_overview, map_figure, time_figure

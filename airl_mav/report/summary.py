@@ -9,13 +9,10 @@ from numpy.typing import NDArray
 
 from airl_mav.constants import US_PER_S
 from airl_mav.flight.statistics import Aggregate, aggregate
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.harness.run_folder import TICK_LATENESS, LoadedRun
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.latency.stamps import NO_STAMP
-
-TICK_LATENESS = "tick_lateness_us"
-"""Name of the array of a paced run that says how late each tick began [µs]."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import zipfile
@@ -39,6 +40,14 @@ def add_arrays(path: Path, prefix: str, arrays: Mapping[str, NDArray[Any]]) -> N
             with new.open(f"{prefix}{name}.npy", "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
     _commit(partial, path)
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name to a new .npz, in place of any old one."""
+    buffer = io.BytesIO()
+    keywords: dict[str, Any] = dict(arrays)
+    np.savez(buffer, **keywords)
+    replace_file(path, buffer.getvalue())
 
 
 def replace_file(path: Path, data: bytes) -> None:

@@ -1,0 +1,150 @@
+"""One episode of a rehearsal: what is planned, what is known of it, how it is saved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.channel import Ended, Loaded, State
+from airl_mav.clock import WallClock
+from airl_mav.constants import US_PER_S
+from airl_mav.flight.judge import Referee
+from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.harness.run_folder import TICK_LATENESS, RunFolder
+from airl_mav.latency.matching import match_setpoints, stamps_of
+from airl_mav.latency.stamps import NO_STAMP
+
+
+@dataclass(frozen=True)
+class ProcessPlan:
+    """How to start one process: module and arguments."""
+
+    module: str
+    arguments: list[str]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a rehearsal needs to know."""
+
+    firmware: ProcessPlan
+    companion: ProcessPlan
+    arena: str
+    seed: int
+    episodes: int
+    goal_radius_m: float
+    time_limit_s: float
+    speed: float
+    computer_watts: float
+
+
+@dataclass
+class Episode:
+    """What is known of a running episode."""
+
+    index: int
+    seed: int
+    loaded: Loaded
+    referee: Referee
+    stopwatch: WallClock
+    wall_us: int | None = None
+    """Wall time from the reset to the verdict."""
+    state: State | None = None
+    verdict_state: State | None = None
+    ended: Ended | None = None
+    first_slipped_us: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
+def save_episode(
+    episode: Episode, plan: Plan, folder: RunFolder, record_path: Path, decisions_path: Path
+) -> EpisodeRecord:
+    """Join what both processes left of an episode and save it in the run folder.
+
+    Args:
+        episode: The episode, judged.
+        plan: What was planned.
+        folder: The run.
+        record_path: The firmware's arrays; removed afterwards.
+        decisions_path: The companion's decision log; may be missing; removed afterwards.
+    """
+    arrays = _read(record_path)
+    trajectory = Trajectory.from_arrays(_part(arrays, "trajectory"))
+    latency = _part(arrays, "estimate", keep_prefix=True)
+    latency[TICK_LATENESS] = arrays["tick/lateness_us"]
+    if decisions_path.exists():
+        latency |= join_stamps(_read(decisions_path), _part(arrays, "setpoints"))
+    record = _record(episode, plan, trajectory)
+    folder.save_episode(record, trajectory, latency)
+    record_path.unlink()
+    decisions_path.unlink(missing_ok=True)
+    return record
+
+
+def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeRecord:
+    referee, loaded = episode.referee, episode.loaded
+    verdict = referee.verdict or referee.abort(loaded.time_us, "no verdict")
+    state = episode.verdict_state
+    quality = None
+    if referee.navigation_us is not None and verdict.time_us >= referee.navigation_us:
+        quality = measure_quality(
+            trajectory, referee.navigation_us, verdict.time_us, plan.computer_watts
+        )
+    return EpisodeRecord(
+        index=episode.index,
+        seed=episode.seed,
+        arena=plan.arena,
+        arena_seed=episode.seed,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        goal=loaded.goal,
+        goal_radius_m=plan.goal_radius_m,
+        time_limit_s=plan.time_limit_s,
+        started_us=loaded.time_us,
+        navigation_us=referee.navigation_us,
+        ended_us=verdict.time_us,
+        wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
+        slipped_us=state.slipped_us - episode.first_slipped_us if state else 0,
+        battery_remaining=state.battery if state else None,
+        quality=quality,
+        notes=tuple(episode.notes),
+    )
+
+
+def join_stamps(
+    decisions: dict[str, NDArray[Any]], setpoints: dict[str, NDArray[Any]]
+) -> dict[str, NDArray[Any]]:
+    """Return the decision log with the times at which the autopilot accepted and applied each.
+
+    Where the host could not keep up, simulated time was set back to the tick that was due: a
+    decision across such a moment has no interval that means anything, and gets no stamps here.
+    """
+    sent, accepted = decisions["sent_us"], setpoints["accepted_us"]
+    index = match_setpoints(
+        np.maximum.accumulate(sent),
+        decisions["setpoint"],
+        np.maximum.accumulate(accepted),
+        setpoints["setpoint"],
+    )
+    accepted_us, motor_us = stamps_of(index, accepted), stamps_of(index, setpoints["motor_us"])
+    broken = (accepted_us < sent) | (motor_us < accepted_us)
+    accepted_us[broken] = motor_us[broken] = NO_STAMP
+    return {**decisions, "accepted_us": accepted_us, "motor_us": motor_us}
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files}
+
+
+def _part(
+    arrays: dict[str, NDArray[Any]], prefix: str, *, keep_prefix: bool = False
+) -> dict[str, NDArray[Any]]:
+    cut = 0 if keep_prefix else len(prefix) + 1
+    return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}
