@@ -25,13 +25,13 @@ class GreedySettings:
     max_yaw_rate_rad_s: float = math.radians(90.0)
     brake_m_s2: float = 2.5
     """Deceleration that the speed limit counts on."""
-    half_width_m: float = 0.55
+    half_width_m: float = 0.7
     """Half the vehicle's width plus a margin."""
     band_m: float = 0.6
     """Returns this far above or below the vehicle are in its way."""
-    stop_distance_m: float = 1.2
+    stop_distance_m: float = 1.3
     """Closer returns than this are not approached."""
-    free_distance_m: float = 6.0
+    free_distance_m: float = 10.0
     """A heading that is free this far is as good as any."""
     period_s: float = 0.5
     """Time until the next decision that the speed limit counts on."""
@@ -73,10 +73,11 @@ class GreedyPolicy:
         heading = float(headings[best])
         if abs(heading) > math.radians(3.0):
             self._side = math.copysign(1.0, heading)
-        ahead = min(clearance(points, 0.0, s.half_width_m), float(clear[best]))
-        speed = self._speed(min(ahead, float(clear[best])), distance)
-        forward = speed * max(0.0, math.cos(heading)) ** 2
-        return Action(forward, 0.0, self._turn(heading))
+        speed = self._speed(float(clear[best]), distance)
+        turn = self._turn(heading)
+        # The command turns with the nose while it is held: aim so that its mean lies right.
+        course = heading - 0.5 * turn * s.period_s
+        return Action(speed * math.cos(course), speed * math.sin(course), turn)
 
     def _turn(self, angle: float) -> float:
         limit = self._settings.max_yaw_rate_rad_s
