@@ -60,7 +60,8 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
     """Return a validation error's first finding as one line: field, value, accepted range."""
-    first = error.errors()[0]
+    # A misspelt field also goes missing: its misspelling says more.
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     path = first["loc"]
     field = ".".join(str(part) for part in path)
     rest = error.error_count() - 1
@@ -74,6 +75,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         hint = f"did you mean {near[0]!r}?" if near else f"fields: {', '.join(names)}"
         return f"{field}: unknown field; {hint}{tail}"
     accepted = _accepted(model, path) or first["msg"]
+    table = _model_at(model, path) if first["type"] == "model_type" else None
+    if table is not None:
+        accepted = f"a table with the fields {', '.join(table.model_fields)}"
     value = first["input"]
     where = f"{field} = {value!r}" if field else "invalid"
     if first["type"] == "value_error":
