@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.harness.run_folder import TICK_LATENESS, LoadedRun
 from airl_mav.latency.percentiles import Summary, summarize
@@ -21,7 +22,8 @@ class RealTime:
 
     tick_lateness: Summary
     factor: float | None
-    """Simulated seconds per wall second over all episodes; None where time was not paced."""
+    """Simulated seconds per wall second over all episodes that were not aborted; None where time
+    was not paced."""
     slipped_us: int
     """Simulated time given up [µs]."""
     setpoint_to_motor: Summary
@@ -55,7 +57,8 @@ def _real_time(run: LoadedRun, stages: dict[str, Summary]) -> RealTime:
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
     accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
-    paced = [episode for episode in run.episodes if episode.wall_s]
+    # An aborted flight ends when its end is noticed: its wall time counts something else.
+    paced = [e for e in run.episodes if e.wall_s and e.outcome is not Outcome.ABORTED]
     wall_s = sum(episode.wall_s or 0.0 for episode in paced)
     flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
     return RealTime(
