@@ -8,44 +8,44 @@ from __future__ import annotations
 
 import importlib
 import sys
+from importlib.util import find_spec
 
 from rich.console import Console
 
 from airl_mav.cli.common import EXIT_USAGE
 
+SIM_MODULES = ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy")
+"""What the [sim] extra installs."""
 
-def _main_of(command: str, extra: str) -> None:
-    """Import `airl_mav.cli.<command>` and run its main."""
-    try:
-        module = importlib.import_module(f"airl_mav.cli.{command}")
-    except ModuleNotFoundError as error:
-        missing = (error.name or "").partition(".")[0]
-        if missing in ("airl_mav", "companion", "firmware_sim"):
-            raise  # ours, not an optional part
+
+def _start(command: str, needed: tuple[str, ...] = SIM_MODULES) -> None:
+    """Run the main of `airl_mav.cli.<command>`, if all that it needs is installed."""
+    missing = [name for name in needed if find_spec(name) is None]
+    if missing:
         Console(stderr=True, soft_wrap=True).print(
-            f"error: {missing} is not installed: pip install 'airl-mav[{extra}]'",
+            f"error: not installed: {', '.join(missing)}; pip install 'airl-mav[sim]'",
             style="red",
             markup=False,
         )
         sys.exit(EXIT_USAGE)
-    module.main()
+    importlib.import_module(f"airl_mav.cli.{command}").main()
 
 
 def sitl() -> None:
     """`airl-sitl`."""
-    _main_of("sitl", "sim")
+    _start("sitl")
 
 
 def firmware() -> None:
     """`airl-firmware`."""
-    _main_of("firmware", "sim")
+    _start("firmware")
 
 
 def companion() -> None:
-    """`airl-companion`."""
-    _main_of("companion", "sim")
+    """`airl-companion`: needs nothing beyond the light installation."""
+    _start("companion", needed=())
 
 
 def airl() -> None:
     """`airl`."""
-    _main_of("main", "sim")
+    _start("main")
