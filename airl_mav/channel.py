@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from typing import Annotated, Any, BinaryIO, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 
 class _Line(BaseModel):
@@ -76,13 +76,6 @@ class Abort(_Line):
     """Stop and land; False after a crash: there is nothing left to land."""
 
 
-class Resync(_Line):
-    """The simulator has given up simulated time: its clock has a new epoch."""
-
-    type: Literal["resync"] = "resync"
-    epoch_ns: int | None
-
-
 class Shutdown(_Line):
     """End the process."""
 
@@ -107,6 +100,8 @@ class Loaded(_Line):
     time_us: int
     epoch_ns: int | None
     """Host monotonic time of simulated time 0; None when time is not paced."""
+    slipped_us: int
+    """Simulated time given up before, because the host could not keep up."""
     goal: tuple[float, float]
 
 
@@ -125,8 +120,6 @@ class State(_Line):
     landed: bool
     slipped_us: int
     """Simulated time given up since the start because the host could not keep up."""
-    epoch_ns: int | None
-    """Host monotonic time of simulated time 0; moves when simulated time is given up."""
 
 
 class Text(_Line):
@@ -174,7 +167,7 @@ class Failed(_Line):
 
 
 Request = Annotated[
-    LoadEpisode | FinishEpisode | Fly | Abort | Resync | Shutdown, Field(discriminator="type")
+    LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
     Ready | Loaded | State | Text | Saved | Progress | Ended | Failed,
@@ -218,11 +211,22 @@ class ChildChannel:
             return
 
     def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
-        """Call `handle` for every request, on a thread; `gone` when the harness is gone."""
+        """Call `handle` for every request, on a thread; `gone` when the harness is gone.
+
+        A line that is no request is passed over, as the harness does with events. `gone` is also
+        called when `handle` fails: nobody would hear the end of the harness any more.
+        """
 
         def loop() -> None:
-            for line in self._incoming:
-                handle(_REQUESTS.validate_json(line))
-            gone()
+            try:
+                for line in self._incoming:
+                    try:
+                        request = _REQUESTS.validate_json(line)
+                    except ValidationError:
+                        sys.stderr.write(f"not a request: {line[:200]!r}\n")
+                        continue
+                    handle(request)
+            finally:
+                gone()
 
         threading.Thread(target=loop, name="channel", daemon=True).start()

@@ -17,19 +17,21 @@ from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from mavsdk.logging import log_subscribe
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
-from mavsdk.plugins.telemetry import LandedState, Telemetry
+from mavsdk.plugins.telemetry import LandedState, Telemetry, TelemetryError
 
-from airl_mav.clock import Clock
+from airl_mav.clock import Clock, WallClock
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
 from airl_mav.policy.observation import Kinematics
 
-TELEMETRY_HZ = 50.0
+RATE_HZ = 50.0
 """Rate asked for position, velocity and attitude [Hz]."""
 
 POLL_S = 0.05
 """How often a condition is looked at while waiting for it [s]."""
 
+CONNECT_SLICE_S = 0.5
+"""Longest single wait for a flight controller [wall s]."""
 
 HEALTH_SETTLE_S = 0.5
 """Good health must last so long before arming: more than two of PX4's 5 Hz reports [s]."""
@@ -110,17 +112,27 @@ class MavsdkLink:
         self._action: Any = None
         self._offboard: Any = None
 
-    def connect(self, timeout_s: float) -> None:
-        """Wait for a flight controller. Raises LinkError when none is heard in time."""
-        system = self._mavsdk.first_autopilot(timeout_s)
-        if system is None:
-            raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+    def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
+        """Wait for a flight controller. Raises LinkError when none is heard in time [wall s].
+
+        `stop`, set from outside, breaks off the wait.
+        """
+        stopwatch = WallClock()
+        system = None
+        while system is None:
+            if stop is not None and stop.is_set():
+                raise LinkError("stopped")
+            left_s = timeout_s - stopwatch.time_us() / US_PER_S
+            if left_s <= 0.0:
+                raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+            # In slices: a signal is only noticed between two calls into MAVSDK.
+            system = self._mavsdk.first_autopilot(min(left_s, CONNECT_SLICE_S))
         self._system = system
         self._telemetry = Telemetry(system)
         self._action = Action(system)
         self._offboard = Offboard(system)
-        self._telemetry.set_rate_position_velocity_ned(TELEMETRY_HZ)
-        self._telemetry.set_rate_attitude_quaternion(TELEMETRY_HZ)
+        self._call("telemetry", lambda: self._telemetry.set_rate_position_velocity_ned(RATE_HZ))
+        self._call("telemetry", lambda: self._telemetry.set_rate_attitude_quaternion(RATE_HZ))
 
     def close(self) -> None:
         """Release MAVSDK."""
@@ -136,8 +148,9 @@ class MavsdkLink:
 
     @property
     def healthy(self) -> bool:
-        """Whether the flight controller reports all of its health checks as good."""
-        return bool(self._telemetry.health_all_ok())
+        """Whether the flight controller reports good sensors and that it may be armed."""
+        telemetry = self._telemetry
+        return bool(telemetry.health_all_ok() and telemetry.health().is_armable)
 
     @property
     def armed(self) -> bool:
@@ -165,16 +178,17 @@ class MavsdkLink:
             np.array([q.w, q.x, q.y, q.z]),
         )
 
-    def arm(self, timeout_s: float) -> None:
+    def arm(self, timeout_s: float, stop: threading.Event) -> None:
         """Wait until the flight controller reports good health, then arm.
 
         Its health is told a few times a second: right after a reboot, old news may still be good
-        news. So it must have been good for a while, and a refused request is repeated.
+        news. So it must have been good for a while, and a refused request is repeated. `stop`, set
+        from outside, breaks off the wait.
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us = self._clock.time_us()
         while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
-            self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm")
+            self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm", stop)
             self._pause()
             if not self.healthy:
                 good_since_us = self._clock.time_us()
@@ -183,11 +197,14 @@ class MavsdkLink:
                 self._action.arm()
                 return
             except ActionError as error:
-                self._check(deadline_us, f"arming failed: {_reason(error)}")
+                self._check(deadline_us, f"arming failed: {_reason(error)}", stop)
                 self._pause(ARM_RETRY_S)
 
-    def takeoff(self, altitude_m: float, timeout_s: float) -> None:
-        """Take off and return when the altitude above the start is reached."""
+    def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
+        """Take off and return when the altitude above the start is reached.
+
+        `stop`, set from outside, breaks off the climb.
+        """
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
@@ -197,7 +214,7 @@ class MavsdkLink:
             height = start_down - float(state.position[2])
             if height > 0.85 * altitude_m and abs(float(state.velocity[2])) < 0.3:
                 return
-            self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s")
+            self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
             self._pause()
 
     def enter_offboard(self) -> None:
@@ -231,17 +248,19 @@ class MavsdkLink:
     def _call(self, what: str, call: Any) -> None:
         try:
             call()
-        except (ActionError, OffboardError) as error:
+        except (ActionError, OffboardError, TelemetryError) as error:
             raise LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
         return self._clock.time_us() + int(timeout_s * US_PER_S)
 
-    def _check(self, deadline_us: int, message: str) -> None:
+    def _check(self, deadline_us: int, message: str, stop: threading.Event | None = None) -> None:
         if not self.connected:
             raise LinkError("the flight controller is no longer heard")
         if self._abandon.is_set():
             raise LinkError("abandoned")
+        if stop is not None and stop.is_set():
+            raise LinkError("stopped")
         if self._clock.time_us() >= deadline_us:
             raise LinkError(message)
 
@@ -258,5 +277,8 @@ def _reason(error: Exception) -> str:
 def _connection_problem(url: str, result: Any) -> str:
     name = result.name.lower().replace("_", " ")
     if result == ConnectionResult.BIND_ERROR:
-        return f"--connect {url}: the port is taken (another companion?): choose another"
+        return (
+            f"--connect {url}: the port is taken (another companion?): choose another "
+            "(airl-sitl: --api-port)"
+        )
     return f"--connect {url}: {name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -25,7 +27,7 @@ class MissionResult:
     """How a mission ended."""
 
     reason: str
-    """goal reached, stopped, link lost, watchdog, or what was refused."""
+    """goal reached, stopped, link lost, watchdog, or what was refused or failed."""
     notes: tuple[str, ...]
     """What the watchdog did, what went wrong on the way down."""
     log: DecisionLog
@@ -65,23 +67,33 @@ def fly_mission(
     pilot = Pilot(link, frames, policy, watchdog, clock, pilot_settings, latency=latency)
     try:
         progress("arming")
-        link.arm(ARM_TIMEOUT_S)
+        link.arm(ARM_TIMEOUT_S, stop)
         progress("taking off")
-        link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S)
+        link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
         link.enter_offboard()
         progress("navigating")
         watchdog.start()
         reason = pilot.fly(goal, stop)
     except LinkError as error:
-        reason = str(error) if link.connected else "link lost"
+        reason = str(error)
+    except Exception as error:
+        # A policy may raise anything; the vehicle comes down all the same.
+        reason = f"policy failed: {type(error).__name__}: {error}"
+        traceback.print_exc(file=sys.stderr)
     finally:
         watchdog.stop()
+    lost = not link.connected
     if abandon.is_set():
         reason = "stopped"
+    elif lost:
+        # The watchdog may have been the first to notice.
+        reason = "link lost"
     notes = list(watchdog.notes)
-    if abandon.is_set():
+    if abandon.is_set() or lost:
+        # A lost link may be lost one way only: MAVSDK must not go on repeating the last setpoint
+        # to a vehicle that still hears it.
         notes += _let_go(link)
-    elif link.connected:
+    else:
         progress("landing")
         notes += _come_down(link, left_offboard=watchdog.left_offboard)
     progress("done")

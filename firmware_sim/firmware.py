@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from airl_mav.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.state import Message
 from firmware_sim.mavlink.server import MavlinkServer
@@ -93,8 +91,7 @@ class Firmware:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
         sockets = server.filenos()
-        self._pacing.wait(simulation.time_us, sockets, self._receive)
-        server.receive(self.clock.time_us())
+        server.receive(self._pacing.wait(simulation.time_us, sockets, server.receive))
         simulation.tick()
         server.send(simulation.time_us)
         if self._camera is not None:
@@ -102,15 +99,15 @@ class Firmware:
         if self.on_tick is not None:
             self.on_tick(simulation)
 
-    def _receive(self) -> None:
-        self.server.receive(self.clock.time_us())
-
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
         if self.simulation is None:
             return
-        lateness = self._pacing.take_lateness()
-        self.simulation.save(path, {"tick/lateness_us": np.asarray(lateness, np.int64)})
+        pacing = self._pacing
+        self.simulation.save(
+            path,
+            {"tick/lateness_us": pacing.take_lateness(), "tick/slips_us": pacing.take_slips()},
+        )
         self._close_tlog()
 
     def _close_tlog(self) -> None:

@@ -39,12 +39,19 @@ class Pacing(Protocol):
         """Say that simulated `tick_us` is now: what came before took time of no episode."""
         ...
 
-    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
-        """Return when simulated `tick_us` is due; call `readable` when a socket talks before."""
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
+        """Wait until simulated `tick_us` is due and return the time then [µs].
+
+        When a socket talks before, `readable` is called with the time of that.
+        """
         ...
 
     def take_lateness(self) -> NDArray[np.int64]:
         """Return how late each tick began since the last call [µs of simulated time]."""
+        ...
+
+    def take_slips(self) -> NDArray[np.int64]:
+        """Return (k, 2) since the last call: the tick at which, and how much was given up [µs]."""
         ...
 
 
@@ -56,6 +63,8 @@ class WallPacing:
         self.clock = WallClock(speed)
         self.slipped_us = 0
         self._lateness: list[int] = []
+        self._slips: list[tuple[int, int]] = []
+        self._stamp_us = 0
 
     @property
     def epoch_ns(self) -> int:
@@ -68,30 +77,51 @@ class WallPacing:
         if behind_us > 0:
             self.clock.slip(behind_us)
         self._lateness.clear()
+        self._slips.clear()
+        self._stamp_us = 0
 
-    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
-        """Return at the wall time of simulated `tick_us`.
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
+        """Wait until the wall time of simulated `tick_us`; return the time then [µs].
 
         What arrives early is handled at once, stamped with its own time, and waits for the tick.
+        Every time handed out is read once and checked for lag first: a process that was stopped
+        while it waited must not stamp what has arrived with a time that is about to be given up.
         """
         clock = self.clock
         while (wait_s := clock.wall_seconds_until(tick_us)) > 0.0:
             timeout = max(0.0, wait_s - SPIN_US * 1e-6)
             ready, _, _ = select.select(sockets, [], [], timeout)
+            now_us = clock.time_us()
+            if now_us - tick_us > MAX_LAG_US:
+                break
             if ready:
-                readable()
-        late_us = clock.time_us() - tick_us
+                readable(self._stamp(now_us))
+        now_us = clock.time_us()
+        late_us = now_us - tick_us
         if late_us > MAX_LAG_US:
             clock.slip(late_us)
             self.slipped_us += late_us
-            late_us = 0
+            self._slips.append((tick_us, late_us))
+            now_us, late_us = tick_us, 0
         self._lateness.append(late_us)
+        return self._stamp(now_us)
+
+    def _stamp(self, now_us: int) -> int:
+        """Return a time that never goes back."""
+        self._stamp_us = max(self._stamp_us, now_us)
+        return self._stamp_us
 
     def take_lateness(self) -> NDArray[np.int64]:
         """Return how late each tick began since the last call [µs of simulated time]."""
         lateness = np.array(self._lateness, np.int64)
         self._lateness.clear()
         return lateness
+
+    def take_slips(self) -> NDArray[np.int64]:
+        """Return (k, 2) since the last call: the tick at which, and how much was given up [µs]."""
+        slips = np.array(self._slips, np.int64).reshape(-1, 2)
+        self._slips.clear()
+        return slips
 
 
 class Unpaced:
@@ -107,11 +137,16 @@ class Unpaced:
         """Set the clock to `tick_us`."""
         self.clock.sleep_until(tick_us)
 
-    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[], None]) -> None:
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Set the clock to `tick_us`; sockets are read once a tick by the caller anyway."""
         del sockets, readable
         self.clock.sleep_until(tick_us)
+        return tick_us
 
     def take_lateness(self) -> NDArray[np.int64]:
         """Return nothing: no tick is late."""
         return np.zeros(0, np.int64)
+
+    def take_slips(self) -> NDArray[np.int64]:
+        """Return nothing: no time is given up."""
+        return np.zeros((0, 2), np.int64)

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from airl_mav.errors import UsageError
+from airl_mav.ports import Ports
+
+if TYPE_CHECKING:  # The companion shares this module, and not the simulator.
+    from firmware_sim.plant.wind import WindSettings
 
 EXIT_BROKEN = 1
 """The run could not be finished: a process died."""
@@ -17,6 +22,48 @@ EXIT_USAGE = 2
 
 EXIT_INTERRUPTED = 130
 """Ctrl-C (128 + SIGINT)."""
+
+
+GREATEST_SEED = 2**31
+GREATEST_PORT = 65_535
+
+
+def check_range(option: str, value: float, low: float, high: float) -> None:
+    """Raise UsageError unless low <= value <= high; NaN is outside."""
+    if not low <= value <= high:
+        raise UsageError(f"{option} {value:.10g}: accepted: {low:g} <= value <= {high:.10g}")
+
+
+def check_ports(ports: Ports, *, free: bool) -> None:
+    """Check the port numbers.
+
+    Args:
+        ports: What was asked for.
+        free: Whether the camera's port may be 0, any free one.
+
+    Raises:
+        UsageError: A number is no port; libzmq would cut it to 16 bits without a word.
+    """
+    for option, value, low in (
+        ("--api-port", ports.api_port, 1),
+        ("--api-local-port", ports.api_local_port, 0),
+        ("--gcs-port", ports.gcs_port, 1),
+        ("--gcs-local-port", ports.gcs_local_port, 0),
+        ("--camera-port", ports.camera_port, 0 if free else 1),
+    ):
+        check_range(option, value, low, GREATEST_PORT)
+    if ports.api_port == ports.gcs_port:
+        raise UsageError(
+            f"--gcs-port {ports.gcs_port}: accepted: another than --api-port {ports.api_port}"
+        )
+
+
+def check_wind(wind: WindSettings) -> None:
+    """Raise UsageError for wind that is none."""
+    check_range("--wind.north-m-s", wind.north_m_s, -50.0, 50.0)
+    check_range("--wind.east-m-s", wind.east_m_s, -50.0, 50.0)
+    check_range("--wind.gust-m-s", wind.gust_m_s, 0.0, 50.0)
+    check_range("--wind.gust-time-s", wind.gust_time_s, 0.01, 1000.0)
 
 
 def run_command(command: Callable[[], int]) -> None:

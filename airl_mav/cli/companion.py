@@ -6,6 +6,8 @@ import os
 import queue
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,10 +25,17 @@ from airl_mav.channel import (
     Fly,
     Progress,
     Ready,
-    Resync,
     Shutdown,
 )
-from airl_mav.cli.common import EXIT_BROKEN, EXIT_USAGE, run_command
+from airl_mav.cli.common import (
+    EXIT_BROKEN,
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
+    GREATEST_PORT,
+    GREATEST_SEED,
+    check_range,
+    run_command,
+)
 from airl_mav.clock import Clock, WallClock
 from airl_mav.errors import UsageError
 from airl_mav.latency.injection import choose_injection
@@ -90,6 +99,61 @@ def main() -> None:
     run_command(lambda: serve(command) if command.control else stand_alone(command))
 
 
+def check(command: CompanionCommand) -> None:
+    """Check everything that can be wrong before a connection is opened. Raises UsageError."""
+    check_range("--speed", command.speed, 0.1, 100.0)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_range("--connect-timeout", command.connect_timeout, 0.1, 3600.0)
+    for metres in command.goal:
+        check_range("--goal", metres, -10_000.0, 10_000.0)
+    pilot = command.pilot
+    check_range("--goal-radius-m", pilot.goal_radius_m, 0.1, 50.0)
+    check_range("--altitude-m", pilot.altitude_m, 0.5, 100.0)
+    check_range("--max-speed-m-s", pilot.max_speed_m_s, 0.1, 30.0)
+    check_holding("--hold-s", pilot.hold_s, command.watchdog)
+    if command.log is not None and not command.log.parent.is_dir():
+        raise UsageError(f"--log {command.log}: no folder {command.log.parent}")
+    sampler(command, command.seed)
+
+
+def check_holding(option: str, hold_s: float, watchdog: WatchdogSettings) -> None:
+    """Check the hold time and the watchdog's bounds against each other. Raises UsageError."""
+    check_range(option, hold_s, 0.0, 10.0)
+    check_range("--decision-timeout-s", watchdog.decision_timeout_s, 0.1, 60.0)
+    check_range("--leave-after-s", watchdog.leave_after_s, 0.1, 60.0)
+    if watchdog.hover_after_s is not None:
+        check_range("--hover-after-s", watchdog.hover_after_s, 0.0, 60.0)
+    if watchdog.decision_timeout_s <= hold_s:
+        raise UsageError(
+            f"--decision-timeout-s {watchdog.decision_timeout_s:g}: accepted: more than "
+            f"{option} {hold_s:g}, or every decision is overdue"
+        )
+
+
+@contextmanager
+def opened(
+    command: CompanionCommand, clock: Clock, abandon: threading.Event
+) -> Iterator[tuple[MavsdkLink, ZmqFrameSource]]:
+    """Open link and camera for a while. Raises UsageError for an address that is none."""
+    with (
+        closing(open_camera(command.camera, clock)) as frames,
+        closing(MavsdkLink(command.connect, clock, abandon)) as link,
+    ):
+        yield link, frames
+
+
+def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
+    """Connect to the camera. Raises UsageError for an address that is none."""
+    port = endpoint.rpartition(":")[2]
+    # libzmq would cut the number to 16 bits without a word.
+    if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
+        raise UsageError(f"--camera {endpoint}: accepted: tcp://HOST:PORT, port 1..{GREATEST_PORT}")
+    try:
+        return ZmqFrameSource(endpoint, clock)
+    except ValueError as error:
+        raise UsageError(f"--camera: {error}") from None
+
+
 def sampler(command: CompanionCommand, seed: int) -> LatencySampler | None:
     """Return where t2 is drawn from. Raises UsageError for an unknown computer or workload."""
     injection = choose_injection(load_computer(command.computer), command.workload)
@@ -98,6 +162,7 @@ def sampler(command: CompanionCommand, seed: int) -> LatencySampler | None:
 
 def stand_alone(command: CompanionCommand) -> int:
     """Fly one mission."""
+    check(command)
     console = Console()
     clock = WallClock(command.speed)
     stop, abandon = threading.Event(), threading.Event()
@@ -105,35 +170,33 @@ def stand_alone(command: CompanionCommand) -> int:
         signal.signal(number, lambda *_: stop.set())
     policy = load_policy(command.policy, command.pilot.hold_s)
     latency = sampler(command, command.seed)
-    link = MavsdkLink(command.connect, clock, abandon)
-    frames = ZmqFrameSource(command.camera, clock)
     try:
-        link.connect(command.connect_timeout)
-        result = fly_mission(
-            link,
-            frames,
-            policy,
-            command.goal,
-            clock,
-            stop,
-            abandon,
-            lambda phase: console.print(f"{clock.time_us() / 1e6:8.2f} s  {phase}"),
-            pilot_settings=command.pilot,
-            watchdog_settings=command.watchdog,
-            latency=latency,
-        )
+        with opened(command, clock, abandon) as (link, frames):
+            link.connect(command.connect_timeout, stop)
+            result = fly_mission(
+                link,
+                frames,
+                policy,
+                command.goal,
+                clock,
+                stop,
+                abandon,
+                lambda phase: console.print(f"{clock.time_us() / 1e6:8.2f} s  {phase}"),
+                pilot_settings=command.pilot,
+                watchdog_settings=command.watchdog,
+                latency=latency,
+            )
     except LinkError as error:
         console.print(f"error: {error}", style="red", markup=False)
-        return EXIT_BROKEN
-    finally:
-        frames.close()
-        link.close()
+        return EXIT_INTERRUPTED if stop.is_set() else EXIT_BROKEN
     if command.log is not None:
         save_arrays(command.log, result.log.columns())
     for note in result.notes:
         console.print(note, style="yellow", markup=False)
     console.print(f"{result.reason}; {len(result.log)} decisions")
-    return 0 if result.reason == "goal reached" else EXIT_BROKEN
+    if result.reason == "goal reached":
+        return 0
+    return EXIT_INTERRUPTED if stop.is_set() else EXIT_BROKEN
 
 
 def serve(command: CompanionCommand) -> int:
@@ -142,55 +205,54 @@ def serve(command: CompanionCommand) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     requests: queue.Queue[Any] = queue.Queue()
     stop, abandon = threading.Event(), threading.Event()
+    try:
+        check(command)
+    except UsageError as error:
+        channel.send(Failed(message=str(error)))
+        return EXIT_USAGE
     clock = WallClock(command.speed)
 
     def handle(request: Any) -> None:
-        if isinstance(request, Fly | Resync) and request.epoch_ns is not None:
-            clock.epoch_ns = request.epoch_ns
         if isinstance(request, Abort):
             (stop if request.land else abandon).set()
             stop.set()
-        elif isinstance(request, Fly):
+            return
+        if isinstance(request, Fly):
             stop.clear()
             abandon.clear()
-        if isinstance(request, Fly | Shutdown):
-            requests.put(request)
+            # Shared for one flight, then left alone: what lasts a while (holding an action, the
+            # watchdog) must not jump when the simulator gives up time. The harness corrects the
+            # stamps afterwards.
+            clock.epoch_ns = clock.epoch_ns if request.epoch_ns is None else request.epoch_ns
+        requests.put(request)
 
     # Without its harness a companion has no business in the air, whatever it is doing: its
     # setpoints end and the flight controller's offboard-loss failsafe takes over.
     channel.listen(handle, lambda: os._exit(EXIT_BROKEN))
     try:
         policy = load_policy(command.policy, command.pilot.hold_s)
-        sampler(command, command.seed)
-        link = MavsdkLink(command.connect, clock, abandon)
-        frames = ZmqFrameSource(command.camera, clock)
-        channel.send(Ready())
-    except UsageError as error:
+        with opened(command, clock, abandon) as (link, frames):
+            channel.send(Ready())
+            while not isinstance(request := requests.get(), Shutdown):
+                if not link.connected:
+                    link.connect(command.connect_timeout)
+                result = fly_mission(
+                    link,
+                    frames,
+                    policy,
+                    request.goal,
+                    clock,
+                    stop,
+                    abandon,
+                    _announce(channel, clock),
+                    pilot_settings=command.pilot,
+                    watchdog_settings=command.watchdog,
+                    latency=sampler(command, request.latency_seed),
+                )
+                channel.send(_ended(result, request))
+    except (UsageError, LinkError) as error:
         channel.send(Failed(message=str(error)))
-        return EXIT_USAGE
-    while not isinstance(request := requests.get(), Shutdown):
-        try:
-            if not link.connected:
-                link.connect(command.connect_timeout)
-        except LinkError as error:
-            channel.send(Failed(message=str(error)))
-            return EXIT_BROKEN
-        result = fly_mission(
-            link,
-            frames,
-            policy,
-            request.goal,
-            clock,
-            stop,
-            abandon,
-            _announce(channel, clock),
-            pilot_settings=command.pilot,
-            watchdog_settings=command.watchdog,
-            latency=sampler(command, request.latency_seed),
-        )
-        channel.send(_ended(result, request))
-    frames.close()
-    link.close()
+        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_BROKEN
     return 0
 
 

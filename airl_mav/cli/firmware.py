@@ -29,7 +29,14 @@ from airl_mav.channel import (
     State,
     Text,
 )
-from airl_mav.cli.common import EXIT_USAGE, run_command
+from airl_mav.cli.common import (
+    EXIT_USAGE,
+    GREATEST_SEED,
+    check_ports,
+    check_range,
+    check_wind,
+    run_command,
+)
 from airl_mav.clock import WallClock, utc_now
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
@@ -104,8 +111,15 @@ def build(command: FirmwareCommand) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
     Raises:
-        UsageError: A port is taken, an address unusable, the speed not positive.
+        UsageError: An option is out of range, a port taken, an address unusable.
     """
+    check_ports(command.ports, free=True)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    if command.duration is not None:
+        check_range("--duration", command.duration, 0.0, 1e6)
+    check_wind(command.wind)
+    if command.tlog is not None and not command.tlog.parent.is_dir():
+        raise UsageError(f"--tlog {command.tlog}: no folder {command.tlog.parent}")
     pacing = pacing_of(command.speed)
     ports = command.ports
     server = px4_server(
@@ -158,12 +172,15 @@ def stand_alone(command: FirmwareCommand) -> int:
     """Fly whatever the clients ask for, until Ctrl-C."""
     console = Console()
     vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
-    episode = setup(command, vehicle, command.arena, command.seed, command.seed)
     firmware = build(command)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    firmware.on_message = lambda m: console.print(
+        f"[{m.severity.name.lower()}] {m.text}", markup=False
+    )
     try:
+        episode = setup(command, vehicle, command.arena, command.seed, command.seed)
         warm_up(vehicle)
         firmware.load(episode, command.tlog, unix_us())
         arena: Arena | None = episode.arena
@@ -177,9 +194,6 @@ def stand_alone(command: FirmwareCommand) -> int:
                 f"goal              {arena.goal[0]:.1f} {arena.goal[1]:.1f} (north east, m)"
             )
         console.print("Ctrl-C ends it.")
-        firmware.on_message = lambda m: console.print(
-            f"[{m.severity.name.lower()}] {m.text}", markup=False
-        )
         fly(firmware, stop, command.duration, console)
     finally:
         firmware.close()
@@ -189,18 +203,24 @@ def stand_alone(command: FirmwareCommand) -> int:
 def fly(
     firmware: Firmware, stop: threading.Event, duration_s: float | None, console: Console
 ) -> None:
-    """Run ticks until told to stop, or for a duration of simulated time [s]; say how fast."""
+    """Run ticks until told to stop, or for a duration of simulated time [s]; say how it went."""
     start_us, stopwatch = firmware.clock.time_us(), WallClock()
     end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)
     while not stop.is_set() and (end_us is None or firmware.clock.time_us() < end_us):
         firmware.step()
-    flown_s, wall_s = (
-        (firmware.clock.time_us() - start_us) / US_PER_S,
-        stopwatch.time_us() / US_PER_S,
-    )
+    flown_s = (firmware.clock.time_us() - start_us) / US_PER_S
+    wall_s = max(stopwatch.time_us(), 1) / US_PER_S
     console.print(
         f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time"
     )
+    if firmware.slipped_us:
+        given_up_s = firmware.slipped_us / US_PER_S
+        console.print(f"{given_up_s:.2f} s given up: this host could not keep up", style="yellow")
+    for name, link in firmware.server.counters().items():
+        console.print(
+            f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
+            f"sent {link.tx}, not sent {link.send_errors}"
+        )
 
 
 def serve(command: FirmwareCommand) -> int:
@@ -276,6 +296,7 @@ class _Service:
                 episode=request.episode,
                 time_us=loaded.time_us,
                 epoch_ns=loaded.epoch_ns,
+                slipped_us=self._firmware.slipped_us,
                 goal=(float(goal[0]), float(goal[1])),
             )
         )
@@ -305,7 +326,6 @@ class _Service:
                 armed=flight.phase >= Phase.GROUND,
                 landed=flight.phase < Phase.AIR,
                 slipped_us=self._firmware.slipped_us,
-                epoch_ns=self._firmware.epoch_ns,
             )
         )
 

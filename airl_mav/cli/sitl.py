@@ -10,7 +10,17 @@ from typing import NoReturn
 import tyro
 from rich.console import Console
 
-from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, run_command
+from airl_mav.arena.generate import generate
+from airl_mav.cli.common import (
+    EXIT_BROKEN,
+    EXIT_INTERRUPTED,
+    GREATEST_SEED,
+    check_ports,
+    check_range,
+    check_wind,
+    run_command,
+)
+from airl_mav.cli.companion import check_holding
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
@@ -32,6 +42,11 @@ from firmware_sim.plant.wind import WindSettings
 ARRIVAL_SHARE = 0.8
 """The companion flies to this share of the goal radius: it knows its place only by estimate, while
 the referee measures the true one."""
+
+
+SLOWEST, FASTEST = 0.5, 10.0
+"""Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
+(1 Hz of simulated time, 3 s allowed); faster, its 20 Hz of setpoints come near offboard loss."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +76,7 @@ class SitlCommand:
     """Seed; episode i uses seed + i for arena, sensors, wind and latency."""
 
     speed: float = 1.0
-    """Simulated seconds per wall second, > 0. Latencies count in simulated time."""
+    """Simulated seconds per wall second, 0.5 to 10. Latencies count in simulated time."""
 
     goal_radius: float = GOAL_RADIUS_M
     """The goal is reached closer than this, seen from above, m."""
@@ -109,6 +124,7 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
     """
     console = console or Console()
     setup = check(command)
+    signal.signal(signal.SIGTERM, _interrupt)
     folder = RunFolder.create(
         command.out,
         f"sitl-{command.policy}",
@@ -116,7 +132,6 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
         setup=setup,
         seeds=[command.seed + i for i in range(command.episodes)],
     )
-    signal.signal(signal.SIGTERM, _interrupt)
     console.print(f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {command.policy}")
     console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
     console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
@@ -131,6 +146,9 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
         except KeyboardInterrupt:
             console.print("interrupted: what was flown is kept", style="yellow")
             code = EXIT_INTERRUPTED
+        except UsageError:
+            folder.discard()
+            raise
         finally:
             folder.sweep()
     conclude(folder, console)
@@ -146,15 +164,19 @@ def check(command: SitlCommand) -> Setup:
     Raises:
         UsageError: Names the option, its value and what is accepted.
     """
-    _in_range("--episodes", command.episodes, 1, 100_000)
-    _in_range("--seed", command.seed, 0, 2**31)
-    _in_range("--speed", command.speed, 0.01, 20.0)
-    _in_range("--goal-radius", command.goal_radius, 0.2, 50.0)
-    _in_range("--time-limit", command.time_limit, 1.0, 3600.0)
-    _in_range("--hold", command.hold, 0.0, 10.0)
-    _in_range("--altitude", command.altitude, 0.5, 100.0)
+    check_range("--episodes", command.episodes, 1, 100_000)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_range("--speed", command.speed, SLOWEST, FASTEST)
+    check_range("--goal-radius", command.goal_radius, 0.2, 50.0)
+    check_range("--time-limit", command.time_limit, 1.0, 3600.0)
+    check_range("--altitude", command.altitude, 0.5, 100.0)
+    check_holding("--hold", command.hold, command.watchdog)
+    check_wind(command.wind)
+    # The companion connects to the camera by its number: it cannot be "any free one" here.
+    check_ports(command.ports, free=False)
     vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
     arena = load_profile("arenas", command.arena, ArenaSpec)
+    generate(arena, command.seed, name=command.arena, vehicle_width_m=vehicle.body.width_m)
     computer = load_computer(command.computer)
     injection = choose_injection(computer, command.workload)
     hover_s = command.watchdog.hover_after_s
@@ -171,11 +193,6 @@ def check(command: SitlCommand) -> Setup:
     )
 
 
-def _in_range(option: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise UsageError(f"{option} {value:g}: accepted: {low:g} <= value <= {high:g}")
-
-
 def plan(command: SitlCommand, setup: Setup) -> Plan:
     """Turn the command into the arguments of the two processes."""
     ports, wind, watchdog = command.ports, command.wind, command.watchdog
@@ -183,8 +200,9 @@ def plan(command: SitlCommand, setup: Setup) -> Plan:
         *("--control", "stdio"),
         *("--vehicle", command.vehicle),
         *("--speed", f"{command.speed!r}"),
-        *("--wind.north-m-s", f"{wind.north_m_s!r}", "--wind.east-m-s", f"{wind.east_m_s!r}"),
-        *("--wind.gust-m-s", f"{wind.gust_m_s!r}", "--wind.gust-time-s", f"{wind.gust_time_s!r}"),
+        # One word each: -1e-05 by itself would be taken for an option.
+        *(f"--wind.north-m-s={wind.north_m_s!r}", f"--wind.east-m-s={wind.east_m_s!r}"),
+        *(f"--wind.gust-m-s={wind.gust_m_s!r}", f"--wind.gust-time-s={wind.gust_time_s!r}"),
         *("--api-port", f"{ports.api_port}", "--api-local-port", f"{ports.api_local_port}"),
         *("--gcs-port", f"{ports.gcs_port}", "--gcs-local-port", f"{ports.gcs_local_port}"),
         *("--camera-port", f"{ports.camera_port}"),

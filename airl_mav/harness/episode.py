@@ -18,7 +18,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.run_folder import TICK_LATENESS, RunFolder
 from airl_mav.latency.matching import match_setpoints, stamps_of
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import STAMPS
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,15 @@ class Episode:
     """Wall time from the reset to the verdict."""
     state: State | None = None
     verdict_state: State | None = None
+    called_off: bool = False
+    """The companion has been told to end the mission."""
     ended: Ended | None = None
-    first_slipped_us: int = 0
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def slipped_us(self) -> int:
+        """Simulated time given up so far [µs]."""
+        return 0 if self.state is None else self.state.slipped_us - self.loaded.slipped_us
 
 
 def save_episode(
@@ -79,7 +85,9 @@ def save_episode(
     latency = _part(arrays, "estimate", keep_prefix=True)
     latency[TICK_LATENESS] = arrays["tick/lateness_us"]
     if decisions_path.exists():
-        latency |= join_stamps(_read(decisions_path), _part(arrays, "setpoints"))
+        latency |= join_stamps(
+            _read(decisions_path), _part(arrays, "setpoints"), arrays["tick/slips_us"]
+        )
     record = _record(episode, plan, trajectory)
     folder.save_episode(record, trajectory, latency)
     record_path.unlink()
@@ -110,32 +118,56 @@ def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeReco
         navigation_us=referee.navigation_us,
         ended_us=verdict.time_us,
         wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
-        slipped_us=state.slipped_us - episode.first_slipped_us if state else 0,
+        slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,
         quality=quality,
         notes=tuple(episode.notes),
     )
 
 
+COMPANION_STAMPS = tuple(name for name in STAMPS if name != "capture_us")
+"""Stamps by the companion's clock; the exposure of a frame is by the simulator's."""
+
+
 def join_stamps(
-    decisions: dict[str, NDArray[Any]], setpoints: dict[str, NDArray[Any]]
+    decisions: dict[str, NDArray[Any]],
+    setpoints: dict[str, NDArray[Any]],
+    slips: NDArray[np.int64],
 ) -> dict[str, NDArray[Any]]:
     """Return the decision log with the times at which the autopilot accepted and applied each.
 
-    Where the host could not keep up, simulated time was set back to the tick that was due: a
-    decision across such a moment has no interval that means anything, and gets no stamps here.
+    Args:
+        decisions: The companion's log, by column.
+        setpoints: The firmware's log, by column.
+        slips: (k, 2) ticks at which simulated time was given up, and how much [µs].
     """
-    sent, accepted = decisions["sent_us"], setpoints["accepted_us"]
+    by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
     index = match_setpoints(
-        np.maximum.accumulate(sent),
+        by_simulator["sent_us"],
         decisions["setpoint"],
-        np.maximum.accumulate(accepted),
+        setpoints["accepted_us"],
         setpoints["setpoint"],
     )
-    accepted_us, motor_us = stamps_of(index, accepted), stamps_of(index, setpoints["motor_us"])
-    broken = (accepted_us < sent) | (motor_us < accepted_us)
-    accepted_us[broken] = motor_us[broken] = NO_STAMP
-    return {**decisions, "accepted_us": accepted_us, "motor_us": motor_us}
+    return {
+        **decisions,
+        **by_simulator,
+        "accepted_us": stamps_of(index, setpoints["accepted_us"]),
+        "motor_us": stamps_of(index, setpoints["motor_us"]),
+    }
+
+
+def without_slips(times_us: NDArray[np.int64], slips: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return times (n,) of a clock that ran on as the simulator's clock tells them [µs].
+
+    Both agreed at the start of the episode. Each slip set the simulator's clock back to the tick
+    that was due: what happened while it stood still happened at that tick.
+    """
+    told = times_us.copy()
+    given_up_us = 0
+    for tick_us, lost_us in slips:
+        told -= np.clip(times_us - (tick_us + given_up_us), 0, lost_us)
+        given_up_us += lost_us
+    return told
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]]:

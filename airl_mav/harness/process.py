@@ -104,6 +104,11 @@ class Child:
                 continue
         self._reader.join(GRACE_S)
 
+    def kill(self) -> None:
+        """End it at once; does not wait."""
+        self.ending = True
+        self._process.kill()
+
     def log_tail(self) -> str:
         """Return the last lines of its log."""
         try:

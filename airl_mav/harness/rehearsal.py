@@ -18,7 +18,6 @@ from airl_mav.channel import (
     LoadEpisode,
     Progress,
     Ready,
-    Resync,
     Saved,
     State,
     Text,
@@ -45,6 +44,11 @@ WRAP_UP_S = 90.0
 
 TAKEOFF_LIMIT_S = 90.0
 """Longest time from the reset to the start of navigation [simulated s]."""
+
+
+ARRIVAL_S = 10.0
+"""Longest time from the goal's edge to where the companion thinks the goal is [simulated s];
+then it is told to land where it is."""
 
 
 class RehearsalError(Exception):
@@ -121,16 +125,23 @@ class Rehearsal:
         self._stop_children()
 
     def _stop_children(self) -> None:
-        # The companion first: what it commands last is part of the flight.
-        for name in (COMPANION, FIRMWARE):
-            if name in self._children:
-                self._children[name].stop()
+        try:
+            # The companion first: what it commands last is part of the flight.
+            for name in (COMPANION, FIRMWARE):
+                if name in self._children:
+                    self._children[name].stop()
+        except BaseException:
+            # A second Ctrl-C: no more patience, but nobody is left behind.
+            for child in self._children.values():
+                child.kill()
+            raise
 
     def run(self) -> None:
         """Fly all episodes; each is saved as it ends.
 
         Raises:
-            RehearsalError: A process died. The running episode is saved as aborted.
+            RehearsalError: A process died. The running episode is saved as aborted, unless it was
+                the firmware, which holds its data.
         """
         for index in range(self._plan.episodes):
             self._fly(index)
@@ -177,8 +188,12 @@ class Rehearsal:
             self._judge(episode, episode.referee.abort(now_us, str(error)))
             if not self._firmware_lives():
                 raise
-            # The firmware still flies: see the failsafe through, then keep the data.
+            # The firmware still flies. Whatever is wrong with the companion, its setpoints end
+            # here; see the failsafe through, then keep the data.
+            self._children[COMPANION].stop()
             self._watch_failsafe(episode)
+            if not self._firmware_lives():
+                raise
         self._children[FIRMWARE].send(FinishEpisode())
         self._wait_for(Saved, REPLY_TIMEOUT_S)
         self._save(episode, record_path, decisions_path)
@@ -193,7 +208,8 @@ class Rehearsal:
         elif isinstance(event, Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
-                referee.start_navigation(event.time_us)
+                # By the companion's clock, which has not given up what the simulator's has.
+                referee.start_navigation(event.time_us - episode.slipped_us)
         elif isinstance(event, Text):
             self._observer.text(event)
         elif isinstance(event, Ended):
@@ -207,13 +223,12 @@ class Rehearsal:
 
     def _see(self, episode: Episode, state: State) -> None:
         referee = episode.referee
-        if episode.state is None:
-            episode.first_slipped_us = state.slipped_us
-        if episode.state is not None and state.slipped_us != episode.state.slipped_us:
-            self._children[COMPANION].send(Resync(epoch_ns=state.epoch_ns))
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         if referee.verdict is not None:
+            late_us = state.time_us - referee.verdict.time_us
+            if not episode.called_off and late_us > ARRIVAL_S * US_PER_S:
+                self._call_off(episode, land=state.collision is None)
             return
         verdict = referee.observe(
             TruthSample(state.time_us, state.position, state.collision, state.battery)
@@ -226,7 +241,11 @@ class Rehearsal:
             self._judge(episode, verdict)
             if verdict.outcome is not Outcome.SUCCESS:
                 crashed = verdict.outcome in (Outcome.COLLISION, Outcome.BATTERY)
-                self._children[COMPANION].send(Abort(land=not crashed))
+                self._call_off(episode, land=not crashed)
+
+    def _call_off(self, episode: Episode, *, land: bool) -> None:
+        episode.called_off = True
+        self._children[COMPANION].send(Abort(land=land))
 
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
@@ -296,6 +315,7 @@ class Rehearsal:
             elif take(name, event):
                 return
             elif isinstance(event, Failed):
+                self._children[name].ending = True
                 raise RehearsalError(f"{name}: {event.message}")
 
     def _died(self, name: str, exited: Exited) -> None:

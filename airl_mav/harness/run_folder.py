@@ -10,6 +10,7 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,8 @@ RUN_FILE = "run.json"
 EPISODES_FILE = "episodes.jsonl"
 LATENCY_FILE = "latency.npz"
 TRAJECTORIES_FILE = "trajectories.npz"
+LOG_FILES = ("firmware.log", "companion.log")
+"""What the processes have to say to people: empty when all is well."""
 
 TICK_LATENESS = "tick_lateness_us"
 """Name of the array of a paced run that says how late each tick began [µs]."""
@@ -145,9 +148,22 @@ class RunFolder:
         return self.path / f"flight-{index:03d}.tlog"
 
     def sweep(self) -> None:
-        """Remove what processes left behind for an episode that was never finished."""
-        for leftover in self.path.glob(".*.npz*"):
-            leftover.unlink()
+        """Remove what processes left behind for an episode that was never finished.
+
+        The MAVLink log of a killed firmware is kept: whole records, up to its last second.
+        """
+        for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
+            for leftover in self.path.glob(pattern):
+                leftover.unlink()
+        for log in self.path.glob("flight-*.tlog.part"):
+            log.rename(log.with_suffix(""))
+
+    def discard(self) -> None:
+        """Take back a run that never began, so that the same folder can be used again."""
+        for name in (RUN_FILE, *LOG_FILES):
+            (self.path / name).unlink(missing_ok=True)
+        with suppress(OSError):  # Somebody else's files.
+            self.path.rmdir()
 
     def save_episode(
         self, record: EpisodeRecord, trajectory: Trajectory, latency: Mapping[str, NDArray[Any]]

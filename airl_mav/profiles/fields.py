@@ -36,9 +36,12 @@ def quantity(
         lt: Value that it must stay below.
         default: Value when the file leaves it out; none means that it is required.
     """
+    scalar = any(bound is not None for bound in (ge, gt, le, lt))
     return Field(
         default=default,
         description=description,
+        # Strict, or true and "1.5" would pass for numbers; a tuple in strict mode refuses lists.
+        strict=True if scalar else None,
         ge=ge,
         gt=gt,
         le=le,

@@ -89,7 +89,10 @@ class BuiltinAutopilot:
         if self._home is None and self._estimator.origin is not None:
             self._set_home(estimate)
         self._handle(Event.READY if estimate.healthy else Event.NOT_READY)
-        for due in self._watch.events(self._flight, sample.time_us, sample.battery.remaining):
+        idle = self._output is _IDLE
+        for due in self._watch.events(
+            self._flight, sample.time_us, sample.battery.remaining, idle=idle
+        ):
             if isinstance(due, Message):
                 self._say(due)
             else:
@@ -151,6 +154,7 @@ class BuiltinAutopilot:
             self._guidance.enter(step.flight.mode, self._estimate)
         armed_now = before.phase < Phase.GROUND <= step.flight.phase
         if armed_now and self._estimate is not None:
+            self._watch.armed()
             self._set_home(self._estimate)
             self._guidance.enter(step.flight.mode, self._estimate)
         return step.result
@@ -225,7 +229,7 @@ class BuiltinAutopilot:
         """Make the present position home."""
         if self._estimate is None or self._estimator.origin is None:
             return Result.TEMPORARILY_REJECTED
-        self._home = local_to_geodetic(self._estimate.position, self._estimator.origin)
+        self._set_home(self._estimate)
         return Result.ACCEPTED
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:

@@ -32,7 +32,7 @@ from airl_mav.frames import (
     wrap_pi,
 )
 from airl_mav.kernels import kernel
-from airl_mav.location import MAGNETIC_DECLINATION
+from airl_mav.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.rotation import exponential, multiply, normalize
 from firmware_sim.autopilot.state import Estimate
 from firmware_sim.interfaces import GpsFix, SensorSample
@@ -52,6 +52,14 @@ ALIGN_S = 0.5
 
 GATE = 5.0
 """Innovations beyond this many standard deviations are not fused (EKF2_*_GATE)."""
+
+_north, _east, _down = MAGNETIC_FIELD_NED
+_HEADING_BY_TURN_NED = np.array([-_down * _north, -_down * _east, _north**2 + _east**2]) / (
+    _north**2 + _east**2
+)
+
+BIAS_STEP_S = 0.01
+"""PX4's filter runs at 100 Hz; its bias process noises (EKF2_*_B_NOISE) are per such a step [s]."""
 
 BARO_WALK_M_SQRT_S = 0.01
 """Process noise of the barometer's offset [m/sqrt(s)]."""
@@ -181,8 +189,8 @@ class Estimator:
         q = np.zeros(N_STATES)
         q[VEL] = (value("EKF2_ACC_NOISE") * TICK_S) ** 2
         q[ATT] = (value("EKF2_GYR_NOISE") * TICK_S) ** 2
-        q[GYRO] = (value("EKF2_GYR_B_NOISE") * TICK_S) ** 2
-        q[ACC] = (value("EKF2_ACC_B_NOISE") * TICK_S) ** 2
+        q[GYRO] = value("EKF2_GYR_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
+        q[ACC] = value("EKF2_ACC_B_NOISE") ** 2 * BIAS_STEP_S * TICK_S
         q[BARO] = BARO_WALK_M_SQRT_S**2 * TICK_S
         self.filter.Q = np.diag(q)
 
@@ -256,9 +264,10 @@ class Estimator:
         if abs(pitch) > math.radians(80.0):
             return  # heading is not defined near the vertical
         innovation = np.array([wrap_pi(self._magnetic_heading(mag, roll, pitch) - yaw)])
-        # d yaw / d theta (body axes) = (0, sin roll, cos roll) / cos pitch
+        # The field dips, so a tilt error turns the measured heading: seen from the world's axes,
+        # d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination), 1).
         h = np.zeros((1, N_STATES))
-        h[0, 7], h[0, 8] = math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
+        h[0, ATT] = _HEADING_BY_TURN_NED @ quat_to_matrix(self._q)
         variance = np.array([self._value("EKF2_HEAD_NOISE") ** 2])
         self._ratio[2] = self._fuse("heading", innovation, h, variance)
 

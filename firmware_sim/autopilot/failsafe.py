@@ -36,6 +36,10 @@ class Watch:
         self._battery_level = 0
         self._offboard_lost = False
 
+    def armed(self) -> None:
+        """A flight begins: time on the ground before it does not count."""
+        self._standing_since_us = None
+
     def setpoint(self, time_us: int) -> None:
         """Note a valid offboard setpoint."""
         self._setpoint_us = time_us
@@ -49,11 +53,21 @@ class Watch:
         limit_us = self._value("COM_OF_LOSS_T") * US_PER_S
         return self._setpoint_us is not None and time_us - self._setpoint_us <= limit_us
 
-    def events(self, flight: Flight, time_us: int, battery: float) -> Iterator[Event | Message]:
-        """Yield what has become due at `time_us`; `battery` is the state of charge 0..1."""
+    def events(
+        self, flight: Flight, time_us: int, battery: float, *, idle: bool
+    ) -> Iterator[Event | Message]:
+        """Yield what has become due.
+
+        Args:
+            flight: The commander's state.
+            time_us: Now.
+            battery: State of charge 0..1.
+            idle: Whether the motors stand still: on the ground, time of a take-off's spool-up and
+                ramp is no time of standing.
+        """
         yield from self._offboard(flight, time_us)
-        yield from self._ground(flight, time_us)
-        yield from self._battery(battery)
+        yield from self._ground(flight, time_us, idle)
+        yield from self._battery(flight, battery)
         yield from self._ground_station(time_us)
 
     def _offboard(self, flight: Flight, time_us: int) -> Iterator[Event]:
@@ -68,25 +82,28 @@ class Watch:
             self._offboard_lost = False
             yield Event.SETPOINT_BACK
 
-    def _ground(self, flight: Flight, time_us: int) -> Iterator[Event]:
+    def _ground(self, flight: Flight, time_us: int, idle: bool) -> Iterator[Event]:
         if flight.phase is not Phase.GROUND:
             self._standing_since_us = None
             self._flown = flight.phase is Phase.AIR
             return
-        if self._standing_since_us is None:
+        if self._standing_since_us is None or not idle:
             self._standing_since_us = time_us
         name = "COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT"
         limit_s = self._value(name)
         if limit_s > 0.0 and time_us - self._standing_since_us >= limit_s * US_PER_S:
             yield Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
 
-    def _battery(self, remaining: float) -> Iterator[Event | Message]:
+    def _battery(self, flight: Flight, remaining: float) -> Iterator[Event | Message]:
         limits = [self._value(n) for n in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")]
         level = sum(remaining <= limit for limit in limits)
         if level <= self._battery_level:
             return
         self._battery_level = level
         action = int(self._value("COM_LOW_BAT_ACT"))
+        if flight.phase is Phase.AIR and level >= 2 and action >= 2:
+            # The battery now says where to: setpoints that come back must not take it over.
+            self._offboard_lost = False
         if level == 1:
             yield Message(Severity.WARNING, "Low battery level, return advised")
         elif level == 2:

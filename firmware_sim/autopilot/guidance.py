@@ -47,9 +47,13 @@ class Guidance:
         self._braking = False
         self._return_leg = 0
         self._spool_since_us: int | None = None
-        self._home_down = 0.0
+        self._home = np.zeros(3)
         self.takeoff_altitude_m = 0.0
         """Height above home that a take-off climbs to [m]."""
+
+    @property
+    def _home_down(self) -> float:
+        return float(self._home[2])
 
     def enter(self, mode: Mode, estimate: Estimate) -> None:
         """A new mode begins here and now."""
@@ -62,7 +66,7 @@ class Guidance:
 
     def at_home(self, estimate: Estimate) -> None:
         """Home (the ground under the vehicle at arming) is here."""
-        self._home_down = float(estimate.position[2])
+        self._home = estimate.position.copy()
         self._spool_since_us = None
 
     def wants_to_lift(self, setpoint: Setpoint | None) -> bool:
@@ -151,8 +155,11 @@ class Guidance:
     def _land(self, estimate: Estimate) -> Demand:
         value, anchor = self._value, self._anchor
         height = self._home_down - float(estimate.position[2])
-        slow = height < value("MPC_LAND_ALT2")
-        speed = value("MPC_LAND_SPEED") if slow else value("MPC_Z_V_AUTO_DN")
+        # PX4 slows down linearly between the two heights.
+        heights = (value("MPC_LAND_ALT2"), value("MPC_LAND_ALT1"))
+        speed = float(
+            np.interp(height, heights, (value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")))
+        )
         if float(np.hypot(*estimate.velocity[:2])) > 0.3 and not self._braking:
             # Still moving: stop first, then hold that place while descending.
             anchor.position = estimate.position.copy()
@@ -165,7 +172,7 @@ class Guidance:
         """Climb to RTL_RETURN_ALT, fly home, land."""
         value, anchor = self._value, self._anchor
         height = self._home_down - float(estimate.position[2])
-        away = float(np.hypot(*estimate.position[:2]))
+        away = float(np.hypot(*(estimate.position - self._home)[:2]))
         if self._return_leg == 0:
             target = max(value("RTL_RETURN_ALT"), height)
             if height > target - TAKEOFF_REACHED_M or away < value("NAV_ACC_RAD"):
@@ -178,11 +185,12 @@ class Guidance:
             return Demand((north, east, NAN), (NAN, NAN, speed), anchor.yaw, NAN)
         if self._return_leg == 1:
             if away > 0.5:
-                north, east = (float(c) for c in estimate.position[:2])
+                north, east = (float(c) for c in (estimate.position - self._home)[:2])
                 cruise = min(value("MPC_XY_CRUISE"), value("MPC_XY_P") * away)
                 velocity = (-north / away * cruise, -east / away * cruise, NAN)
                 down = float(anchor.position[2])
                 return Demand((NAN, NAN, down), velocity, anchor.yaw, NAN)
             self._return_leg = 2
-            anchor.position = np.array([0.0, 0.0, float(estimate.position[2])])
+            anchor.position = self._home.copy()
+            self._braking = True  # almost at rest: descend to home itself
         return self._land(estimate)

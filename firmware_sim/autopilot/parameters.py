@@ -89,6 +89,7 @@ SPECS: tuple[Spec, ...] = (
     _s("MC_YAW_WEIGHT", 0.4, 0.1, 1, "", "yaw weight"),
     _s("MC_YR_INT_LIM", 0.3, 0, 10, "", "yaw rate integral limit"),
     _s("MIS_TAKEOFF_ALT", 2.5, 0, 80, "m", "default take-off altitude"),
+    _s("MPC_LAND_ALT1", 10.0, 0, 122, "m", "height below which landing slows down"),
     _s("MPC_LAND_ALT2", 5.0, 1, 10, "m", "height below which landing is slow"),
     _s("MPC_LAND_SPEED", 0.7, 0.6, 10, "m/s", "landing descent rate"),
     _s("MPC_THR_HOVER", 0.5, 0.1, 0.8, "", "hover thrust"),
