@@ -377,6 +377,16 @@ def test_critical_battery_lands() -> None:
         assert rig.truth.position[2] == pytest.approx(REST_DOWN_M, abs=0.01)
 
 
+def test_a_battery_low_before_take_off_acts_in_the_air() -> None:
+    with flight(SEED, parameters={"COM_LOW_BAT_ACT": 2}) as rig:
+        Drain(rig).remaining = 0.06
+        rig.arm()
+        assert rig.ap.takeoff(3.0) is Result.ACCEPTED
+        rig.until(lambda: rig.mode is Mode.LAND, 20.0)
+        rig.until(lambda: rig.ap.flight.phase is Phase.STANDBY, 30.0)
+    assert [text for _, text in rig.texts].count(CRITICAL) == 1
+
+
 def test_critical_battery_returns_then_lands_in_an_emergency() -> None:
     with flight(SEED, parameters={"COM_LOW_BAT_ACT": 3, "RTL_RETURN_ALT": 5.0}) as rig:
         drain = Drain(rig)

@@ -21,6 +21,21 @@ OFFBOARD_LOSS = {
     7: Event.SETPOINT_LOST_DISARM,
 }
 
+BATTERY_TEXT = {
+    1: Message(Severity.WARNING, "Low battery level, return advised"),
+    2: Message(Severity.CRITICAL, "Critical battery level, land now"),
+    3: Message(Severity.EMERGENCY, "Dangerously low battery level! Land immediately!"),
+}
+"""By level: low, critical, emergency."""
+
+BATTERY_ACTION = {
+    (2, 2): Event.BATTERY_LAND,
+    (2, 3): Event.BATTERY_RETURN,
+    (3, 2): Event.BATTERY_LAND,
+    (3, 3): Event.BATTERY_LAND,
+}
+"""By level and COM_LOW_BAT_ACT."""
+
 
 class Watch:
     """Setpoint age, time on the ground, battery, ground station."""
@@ -34,11 +49,14 @@ class Watch:
         self._standing_since_us: int | None = None
         self._flown = False
         self._battery_level = 0
+        self._battery_acted = 0
         self._offboard_lost = False
 
     def armed(self) -> None:
         """A flight begins: time on the ground before it does not count."""
         self._standing_since_us = None
+        # A flight that begins with a low battery is told so by its deeds as well.
+        self._battery_acted = 0
 
     def setpoint(self, time_us: int) -> None:
         """Note a valid offboard setpoint."""
@@ -96,26 +114,18 @@ class Watch:
 
     def _battery(self, flight: Flight, remaining: float) -> Iterator[Event | Message]:
         limits = [self._value(n) for n in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")]
-        level = sum(remaining <= limit for limit in limits)
-        if level <= self._battery_level:
+        level = max(self._battery_level, sum(remaining <= limit for limit in limits))
+        if level > self._battery_level:
+            self._battery_level = level
+            yield BATTERY_TEXT[level]
+        if flight.phase is not Phase.AIR or level <= self._battery_acted:
             return
-        self._battery_level = level
-        action = int(self._value("COM_LOW_BAT_ACT"))
-        if flight.phase is Phase.AIR and level >= 2 and action >= 2:
+        self._battery_acted = level
+        event = BATTERY_ACTION.get((level, int(self._value("COM_LOW_BAT_ACT"))))
+        if event is not None:
             # The battery now says where to: setpoints that come back must not take it over.
             self._offboard_lost = False
-        if level == 1:
-            yield Message(Severity.WARNING, "Low battery level, return advised")
-        elif level == 2:
-            yield Message(Severity.CRITICAL, "Critical battery level, land now")
-            if action == 2:
-                yield Event.BATTERY_LAND
-            elif action == 3:
-                yield Event.BATTERY_RETURN
-        else:
-            yield Message(Severity.EMERGENCY, "Dangerously low battery level! Land immediately!")
-            if action in (2, 3):
-                yield Event.BATTERY_LAND
+            yield event
 
     def _ground_station(self, time_us: int) -> Iterator[Message]:
         if self._gcs_us is None:
