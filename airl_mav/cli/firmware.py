@@ -37,6 +37,7 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
+from airl_mav.cli.vehicle import load_vehicle
 from airl_mav.clock import WallClock, utc_now
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
@@ -171,7 +172,7 @@ def main() -> None:
 def stand_alone(command: FirmwareCommand) -> int:
     """Fly whatever the clients ask for, until Ctrl-C."""
     console = Console()
-    vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+    vehicle = load_vehicle(command.vehicle)
     firmware = build(command)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -231,7 +232,7 @@ def serve(command: FirmwareCommand) -> int:
     requests: queue.Queue[Any] = queue.Queue()
     channel.listen(requests.put, lambda: requests.put(Shutdown()))
     try:
-        vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+        vehicle = load_vehicle(command.vehicle)
         firmware = build(command)
         warm_up(vehicle)
     except UsageError as error:

@@ -21,6 +21,7 @@ from airl_mav.cli.common import (
     run_command,
 )
 from airl_mav.cli.companion import check_holding
+from airl_mav.cli.vehicle import load_vehicle
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
@@ -34,7 +35,6 @@ from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
 from firmware_sim.plant.wind import WindSettings
@@ -174,7 +174,7 @@ def check(command: SitlCommand) -> Setup:
     check_wind(command.wind)
     # The companion connects to the camera by its number: it cannot be "any free one" here.
     check_ports(command.ports, free=False)
-    vehicle = load_profile("vehicles", command.vehicle, VehicleProfile)
+    vehicle = load_vehicle(command.vehicle)
     arena = load_profile("arenas", command.arena, ArenaSpec)
     generate(arena, command.seed, name=command.arena, vehicle_width_m=vehicle.body.width_m)
     computer = load_computer(command.computer)
