@@ -19,6 +19,7 @@ _KERNEL_SOURCES = (
     "airl_mav/arena",
     "airl_mav/camera",
     "airl_mav/control",
+    "airl_mav/envs",
     "airl_mav/vehicle",
     "firmware_sim/autopilot",
     "firmware_sim/plant",

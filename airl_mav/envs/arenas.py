@@ -1,0 +1,103 @@
+"""N arenas as padded arrays: what the fleet kernels collide with and look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.constants import US_PER_S
+from airl_mav.kernels import kernel
+
+
+class ArenaBatch(NamedTuple):
+    """N arenas; obstacle arrays are padded to the greatest number, tours to the longest."""
+
+    bounds: NDArray[np.float64]  # (n, 5) as Bounds.as_array
+    n_obstacles: NDArray[np.int64]  # (n,) static ones first
+    n_static: NDArray[np.int64]  # (n,)
+    shape: NDArray[np.int8]  # (n, m)
+    center: NDArray[np.float64]  # (n, m, 3) NED [m]; moving ones are updated in flight
+    half_size: NDArray[np.float64]  # (n, m, 3) [m]
+    yaw: NDArray[np.float64]  # (n, m) [rad]
+    tour_times_s: NDArray[np.float64]  # (n, movers, k) padded with infinity
+    tour_points: NDArray[np.float64]  # (n, movers, k, 2)
+    tour_period_s: NDArray[np.float64]  # (n, movers)
+    goal: NDArray[np.float64]  # (n, 2) north, east [m]
+
+
+def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
+    """Return room for n arenas of at most so many obstacles, movers and way-points each."""
+    return ArenaBatch(
+        bounds=np.zeros((n, 5)),
+        n_obstacles=np.zeros(n, np.int64),
+        n_static=np.zeros(n, np.int64),
+        shape=np.zeros((n, obstacles), np.int8),
+        center=np.zeros((n, obstacles, 3)),
+        half_size=np.zeros((n, obstacles, 3)),
+        yaw=np.zeros((n, obstacles)),
+        tour_times_s=np.full((n, movers, points), np.inf),
+        tour_points=np.zeros((n, movers, points, 2)),
+        tour_period_s=np.ones((n, movers)),
+        goal=np.zeros((n, 2)),
+    )
+
+
+def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
+    """Return the arenas as one batch, with exactly the room they need."""
+    tours = [tour for arena in arenas for tour in arena.tours]
+    batch = empty_batch(
+        len(arenas),
+        max((len(arena.obstacles) for arena in arenas), default=0),
+        max((len(arena.tours) for arena in arenas), default=0),
+        max((len(tour.times_s) for tour in tours), default=0),
+    )
+    for i, arena in enumerate(arenas):
+        put_arena(batch, i, arena)
+    return batch
+
+
+def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
+    """Write an arena into row i. Raises ValueError when it needs more room than there is."""
+    o = arena.obstacles
+    count, movers = len(o), len(arena.tours)
+    points = max((len(tour.times_s) for tour in arena.tours), default=0)
+    room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
+    if count > room[0] or movers > room[1] or points > room[2]:
+        raise ValueError(f"arena needs {(count, movers, points)}, the batch has room for {room}")
+    batch.bounds[i] = arena.bounds.as_array()
+    batch.n_obstacles[i], batch.n_static[i] = count, arena.n_static
+    batch.shape[i, :count] = o.shape
+    batch.center[i, :count] = o.center
+    batch.half_size[i, :count] = o.half_size
+    batch.yaw[i, :count] = o.yaw
+    batch.goal[i] = arena.goal
+    batch.tour_times_s[i] = np.inf
+    for j, tour in enumerate(arena.tours):
+        k = len(tour.times_s)
+        batch.tour_times_s[i, j, :k] = tour.times_s
+        batch.tour_points[i, j, :k] = tour.points
+        batch.tour_period_s[i, j] = tour.times_s[-1]
+
+
+@kernel
+def move_obstacles(batch: ArenaBatch, i: int, time_us: int) -> None:
+    """Put the moving obstacles of arena i where they are `time_us` after its episode's start.
+
+    The same interpolation as `Arena.centers_at`.
+    """
+    for j in range(batch.n_obstacles[i] - batch.n_static[i]):
+        t = (time_us / US_PER_S) % batch.tour_period_s[i, j]
+        times = batch.tour_times_s[i, j]
+        k = 0
+        while times[k + 1] <= t:
+            k += 1
+        a = (t - times[k]) / (times[k + 1] - times[k])
+        obstacle = batch.n_static[i] + j
+        for axis in range(2):
+            start = batch.tour_points[i, j, k, axis]
+            end = batch.tour_points[i, j, k + 1, axis]
+            batch.center[i, obstacle, axis] = start + a * (end - start)

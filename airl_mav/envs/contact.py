@@ -1,0 +1,79 @@
+"""Does the vehicle touch something? Closed forms, for one vehicle in one arena.
+
+The vehicle is a level disc: as wide as its collision box, that tall. pybullet's plant has the box
+itself, tilted as it flies; the two differ by a few centimetres at a box's corners.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Shape
+from airl_mav.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+
+NOTHING = -1
+FLOOR = -2
+WALL = -3
+
+_BOX = int(Shape.BOX)
+_SPHERE = int(Shape.SPHERE)
+
+
+@kernel
+def touches(
+    position: Vec,
+    radius: float,
+    half_height: float,
+    bounds: NDArray[np.float64],
+    count: int,
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+) -> int:
+    """Return the index of the obstacle that the vehicle overlaps, or FLOOR, WALL, NOTHING.
+
+    Args:
+        position: Vehicle NED [m].
+        radius: Of the vehicle's disc [m].
+        half_height: Of the vehicle's disc [m].
+        bounds: As Bounds.as_array.
+        count: Number of obstacles.
+        shape: (m,).
+        center: (m, 3) NED [m].
+        half_size: (m, 3) [m].
+        yaw: (m,) [rad].
+    """
+    x, y, z = position
+    if z + half_height > 0.0:
+        return FLOOR
+    if z + half_height > -bounds[4] and (
+        x - radius < bounds[0]
+        or x + radius > bounds[1]
+        or y - radius < bounds[2]
+        or y + radius > bounds[3]
+    ):
+        return WALL
+    for i in range(count):
+        dx, dy, dz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
+        hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        gap_z = max(0.0, abs(dz) - half_height - (0.0 if shape[i] == _SPHERE else hz))
+        if shape[i] == _SPHERE:
+            # The nearest point of the disc's rim or face to the centre.
+            gap = max(0.0, math.hypot(dx, dy) - radius)
+            if gap * gap + gap_z * gap_z < hx * hx:
+                return i
+        elif gap_z == 0.0:
+            if shape[i] == _BOX:
+                c, s = math.cos(yaw[i]), math.sin(yaw[i])
+                gx = max(0.0, abs(c * dx + s * dy) - hx)
+                gy = max(0.0, abs(c * dy - s * dx) - hy)
+                if gx * gx + gy * gy < radius * radius:
+                    return i
+            elif math.hypot(dx, dy) < hx + radius:
+                return i
+    return NOTHING
