@@ -61,6 +61,9 @@ def touches(
     for i in range(count):
         dx, dy, dz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
         hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        reach = hx + hy + radius
+        if dx * dx + dy * dy > reach * reach:
+            continue  # far off, which nearly all are: no need for the shape
         gap_z = max(0.0, abs(dz) - half_height - (0.0 if shape[i] == _SPHERE else hz))
         if shape[i] == _SPHERE:
             # The nearest point of the disc's rim or face to the centre.
