@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from typing import Annotated
+
+from pydantic import Field, Strict
 
 from airl_mav.profiles.fields import ProfileModel, quantity
 
@@ -149,6 +151,7 @@ class VehicleProfile(ProfileModel):
     power: Power
     camera: Camera
     sensors: Sensors
-    parameters: dict[str, float | int] = Field(
+    # Strict, or true and "0.5" would pass; a whole number passes for a float.
+    parameters: dict[str, Annotated[float, Strict()]] = Field(
         default_factory=dict, description="PX4-named parameters that differ from the defaults"
     )

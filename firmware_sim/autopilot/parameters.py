@@ -145,6 +145,8 @@ class Parameters:
                     f"parameters.{name} = {value}: accepted: "
                     f"{spec.low:g} <= value <= {spec.high:g} {spec.unit}".rstrip()
                 )
+            if isinstance(spec.default, int) and value != int(value):
+                raise UsageError(f"parameters.{name} = {value}: accepted: a whole number")
             self._values[index] = type(spec.default)(value)
 
     def on_change(self, listener: Callable[[], None]) -> None:
