@@ -92,10 +92,11 @@ class Firmware:
             return
         sockets = server.filenos()
         server.receive(self._pacing.wait(simulation.time_us, sockets, server.receive))
-        simulation.tick()
-        server.send(simulation.time_us)
+        # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
+        simulation.tick()
+        server.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
 

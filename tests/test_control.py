@@ -183,10 +183,12 @@ def test_thrust_axis_and_heading_are_as_asked(thrust, yaw) -> None:
 
 
 @given(triples, angles)
-def test_upside_down_keeps_the_thrust_axis(thrust, yaw) -> None:
+def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust, yaw) -> None:
     assume(thrust[2] > 0.03 * np.linalg.norm(thrust) > 1e-4)
-    up = scipy_of(attitude_setpoint(thrust, yaw)).apply([0.0, 0.0, -1.0])
+    turn = scipy_of(attitude_setpoint(thrust, yaw))
+    up, nose = turn.apply([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     np.testing.assert_allclose(up, np.array(thrust) / np.linalg.norm(thrust), atol=1e-9)
+    assert nose[:2] @ [math.cos(yaw), math.sin(yaw)] > 0.0
 
 
 @given(angles)

@@ -47,7 +47,7 @@ def hover(rig: Rig) -> Hover:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_it_stays_where_it_hovers(seed: int) -> None:
     with flight(seed) as rig:
         flown = hover(rig)

@@ -154,7 +154,7 @@ ESTIMATE, TRUTH = 0, 1
 def test_horizontal_velocity(
     speed: float, latency_up: float, latency_down: float, rise: float, overshoot: float
 ) -> None:
-    up, down = velocity_steps(NORTH, speed, 7.0, range(3))
+    up, down = velocity_steps(NORTH, speed, 6.0, range(2))
     for column in (ESTIMATE, TRUTH):
         for steps, latency in ((up, latency_up), (down, latency_down)):
             found = mean(steps, column, lambda r: r.latency(0.05))
@@ -185,7 +185,7 @@ def yaw_steps(seeds: range) -> list[list[Response]]:
 
 @pytest.mark.slow
 def test_heading() -> None:
-    steps = yaw_steps(range(3))
+    steps = yaw_steps(range(2))
     half_a_degree = math.radians(0.5)
     assert mean(steps, ESTIMATE, lambda r: r.latency(half_a_degree)) == pytest.approx(
         0.100, rel=TOLERANCE

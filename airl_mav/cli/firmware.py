@@ -46,18 +46,23 @@ from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.state import Message, Mode
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.px4_links import px4_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.plant.plant import Collision
 from firmware_sim.plant.wind import WindSettings
+from firmware_sim.plant.world import FLOOR
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 
 MAX_SPEED = 100.0
 """Greatest --speed; what a host cannot keep up with is given up and reported."""
+
+TOUCHDOWN_M_S = 2.0
+"""A slower touch of the floor is a landing: PX4 comes down with 0.7 to 1.5 m/s [m/s]."""
 
 STATE_EVERY = 10
 """The harness hears the true state every so many ticks: 25 Hz."""
@@ -251,6 +256,17 @@ def serve(command: FirmwareCommand) -> int:
     return 0
 
 
+def is_crash(hit: Collision, flight: Flight) -> bool:
+    """Return whether a contact ends a flight: all do but what happens on the ground.
+
+    On the way up and down that includes a gentle touch of the floor, in the modes that fly there.
+    """
+    if hit.what != FLOOR:
+        return True
+    gentle = flight.mode not in (Mode.OFFBOARD, Mode.HOLD) and hit.speed_m_s < TOUCHDOWN_M_S
+    return flight.phase is Phase.AIR and not gentle
+
+
 class _Service:
     """Requests of the harness on a firmware."""
 
@@ -268,6 +284,10 @@ class _Service:
         self._episode = -1
         self._record = Path()
         self._ticks = 0
+        self._hits = 0
+        """Contacts looked at so far."""
+        self._crash: str | None = None
+        """The first thing hit in flight."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             LoadEpisode: self._load,
             FinishEpisode: self._finish,
@@ -291,6 +311,7 @@ class _Service:
         tlog = Path(request.tlog) if request.tlog else None
         loaded = self._firmware.load(episode, tlog, unix_us())
         self._episode, self._record = request.episode, Path(request.record)
+        self._hits, self._crash = 0, None
         goal = episode.arena.goal if episode.arena is not None else np.zeros(2)
         self._channel.send(
             Loaded(
@@ -309,12 +330,15 @@ class _Service:
 
     def _report(self, simulation: Simulation) -> None:
         self._ticks += 1
-        hit = simulation.plant.collisions
-        if self._ticks % STATE_EVERY and not hit:
-            return
         truth, flight = simulation.truth, simulation.autopilot.flight
+        hits = simulation.plant.collisions
+        crashes = [hit.what for hit in hits[self._hits :] if is_crash(hit, flight)]
+        self._hits = len(hits)
+        if crashes and self._crash is None:
+            self._crash = crashes[0]
+        elif self._ticks % STATE_EVERY:
+            return
         x, y, z = (float(c) for c in truth.position)
-        flying_hits = [c.what for c in hit if c.what != "floor" or flight.phase is Phase.AIR]
         self._channel.send(
             State(
                 time_us=truth.time_us,
@@ -322,7 +346,7 @@ class _Service:
                 speed_m_s=float(np.linalg.norm(truth.velocity)),
                 yaw=quat_yaw(truth.quaternion),
                 battery=truth.battery_remaining,
-                collision=flying_hits[0] if flying_hits else None,
+                collision=self._crash,
                 mode=flight.mode.name.lower(),
                 armed=flight.phase >= Phase.GROUND,
                 landed=flight.phase < Phase.AIR,

@@ -97,7 +97,8 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     """Return the returns at flight height as points (n, 2), forward and right of the vehicle [m].
 
     The image is levelled by the vehicle's roll and pitch, so that neither the floor nor the tilt
-    of acceleration looks like an obstacle.
+    of acceleration looks like an obstacle. The camera is taken to look along the nose, from the
+    centre of the vehicle.
     """
     k, depth = observation.intrinsics, observation.depth_m
     seen = depth > 0.0

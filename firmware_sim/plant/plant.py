@@ -256,8 +256,10 @@ class Plant:
         points = self.world.client.getContactPoints(bodyA=self._body)
         if not points and not self._touching:
             return
-        # Index 2 is body B, index 9 the normal force: 0 = close but not touching.
-        touching = {point[2] for point in points if point[9] > 0.0}
+        # Index 2 is body B, index 9 the normal force: 0 = close but not touching. Contacts flicker:
+        # one has ended when the bodies are no longer close.
+        close = {point[2] for point in points}
+        touching = {point[2] for point in points if point[9] > 0.0} | (self._touching & close)
         speed = math.sqrt(sum(v * v for v in velocity_before))
         for other in sorted(touching - self._touching):
             name = self.world.names[other]

@@ -33,16 +33,22 @@ class Rate:
     """Says when a sensor slower than the tick is due, without drift."""
 
     def __init__(self, rate_hz: float) -> None:
-        self._period_us = US_PER_S / rate_hz
-        self._count = 0
+        self._rate_hz = rate_hz
+        self._next = 0
 
     def due(self, time_us: int) -> bool:
         """Return True once for every period that has passed."""
-        if time_us < self._count * self._period_us:
+        if time_us < self._start_us(self._next):
             return False
-        # Rounding may put a time that lies on the end of a period into that period.
-        self._count = max(self._count, int(time_us // self._period_us)) + 1
+        period = int(time_us * self._rate_hz / US_PER_S)
+        # Rounding may put a time that lies on a boundary into the period before it.
+        if self._start_us(period + 1) <= time_us:
+            period += 1
+        self._next = period + 1
         return True
+
+    def _start_us(self, period: int) -> float:
+        return period * US_PER_S / self._rate_hz
 
 
 class _GpsDrift:
