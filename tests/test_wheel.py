@@ -14,8 +14,6 @@ import pytest
 from ports import choose_ports
 from processes import ROOT, running
 
-pytest.importorskip("hatchling", reason="the build backend is not installed")
-
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(400)]
 
 
