@@ -22,7 +22,7 @@ from airl_mav.envs.contact import NOTHING, touches
 from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.power import Coefficients, power_w
+from airl_mav.vehicle.power import Coefficients, coefficients, power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate, yaw_of
 from airl_mav.vehicle.rotor import spin, wrench
@@ -70,22 +70,11 @@ def vehicle_of(profile: VehicleProfile, parameter: Callable[[str], float]) -> Ve
         profile: The vehicle.
         parameter: Lookup of PX4-named parameters: the flight controller's, so that both fly alike.
     """
-    power = profile.power
     return Vehicle(
         airframe=Airframe.from_profile(profile),
         gains=Gains.from_parameters(parameter),
-        power=(
-            power.b1_vxy,
-            power.b2_axy,
-            power.b3_vxy_axy,
-            power.b4_vz,
-            power.b5_az,
-            power.b6_vz_az,
-            power.b7_payload,
-            power.b8_wind,
-            power.b9_hover,
-        ),
-        payload_g=power.payload_g,
+        power=coefficients(profile.power),
+        payload_g=profile.power.payload_g,
         radius=0.5 * profile.body.width_m,
         half_height=0.5 * profile.body.height_m,
     )

@@ -5,9 +5,25 @@ from __future__ import annotations
 import math
 
 from airl_mav.kernels import kernel
+from airl_mav.profiles.vehicle import Power
 from airl_mav.vehicle.rotation import Vec
 
 Coefficients = tuple[float, float, float, float, float, float, float, float, float]
+
+
+def coefficients(power: Power) -> Coefficients:
+    """Return b1..b9 of a vehicle profile."""
+    return (
+        power.b1_vxy,
+        power.b2_axy,
+        power.b3_vxy_axy,
+        power.b4_vz,
+        power.b5_az,
+        power.b6_vz_az,
+        power.b7_payload,
+        power.b8_wind,
+        power.b9_hover,
+    )
 
 
 @kernel

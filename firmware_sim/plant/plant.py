@@ -14,7 +14,7 @@ from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.power import Coefficients, power_w
+from airl_mav.vehicle.power import coefficients, power_w
 from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
 from airl_mav.vehicle.rotor import spin, wrench
@@ -135,18 +135,7 @@ class Plant:
         self._speeds: Speeds = (0.0, 0.0, 0.0, 0.0)
         self._remaining = 1.0
         self._power_w = IDLE_POWER_W
-        p = profile.power
-        self._coefficients: Coefficients = (
-            p.b1_vxy,
-            p.b2_axy,
-            p.b3_vxy_axy,
-            p.b4_vz,
-            p.b5_az,
-            p.b6_vz_az,
-            p.b7_payload,
-            p.b8_wind,
-            p.b9_hover,
-        )
+        self._coefficients = coefficients(profile.power)
         self._body = self._build_body()
         self._touching: set[int] = set()
         self._motion = self._read()
