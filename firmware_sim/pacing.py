@@ -51,7 +51,7 @@ class Pacing(Protocol):
         ...
 
     def take_slips(self) -> NDArray[np.int64]:
-        """Return (k, 2) since the last call: the tick at which, and how much was given up [µs]."""
+        """Return (k, 2) since the last call: the time at which, and how much was given up [µs]."""
         ...
 
 
@@ -97,13 +97,15 @@ class WallPacing:
             if ready:
                 readable(self._stamp(now_us))
         now_us = clock.time_us()
-        late_us = now_us - tick_us
-        if late_us > MAX_LAG_US:
-            clock.slip(late_us)
-            self.slipped_us += late_us
-            self._slips.append((tick_us, late_us))
-            now_us, late_us = tick_us, 0
-        self._lateness.append(late_us)
+        if now_us - tick_us > MAX_LAG_US:
+            # Back to the tick that is due, but not behind a time that was handed out.
+            resumed_us = max(tick_us, self._stamp_us)
+            lost_us = now_us - resumed_us
+            clock.slip(lost_us)
+            self.slipped_us += lost_us
+            self._slips.append((resumed_us, lost_us))
+            now_us = resumed_us
+        self._lateness.append(now_us - tick_us)
         return self._stamp(now_us)
 
     def _stamp(self, now_us: int) -> int:
@@ -118,7 +120,7 @@ class WallPacing:
         return lateness
 
     def take_slips(self) -> NDArray[np.int64]:
-        """Return (k, 2) since the last call: the tick at which, and how much was given up [µs]."""
+        """Return (k, 2) since the last call: the time at which, and how much was given up [µs]."""
         slips = np.array(self._slips, np.int64).reshape(-1, 2)
         self._slips.clear()
         return slips

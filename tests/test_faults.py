@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import signal
 import socket
 import threading
@@ -127,6 +128,12 @@ def loss_to_failsafe(log: list[tuple[float, Any]]) -> float:
     """Return the simulated time from the last setpoint to the failsafe [s]."""
     failsafe = time_of_text(log, "Failsafe activated")
     return failsafe - max(t for t, _ in setpoints(log) if t < failsafe)
+
+
+def given_up_s(vehicle: Running) -> float:
+    """Return the simulated time that a finished airl-firmware says it gave up [s]."""
+    match = re.search(r"([\d.]+) s given up", vehicle.text())
+    return 0.0 if match is None else float(match[1])
 
 
 def modes(log: list[tuple[float, Any]]) -> list[int]:
@@ -338,11 +345,12 @@ def test_hung_policy_is_stopped_then_leaves_offboard_then_lands(
         and m.command == dialect.MAV_CMD_DO_SET_MODE
         and t > zeroed
     )
-    began = forward[0]
-    held = 4 * 0.5  # four decisions, each held for 0.5 s; the last one until it is overdue
-    assert held - 0.5 + 1.5 <= zeroed - began <= held - 0.5 + 1.5 + 0.5
-    assert 0.95 <= left - zeroed <= 1.4
-    assert not [t for t, _ in sent if t > left + 0.3]
+    # Three decisions held for 0.5 s each, the fourth until it is overdue; a busy host may have
+    # given up simulated time, or been late by a moment.
+    lost = given_up_s(vehicle)
+    assert 3 * 0.5 + 1.5 - lost - 0.2 <= zeroed - forward[0] <= 3 * 0.5 + 1.5 + 1.5
+    assert 1.0 - lost - 0.2 <= left - zeroed <= 1.0 + 1.0
+    assert not [t for t, _ in sent if t > left + 0.5]
     assert time_of_text(log, "Landing at current position") > left
     assert time_of_text(log, "Disarmed by landing") > left
     with pytest.raises(StopIteration):
@@ -567,8 +575,8 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     assert rows.min() > 0, "a decision without a stamp"
     assert np.all(np.diff(rows, axis=0) >= 0)
     assert np.all(np.diff(stamps["sent_us"]) > 0)
-    # Actions were held by the companion's own clock: none for the length of the stop.
-    assert np.all(stamps["held_until_us"] - stamps["sent_us"] < 1_000_000)
+    # Actions were held by the companion's own clock: none for the length of the stop longer.
+    assert np.max(stamps["held_until_us"] - stamps["sent_us"]) < 1e6 * SPEED * stopped_s
     assert np.diff(done.trajectories[0].time_us).max() <= 20_000
 
 
@@ -724,9 +732,10 @@ def test_companion_interrupted_in_flight_lands(tmp_path: Path, ground: Ground) -
 
 def test_companion_interrupted_while_nobody_is_there(tmp_path: Path) -> None:
     with companion(tmp_path, choose_ports()) as pilot:
-        time.sleep(1.0)
+        pilot.wait_for_text("waiting for a flight controller on udpin://")
         pilot.interrupt()
-        assert pilot.wait(10.0) in (130, -signal.SIGINT)
+        assert pilot.wait(20.0) == 130
+        assert "error: stopped" in pilot.text()
 
 
 def test_nobody_there(tmp_path: Path) -> None:

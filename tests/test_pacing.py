@@ -81,8 +81,12 @@ def test_stamps_never_go_back(talking: list[int]) -> None:
         time.sleep(pause)
         tick_us += TICK_US
         stamps.append(paced.wait(tick_us, talking, stamps.append))
+        # Nor does the clock go back behind one: what happens next is later.
+        assert paced.clock.time_us() >= stamps[-1]
     assert stamps == sorted(stamps)
-    assert len(paced.take_slips()) >= 2
+    slips = paced.take_slips()
+    assert len(slips) >= 2
+    assert slips[:, 1].sum() == paced.slipped_us
 
 
 def test_unpaced_time_is_the_tick() -> None:

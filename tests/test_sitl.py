@@ -129,9 +129,11 @@ def test_every_decision_is_followed_to_the_motors(done: Done, index: int) -> Non
     np.testing.assert_array_equal(steps.sum(axis=0), stamps["motor_us"] - stamps["capture_us"])
     # Every decision lies in its flight, one after the other, held for half a second.
     assert np.all(stamps["capture_us"] > episode["started_us"])
-    assert np.all(np.diff(stamps["sent_us"]) >= 500_000)
+    # (Where the host gave up time, the simulator's clock has seen less of a hold.)
+    least_us = 500_000 - episode["slipped_us"]
+    assert np.all(np.diff(stamps["sent_us"]) >= least_us)
     held = archive[f"{index:03d}/held_until_us"] - stamps["sent_us"]
-    assert np.all(held >= 500_000)
+    assert np.all(held >= least_us)
     # The motors follow within two ticks of 4 ms, but where the host was busy.
     assert np.median(stamps["motor_us"] - stamps["accepted_us"]) <= 8_000
 

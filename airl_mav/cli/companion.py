@@ -172,6 +172,7 @@ def stand_alone(command: CompanionCommand) -> int:
     latency = sampler(command, command.seed)
     try:
         with opened(command, clock, abandon) as (link, frames):
+            console.print(f"waiting for a flight controller on {command.connect}", markup=False)
             link.connect(command.connect_timeout, stop)
             result = fly_mission(
                 link,

@@ -12,7 +12,7 @@ from importlib.util import find_spec
 
 from rich.console import Console
 
-from airl_mav.cli.common import EXIT_USAGE
+from airl_mav.cli.common import EXIT_INTERRUPTED, EXIT_USAGE
 
 SIM_MODULES = ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy")
 """What the [sim] extra installs."""
@@ -28,7 +28,11 @@ def _start(command: str, needed: tuple[str, ...] = SIM_MODULES) -> None:
             markup=False,
         )
         sys.exit(EXIT_USAGE)
-    importlib.import_module(f"airl_mav.cli.{command}").main()
+    try:
+        module = importlib.import_module(f"airl_mav.cli.{command}")
+    except KeyboardInterrupt:  # The imports take a second: nothing has begun.
+        sys.exit(EXIT_INTERRUPTED)
+    module.main()
 
 
 def sitl() -> None:

@@ -139,7 +139,7 @@ def join_stamps(
     Args:
         decisions: The companion's log, by column.
         setpoints: The firmware's log, by column.
-        slips: (k, 2) ticks at which simulated time was given up, and how much [µs].
+        slips: (k, 2) times at which simulated time was given up, and how much [µs].
     """
     by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
     index = match_setpoints(
