@@ -547,7 +547,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     """1 s: long for the simulation, short for MAVSDK's heartbeats and the watchdog."""
     stopped_s = 1.0
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "1", goal_m=40.0) as run:
+    with sitl(tmp_path, ports, "--episodes", "1", goal_m=25.0) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
         before = ground.track[-1][0]
@@ -583,7 +583,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
 def test_long_stopped_firmware_ends_in_a_defined_way(tmp_path: Path, ground: Ground) -> None:
     """3 s is what MAVSDK allows between heartbeats; the watchdog may be first. No crash."""
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "1", goal_m=40.0) as run:
+    with sitl(tmp_path, ports, "--episodes", "1", goal_m=25.0) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
         os.kill(children["firmware"], signal.SIGSTOP)
