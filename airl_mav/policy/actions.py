@@ -19,9 +19,6 @@ class Action:
     """Positive clockwise seen from above."""
 
 
-HOVER = Action(0.0, 0.0, 0.0)
-
-
 class Policy(Protocol):
     """Anything that decides."""
 

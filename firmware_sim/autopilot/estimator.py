@@ -28,7 +28,6 @@ from airl_mav.frames import (
     quat_normalize,
     quat_to_euler,
     quat_to_matrix,
-    quat_yaw,
     wrap_pi,
 )
 from airl_mav.kernels import kernel
@@ -298,8 +297,3 @@ class Estimator:
             innovation_ratio=self._ratio.copy(),
             healthy=self._healthy(sigma),
         )
-
-    @property
-    def yaw(self) -> float:
-        """Present heading [rad]."""
-        return quat_yaw(self._q)
