@@ -129,6 +129,15 @@ def quat_to_euler(q: Vector) -> Euler:
     return Euler(roll, pitch, yaw)
 
 
+def quats_to_euler(q: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return roll, pitch, yaw, each (...), of unit quaternions (..., 4); as `quat_to_euler`."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return roll, pitch, yaw
+
+
 def quat_yaw(q: Vector) -> float:
     """Return the heading [rad] of a unit quaternion (4,), 0 = north, positive to the east."""
     w, x, y, z = q
@@ -161,19 +170,21 @@ def quat_xyzw_to_wxyz(q: tuple[float, float, float, float]) -> Vector:
     return np.array([q[3], q[0], q[1], q[2]])
 
 
-def ned_to_heading(v: Vector, yaw: float) -> Vector:
-    """Rotate a world vector (3,) about the vertical into the heading frame (forward, right, down).
+def ned_to_heading(v: Vector, yaw: float | Vector) -> Vector:
+    """Rotate world vectors (..., 3) by yaw (...) into the heading frame (forward, right, down).
 
     The heading frame is MAVLink's BODY_NED: yaw follows the vehicle, roll and pitch stay level.
     """
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([c * v[0] + s * v[1], -s * v[0] + c * v[1], v[2]])
+    c, s = np.cos(yaw), np.sin(yaw)
+    north, east = v[..., 0], v[..., 1]
+    return np.stack([c * north + s * east, c * east - s * north, v[..., 2]], axis=-1)
 
 
-def heading_to_ned(v: Vector, yaw: float) -> Vector:
-    """Rotate a heading-frame vector (3,) (forward, right, down) into NED."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1], v[2]])
+def heading_to_ned(v: Vector, yaw: float | Vector) -> Vector:
+    """Rotate heading-frame vectors (..., 3) (forward, right, down) by yaw (...) into NED."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    forward, right = v[..., 0], v[..., 1]
+    return np.stack([c * forward - s * right, s * forward + c * right, v[..., 2]], axis=-1)
 
 
 class Geodetic(NamedTuple):

@@ -16,7 +16,7 @@ from airl_mav.clock import Clock
 from airl_mav.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import Action, Policy, limited
+from airl_mav.policy.actions import Action, Policy, limited, vertical_speed
 from airl_mav.policy.observation import Kinematics, encode
 from companion.camera import FrameSource
 from companion.link import BodyVelocity, Link
@@ -24,12 +24,6 @@ from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1
 """How long one wait for a frame lasts before the other conditions are looked at [s]."""
-
-ALTITUDE_P = 0.5
-"""Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
-
-MAX_VERTICAL_M_S = 1.0
-"""Limit of the altitude correction [m/s]."""
 
 
 @dataclass(frozen=True)
@@ -147,8 +141,7 @@ class Pilot:
 
     def _setpoint(self, action: Action, state: Kinematics) -> BodyVelocity:
         """Add the vertical speed that holds the altitude."""
-        error_m = -self._settings.altitude_m - float(state.position[2])
-        down = max(-MAX_VERTICAL_M_S, min(MAX_VERTICAL_M_S, ALTITUDE_P * error_m))
+        down = vertical_speed(self._settings.altitude_m, float(state.position[2]))
         return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
 
 

@@ -75,8 +75,8 @@ def look(
 
 
 def blank(goal: tuple[float, float], depth_m: float = 0.0) -> Observation:
-    depth = np.full((48, 64), depth_m, np.float32)
-    return Observation(depth, LENS, np.array(goal), np.zeros(3), 0.0, 0.0)
+    depth = np.full((48, 64), depth_m * 1000.0, np.uint16)
+    return Observation(depth, LENS, np.array(goal), np.zeros(3), 0.0, 0.0, 0.0)
 
 
 ANGLE = st.floats(-math.pi, math.pi)

@@ -22,11 +22,11 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.clock import Clock, SimClock, WallClock
 from airl_mav.constants import US_PER_S
 from airl_mav.latency.samplers import EmpiricalSampler, FixedSampler, LatencySampler
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from companion.camera import ReceivedFrame
 from companion.link import STOP, BodyVelocity, LinkError
-from companion.pilot import ALTITUDE_P, MAX_VERTICAL_M_S, Pilot, PilotSettings
+from companion.pilot import Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 
 LENS = Intrinsics.from_fov(8, 6, math.radians(90.0))

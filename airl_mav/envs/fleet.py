@@ -113,15 +113,15 @@ def hover(fleet: Fleet, i: int, altitude_m: float, vehicle: Vehicle) -> None:
 
 
 @kernel
-def advance(fleet: Fleet, arenas: ArenaBatch, ticks: int, vehicle: Vehicle) -> None:
-    """Fly every vehicle that has touched nothing for `ticks` ticks on its setpoint.
+def advance(fleet: Fleet, arenas: ArenaBatch, ticks: NDArray[np.int64], vehicle: Vehicle) -> None:
+    """Fly every vehicle that has touched nothing for its number of `ticks` (n,) on its setpoint.
 
     A setpoint that was changed since the last call takes effect at once: set `repeat_us` to the
     vehicle's time to have it turned into NED by the present heading.
     """
     for i in range(len(fleet.time_us)):
         if fleet.touched[i] == NOTHING:
-            _fly(fleet, arenas, i, ticks, vehicle)
+            _fly(fleet, arenas, i, ticks[i], vehicle)
 
 
 @kernel

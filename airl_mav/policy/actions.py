@@ -19,6 +19,23 @@ class Action:
     """Positive clockwise seen from above."""
 
 
+ALTITUDE_P = 0.5
+"""Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
+
+MAX_VERTICAL_M_S = 1.0
+"""Limit of the altitude correction [m/s]."""
+
+
+def vertical_speed(altitude_m: float, down_m: float) -> float:
+    """Return the downward speed [m/s] that holds an altitude.
+
+    Args:
+        altitude_m: Height above the start to hold [m].
+        down_m: Present position, down of the start [m].
+    """
+    return max(-MAX_VERTICAL_M_S, min(MAX_VERTICAL_M_S, ALTITUDE_P * (-altitude_m - down_m)))
+
+
 class Policy(Protocol):
     """Anything that decides."""
 

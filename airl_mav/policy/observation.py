@@ -1,6 +1,7 @@
 """What a policy sees: a depth image, its own motion and the goal.
 
-One encoder for all: `encode` turns a frame and the vehicle's telemetry into an Observation.
+One function for all: `observe` turns frames and the vehicles' telemetry into an Observation, of
+one vehicle in the companion and of n at a time in training.
 """
 
 from __future__ import annotations
@@ -11,53 +12,79 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import MM_PER_M, Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.frames import Vector, ned_to_heading, quat_to_euler
+from airl_mav.frames import Vector, ned_to_heading, quats_to_euler
 
 
 @dataclass(frozen=True)
 class Kinematics:
-    """The vehicle's own state, as telemetry reports it."""
+    """The own state of a vehicle, or of n, as telemetry reports it. Leading axes may be added."""
 
-    position: Vector  # (3,) local NED [m]
-    velocity: Vector  # (3,) NED [m/s]
-    quaternion: Vector  # (4,) body FRD -> NED
+    position: Vector  # (..., 3) local NED [m]
+    velocity: Vector  # (..., 3) NED [m/s]
+    quaternion: Vector  # (..., 4) body FRD -> NED
 
 
 @dataclass(frozen=True)
 class Observation:
-    """Input of a policy. The heading frame is level and follows the nose: forward, right, down."""
+    """Input of a policy, of one vehicle or with a leading axis of n.
 
-    depth_m: NDArray[np.float32]  # (h, w) along the optical axis [m]; 0 = no return
+    The heading frame is level and follows the nose: forward, right, down.
+    """
+
+    depth_mm: NDArray[np.uint16]  # (..., h, w) along the optical axis [mm]; 0 = no return
     intrinsics: Intrinsics
-    goal: Vector  # (2,) goal relative to the vehicle, forward and right [m]
-    velocity: Vector  # (3,) heading frame [m/s]
-    roll: float
-    """[rad]."""
-    pitch: float
-    """[rad]."""
+    goal: Vector  # (..., 2) goal relative to the vehicle, forward and right [m]
+    velocity: Vector  # (..., 3) heading frame [m/s]
+    roll: float | Vector
+    """(...) [rad]."""
+    pitch: float | Vector
+    """(...) [rad]."""
+    yaw: float | Vector
+    """(...) heading [rad], 0 = north, positive to the east."""
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """Depth (..., h, w) along the optical axis [m]; 0 = no return."""
+        return self.depth_mm.astype(np.float32) / np.float32(MM_PER_M)
 
     @property
     def goal_distance(self) -> float:
-        """Horizontal distance to the goal [m]."""
+        """Horizontal distance of one vehicle to its goal [m]."""
         return math.hypot(self.goal[0], self.goal[1])
 
     @property
     def goal_bearing(self) -> float:
-        """Direction of the goal relative to the nose [rad], positive to the right."""
+        """Direction of one vehicle's goal relative to the nose [rad], positive to the right."""
         return math.atan2(self.goal[1], self.goal[0])
 
 
 def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
     """Return the observation of a frame, telemetry and a goal (north, east [m])."""
-    euler = quat_to_euler(state.quaternion)
-    to_goal = np.array([goal[0] - state.position[0], goal[1] - state.position[1], 0.0])
+    return observe(frame.depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64))
+
+
+def observe(
+    depth_mm: NDArray[np.uint16], intrinsics: Intrinsics, state: Kinematics, goal: Vector
+) -> Observation:
+    """Return the observation of one vehicle, or of n.
+
+    Args:
+        depth_mm: (..., h, w) Z16 images [mm]; 0 = no return.
+        intrinsics: The camera.
+        state: Telemetry.
+        goal: (..., 2) north, east [m].
+    """
+    roll, pitch, yaw = quats_to_euler(state.quaternion)
+    to_goal = np.zeros_like(state.position)
+    to_goal[..., :2] = goal - state.position[..., :2]
     return Observation(
-        depth_m=frame.depth_m(),
-        intrinsics=frame.intrinsics,
-        goal=ned_to_heading(to_goal, euler.yaw)[:2],
-        velocity=ned_to_heading(state.velocity, euler.yaw),
-        roll=euler.roll,
-        pitch=euler.pitch,
+        depth_mm=depth_mm,
+        intrinsics=intrinsics,
+        goal=ned_to_heading(to_goal, yaw)[..., :2],
+        velocity=ned_to_heading(state.velocity, yaw),
+        roll=roll,
+        pitch=pitch,
+        yaw=yaw,
     )

@@ -1,0 +1,199 @@
+"""Observation layouts: from what the vehicle senses to the arrays that a network takes.
+
+`body` is the default: a depth image, and goal and velocity in the heading frame. `paper` is Air
+Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of the
+goal, and vectors in the world frame. Both are Dicts of `depth`, `velocity` and `goal`.
+
+The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
+and the companion is n = 1.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.frames import heading_to_ned
+from airl_mav.policy.observation import Observation
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+LayoutName = Literal["body", "paper"]
+Encoded = dict[str, NDArray[Any]]
+
+DEPTH, VELOCITY, GOAL = "depth", "velocity", "goal"
+"""Keys of every layout."""
+
+SPEED_SCALE_M_S = 5.0
+"""`body`: velocities are divided by this, the fastest action of the paper."""
+
+DISTANCE_SCALE_M = 20.0
+"""`body`: the distance to the goal is divided by this."""
+
+STRIP_ROWS = 10
+"""`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
+
+STRIP_HALF_WIDTH = 1
+"""`paper`: the bar that draws the bearing is three columns wide."""
+
+
+class ObservationSpec(ProfileModel):
+    """What a network takes, and the camera that can provide it."""
+
+    layout: LayoutName = "body"
+    height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
+    width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
+    horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
+    range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
+
+    @property
+    def camera_rows(self) -> int:
+        """Rows of the image that come from the camera."""
+        return self.height_px - (STRIP_ROWS if self.layout == "paper" else 0)
+
+
+class Box(NamedTuple):
+    """Shape, type and bounds of one array of a layout, without the leading axis."""
+
+    shape: tuple[int, ...]
+    dtype: type[np.generic]
+    low: float
+    high: float
+
+
+def boxes(spec: ObservationSpec) -> dict[str, Box]:
+    """Return the arrays of a layout, by key."""
+    return {
+        DEPTH: Box((1, spec.height_px, spec.width_px), np.uint8, 0, 255),
+        VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
+        GOAL: Box((3,), np.float32, -math.inf, math.inf),
+    }
+
+
+def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
+    """Return why a camera cannot serve a layout, or None when it can.
+
+    Its image must be a whole multiple of the network's, its field of view the same.
+    """
+    rows, columns = spec.camera_rows, spec.width_px
+    if (
+        camera.width % columns
+        or camera.height % rows
+        or camera.width * rows != (camera.height * columns)
+    ):
+        return (
+            f"camera {camera.width}x{camera.height} px; accepted: {columns}x{rows} px "
+            "or a whole multiple"
+        )
+    fov_deg = math.degrees(2.0 * math.atan2(0.5 * camera.width, camera.focal))
+    if abs(fov_deg - spec.horizontal_fov_deg) > 0.1:
+        return (
+            f"camera with a horizontal field of view of {fov_deg:.1f} deg; "
+            f"accepted: {spec.horizontal_fov_deg:.1f} deg"
+        )
+    return None
+
+
+def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
+    """Return the arrays of a layout for n vehicles.
+
+    Args:
+        spec: The layout; its camera must fit (`camera_mismatch`).
+        seen: Of n vehicles: every array has a leading axis (n,).
+
+    Returns:
+        `depth` (n, 1, height, width) uint8, `velocity` (n, 3) and `goal` (n, 3) float32.
+        `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
+        its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
+    """
+    distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
+    image = _look_up(spec, _pooled(seen.depth_mm, spec.camera_rows, spec.width_px))
+    if spec.layout == "body":
+        safe = np.maximum(distance, 1e-6)
+        goal = np.stack(
+            [seen.goal[:, 0] / safe, seen.goal[:, 1] / safe, distance / DISTANCE_SCALE_M], axis=1
+        )
+        velocity = seen.velocity / SPEED_SCALE_M_S
+    else:
+        image = np.concatenate([_bearing_strip(spec, seen), image], axis=1)
+        level = np.concatenate([seen.goal, np.zeros((len(distance), 1))], axis=1)
+        goal = heading_to_ned(level, seen.yaw)
+        goal[:, 2] = distance
+        velocity = heading_to_ned(seen.velocity, seen.yaw)
+    return {
+        DEPTH: image[:, None],
+        VELOCITY: velocity.astype(np.float32),
+        GOAL: goal.astype(np.float32),
+    }
+
+
+def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
+    """Return the arrays with one input made zero, as the paper's sensor ablation does."""
+    return {k: np.zeros_like(v) if k == key else v for k, v in encoded.items()}
+
+
+def _pooled(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
+    """Shrink Z16 images (n, h, w) to (n, rows, columns): the nearest return of each block wins."""
+    # One less, so that "no return" (0) wraps round to the farthest of all.
+    image = depth_mm - np.uint16(1)
+    vertical, horizontal = depth_mm.shape[1] // rows, depth_mm.shape[2] // columns
+    nearest = image[:, ::vertical]
+    for k in range(1, vertical):
+        nearest = np.minimum(nearest, image[:, k::vertical])
+    image, nearest = nearest, nearest[:, :, ::horizontal]
+    for k in range(1, horizontal):
+        nearest = np.minimum(nearest, image[:, :, k::horizontal])
+    return nearest
+
+
+def _look_up(spec: ObservationSpec, image: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Turn the images of `_pooled` into grey values."""
+    table = _body_table(spec.range_m) if spec.layout == "body" else _paper_table(spec.range_m)
+    grey: NDArray[np.uint8] = table[image]
+    return grey
+
+
+def _depths_m(range_m: float) -> NDArray[np.float64]:
+    """Return the depth [m] of every value of `_pooled`; infinite beyond the range."""
+    depth = (np.arange(MAX_MM + 1) + 1) / MM_PER_M
+    depth[(depth > range_m) | (np.arange(MAX_MM + 1) == MAX_MM)] = np.inf
+    return depth
+
+
+@cache
+def _body_table(range_m: float) -> NDArray[np.uint8]:
+    """Depth in proportion to the range: 0 is at the lens, 255 the range and beyond."""
+    share = np.minimum(_depths_m(range_m) / range_m, 1.0)
+    return np.rint(255.0 * share).astype(np.uint8)
+
+
+@cache
+def _paper_table(range_m: float) -> NDArray[np.uint8]:
+    """Air Learning's mapping (airlearning-rl, getScreenDepthVis).
+
+    255 / max(1 m, depth) cut to a byte, inverted, to the tenth power of the byte's range.
+    """
+    byte = (255.0 / np.maximum(1.0, _depths_m(range_m))).astype(np.uint8)
+    return (255.0 * ((255.0 - byte) / 255.0) ** 10).astype(np.uint8)
+
+
+def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8]:
+    """Return Air Learning's strip (n, 10, width): white, a black bar at the goal's bearing.
+
+    Bearings of -180..180 deg run from the left to the right edge; the last row is black.
+    """
+    n, width = len(seen.goal), spec.width_px
+    bearing = np.arctan2(seen.goal[:, 1], seen.goal[:, 0])
+    column = ((bearing + math.pi) / (2.0 * math.pi) * width).astype(np.int64)
+    column = np.clip(column, STRIP_HALF_WIDTH, width - 1 - STRIP_HALF_WIDTH)
+    strip = np.full((n, STRIP_ROWS, width), 255, np.uint8)
+    strip[:, -1] = 0
+    for offset in range(-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH + 1):
+        strip[np.arange(n), :, column + offset] = 0
+    return strip
