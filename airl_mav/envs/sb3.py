@@ -1,0 +1,95 @@
+"""The vectorised environment as a stable-baselines3 VecEnv."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
+
+from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.policy.layouts import Encoded
+
+QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
+"""What of an episode's info goes into SB3's `episode` info, beside return, length and time."""
+
+
+class NavigationVecEnv(VecEnv):
+    """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`."""
+
+    def __init__(self, env: NavigationVectorEnv) -> None:
+        """Wrap a vectorised environment."""
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.env = env
+        self.render_mode = None
+        self._actions: NDArray[Any] = np.zeros(0)
+        self._return = np.zeros(env.num_envs)
+        self._length = np.zeros(env.num_envs, np.int64)
+
+    def reset(self) -> Encoded:
+        """Begin n episodes; `seed()` before it seeds them."""
+        seed = next((s for s in self._seeds if s is not None), None)
+        observation, _ = self.env.reset(seed=seed)
+        self._reset_seeds()
+        self._reset_options()
+        self._return[:] = 0.0
+        self._length[:] = 0
+        return observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Fly one decision."""
+        seen, reward, terminated, truncated, info = self.env.step(self._actions)
+        self._return += reward
+        self._length += 1
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(done):
+            episode = {key: info[key][i].item() for key in QUALITY}
+            episode |= {"r": float(self._return[i]), "l": int(self._length[i]), "t": 0.0}
+            infos[i] = {
+                "terminal_observation": info["final_obs"][i],
+                "TimeLimit.truncated": bool(truncated[i]),
+                "is_success": episode["success"],
+                "episode": episode,
+            }
+        self._return[done] = 0.0
+        self._length[done] = 0
+        return seen, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of the wrapped environment, once for every index asked for."""
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute; the n environments are one object. Raises ValueError for a part."""
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError("indices: accepted: all environments, which are one object")
+        setattr(self.env, attr_name, value)
+
+    def env_method(
+        self, method_name: str, *arguments: Any, indices: VecEnvIndices = None, **keywords: Any
+    ) -> list[Any]:
+        """Call a method of the wrapped environment once; return its result for every index."""
+        result = getattr(self.env, method_name)(*arguments, **keywords)
+        return [result] * len(list(self._get_indices(indices)))
+
+    def env_is_wrapped(
+        self,
+        wrapper_class: type[Any],
+        indices: VecEnvIndices = None,  # noqa: ARG002
+    ) -> list[bool]:
+        """Return False: there are no wrappers inside."""
+        return [False] * len(list(self._get_indices(indices)))
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return nothing to see: render the single environment instead."""
+        return [None] * self.num_envs

@@ -1,0 +1,155 @@
+"""What an environment is made of: the knobs of `airl/Navigation-v0` and of a training config."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from airl_mav.envs.rewards import RewardName
+from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
+from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
+from airl_mav.policy.layouts import LayoutName
+from airl_mav.profiles.arena import Each
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+
+class EpisodeRules(ProfileModel):
+    """When an episode ends, and how often the policy decides."""
+
+    goal_radius_m: float = quantity(
+        "the goal is reached closer than this, seen from above",
+        "m",
+        ge=0.2,
+        le=50,
+        default=GOAL_RADIUS_M,
+    )
+    time_limit_s: float = quantity(
+        "longest flight from the start of navigation", "s", ge=1, le=3600, default=TIME_LIMIT_S
+    )
+    hold_s: float = quantity(
+        "t3: how long an action is held before the next observation",
+        "s",
+        ge=0.02,
+        le=10,
+        default=0.5,
+    )
+    hover_after_s: float | None = quantity(
+        "zero the velocity so long after the hold time when no new action has come (AirSim: 0.06);"
+        " left out: the last one persists (PX4, MAVSDK)",
+        "s",
+        ge=0,
+        le=60,
+        default=None,
+    )
+    altitude_m: float = quantity("height that is held", "m", ge=0.5, le=100, default=2.5)
+
+
+class CameraChange(ProfileModel):
+    """Another camera than the vehicle's; what is left out stays as it is."""
+
+    width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
+    height_px: int | None = quantity("image height", "px", ge=6, le=480, default=None)
+    horizontal_fov_deg: float | None = quantity(
+        "horizontal field of view", "deg", gt=10, lt=170, default=None
+    )
+    range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
+
+
+class Delay(ProfileModel):
+    """How late decisions are: the stages of docs/architecture.md, in simulated time."""
+
+    computer: str = Field(default="workstation", description="computer profile to fly as")
+    workload: str | None = Field(
+        default=None, description="workload whose t2 is drawn; left out: native_ms"
+    )
+    native_ms: float = quantity(
+        "t2 when no workload is chosen: inference on a desktop computer",
+        "ms",
+        ge=0,
+        le=60_000,
+        default=1.0,
+    )
+    transport_ms: float = quantity(
+        "t1 without the wait for the frame: capture to decoded", "ms", ge=0, le=1000, default=5.0
+    )
+    link_ms: float = quantity(
+        "setpoint sent to accepted, and to the first motor command",
+        "ms",
+        ge=0,
+        le=1000,
+        default=4.0,
+    )
+
+
+class Randomisation(ProfileModel):
+    """What is drawn anew with every episode, around the profile's value; 0 leaves it alone."""
+
+    mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
+    thrust: float = quantity("greatest thrust, +- this share", "1", ge=0, le=0.9, default=0.0)
+    drag: float = quantity("drag, +- this share", "1", ge=0, le=0.9, default=0.0)
+    rotor_lag: float = quantity(
+        "rotor time constant, +- this share", "1", ge=0, le=0.9, default=0.0
+    )
+    estimation: bool = Field(
+        default=True, description="telemetry carries the estimator's error, not the truth"
+    )
+    depth_noise: float = quantity(
+        "sd of the depth noise at 10 m, as a share; grows with the square of the depth as of a"
+        " stereo camera",
+        "1",
+        ge=0,
+        le=0.9,
+        default=0.0,
+    )
+    depth_dropout: float = quantity(
+        "share of pixels without a return, drawn anew each frame", "1", ge=0, le=0.9, default=0.0
+    )
+    extra_delay_ms: Annotated[tuple[float, float], Each(0, 10_000, ascending=True)] = quantity(
+        "added to t2: one value an episode, drawn from this range", "ms", default=(0.0, 0.0)
+    )
+
+
+class Curriculum(ProfileModel):
+    """Zones of growing radius around the start (the paper's): the goal is drawn inside."""
+
+    window: int = quantity("last episodes that count", "1", ge=1, le=1_000_000, default=1000)
+    threshold: float = quantity(
+        "success rate over them from which the next zone opens", "1", gt=0, le=1, default=0.5
+    )
+
+
+class EnvironmentSpec(ProfileModel):
+    """The environment: what flies where, what is seen, done, rewarded and randomised."""
+
+    vehicle: str = Field(default="quad", description="vehicle profile")
+    arena: str = Field(default="static-obstacles", description="arena profile")
+    layout: LayoutName = Field(default="body", description="observation layout")
+    image_width_px: int = quantity("image that the network sees", "px", ge=4, le=640, default=32)
+    image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
+    actions: ActionSetName = Field(default="arc-25", description="action set")
+    max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
+    reward: RewardName = Field(default="shaped", description="reward")
+    camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
+    episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
+    delay: Delay = Field(default_factory=Delay, description="how late decisions are")
+    randomisation: Randomisation = Field(
+        default_factory=Randomisation, description="what is drawn with every episode"
+    )
+    curriculum: Curriculum | None = Field(
+        default=None, description="zones by success; left out: the whole arena from the start"
+    )
+
+    @model_validator(mode="after")
+    def _decides_in_time(self) -> EnvironmentSpec:
+        if self.episode.hold_s >= self.episode.time_limit_s:
+            raise ValueError(
+                f"episode.hold_s = {self.episode.hold_s:g}: accepted: value < "
+                f"{self.episode.time_limit_s:g} s (episode.time_limit_s)"
+            )
+        return self
+
+    @property
+    def action_spec(self) -> ActionSpec:
+        """The action set with its fastest speed."""
+        return ActionSpec(set=self.actions, max_speed_m_s=self.max_speed_m_s)
