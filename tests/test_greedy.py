@@ -131,10 +131,11 @@ def test_near_points_agree_with_scipy(pitch: float, roll: float, band: float, se
     rng = np.random.default_rng(seed)
     depth = rng.uniform(0.3, 20.0, (12, 16)).astype(np.float32)
     depth[rng.random((12, 16)) < 0.3] = 0.0
+    depth = np.rint(depth * 1000.0).astype(np.uint16)
     lens = Intrinsics.from_fov(16, 12, 1.4)
-    seen = Observation(depth, lens, np.zeros(2), np.zeros(3), roll, pitch)
+    seen = Observation(depth, lens, np.zeros(2), np.zeros(3), roll, pitch, 0.0)
     v, u = np.mgrid[0:12, 0:16]
-    z = depth.astype(np.float64)
+    z = depth / 1000.0
     body = np.stack([z, (u - 7.5) / lens.focal * z, (v - 5.5) / lens.focal * z], axis=-1)
     level = Rotation.from_euler("ZYX", [0.0, pitch, roll]).apply(body[depth > 0])
     expected = level[np.abs(level[:, 2]) < band][:, :2]
@@ -336,7 +337,9 @@ def test_never_exceeds_its_limits(
     depth: NDArray[np.float32], forward: float, right: float, roll: float, pitch: float
 ) -> None:
     lens = Intrinsics.from_fov(8, 6, math.radians(90.0))
-    seen = Observation(depth, lens, np.array([forward, right]), np.zeros(3), roll, pitch)
+    mm = np.rint(depth * 1000.0).astype(np.uint16)
+    goal = np.array([forward, right])
+    seen = Observation(mm, lens, goal, np.zeros(3), roll, pitch, 0.0)
     action = GreedyPolicy().act(seen)
     assert math.hypot(action.forward_m_s, action.right_m_s) <= S.max_speed_m_s + 1e-9
     assert abs(action.yaw_rate_rad_s) <= S.max_yaw_rate_rad_s + 1e-9

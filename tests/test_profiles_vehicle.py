@@ -20,8 +20,9 @@ from pydantic.fields import FieldInfo
 from airl_mav.errors import UsageError
 from airl_mav.profiles.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.loading import list_profiles, load_profile, profiles_dir
+from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.parameters import SPECS, Parameters
+from firmware_sim.autopilot.parameters import Parameters
 
 ROOT = Path(__file__).resolve().parent.parent
 QUAD_TOML = (ROOT / "profiles" / "vehicles" / "quad.toml").read_text(encoding="utf-8")

@@ -37,7 +37,6 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
-from airl_mav.cli.vehicle import load_vehicle
 from airl_mav.clock import WallClock, utc_now
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
@@ -45,7 +44,7 @@ from airl_mav.frames import quat_yaw
 from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.commander import Flight, Phase
 from firmware_sim.autopilot.state import Message, Mode
 from firmware_sim.firmware import Firmware

@@ -21,7 +21,6 @@ from airl_mav.cli.common import (
     run_command,
 )
 from airl_mav.cli.companion import check_holding
-from airl_mav.cli.vehicle import load_vehicle
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
@@ -35,6 +34,7 @@ from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import load_vehicle
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
 from firmware_sim.plant.wind import WindSettings

@@ -71,7 +71,7 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     batch.bounds[i] = arena.bounds.as_array()
     batch.n_obstacles[i], batch.n_static[i] = count, arena.n_static
     batch.shape[i, :count] = o.shape
-    batch.center[i, :count] = o.center
+    batch.center[i, :count] = arena.centers_at(0)
     batch.half_size[i, :count] = o.half_size
     batch.yaw[i, :count] = o.yaw
     batch.goal[i] = arena.goal

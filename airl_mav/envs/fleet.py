@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ from airl_mav.envs.contact import NOTHING, touches
 from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import Coefficients, coefficients, power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate, yaw_of
@@ -31,6 +33,32 @@ REPEAT_US = 50_000
 """MAVSDK repeats the newest setpoint at 20 Hz [µs]."""
 
 NAN3: Vec = (math.nan, math.nan, math.nan)
+
+
+class Verdict(IntEnum):
+    """How a flight ended, or that it goes on; `flight.judge.Outcome` for arrays."""
+
+    FLYING = 0
+    SUCCESS = 1
+    COLLISION = 2
+    BATTERY = 3
+    TIMEOUT = 4
+
+
+_FLYING = int(Verdict.FLYING)
+_SUCCESS = int(Verdict.SUCCESS)
+_COLLISION = int(Verdict.COLLISION)
+_BATTERY = int(Verdict.BATTERY)
+_TIMEOUT = int(Verdict.TIMEOUT)
+
+
+class Rules(NamedTuple):
+    """What ends a flight besides collision and battery; as `flight.judge.Task`."""
+
+    goal_radius: float
+    """The goal is reached closer than this, seen from above [m]."""
+    time_limit_us: int
+    """Longest flight [µs]."""
 
 
 class Fleet(NamedTuple):
@@ -48,15 +76,30 @@ class Fleet(NamedTuple):
     repeat_us: NDArray[np.int64]  # (n,) time of the next repeat
     distance: NDArray[np.float64]  # (n,) flown since the start [m]
     energy: NDArray[np.float64]  # (n,) drawn since the start [J]
+    battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
     touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, WALL, or NOTHING
+    verdict: NDArray[np.int64]  # (n,) Verdict
+    airframe: NDArray[np.float64]  # (n, fields of Airframe) each one's own
+
+
+class Pack(NamedTuple):
+    """The battery's constants."""
+
+    empty_v: float
+    """Open-circuit voltage of the empty pack [V]."""
+    full_v: float
+    resistance_ohm: float
+    capacity_mah: float
 
 
 class Vehicle(NamedTuple):
     """The constants that all vehicles of a fleet share."""
 
     airframe: Airframe
+    """Nominal: what `hover` gives a vehicle that is not given its own."""
     gains: Gains
     power: Coefficients
+    pack: Pack
     payload_g: float
     radius: float
     """Of the collision disc [m]."""
@@ -70,10 +113,14 @@ def vehicle_of(profile: VehicleProfile, parameter: Callable[[str], float]) -> Ve
         profile: The vehicle.
         parameter: Lookup of PX4-named parameters: the flight controller's, so that both fly alike.
     """
+    b = profile.battery
     return Vehicle(
         airframe=Airframe.from_profile(profile),
         gains=Gains.from_parameters(parameter),
         power=coefficients(profile.power),
+        pack=Pack(
+            b.cells * b.cell_empty_v, b.cells * b.cell_full_v, b.resistance_ohm, b.capacity_mah
+        ),
         payload_g=profile.power.payload_g,
         radius=0.5 * profile.body.width_m,
         half_height=0.5 * profile.body.height_m,
@@ -97,36 +144,94 @@ def new_fleet(n: int) -> Fleet:
         repeat_us=np.zeros(n, np.int64),
         distance=np.zeros(n),
         energy=np.zeros(n),
+        battery=np.ones(n),
         touched=np.full(n, NOTHING, np.int64),
+        verdict=np.full(n, _FLYING, np.int64),
+        airframe=np.zeros((n, len(Airframe._fields))),
     )
 
 
-def hover(fleet: Fleet, i: int, altitude_m: float, vehicle: Vehicle) -> None:
-    """Put vehicle i into a hover above the origin, heading north, all counters at zero."""
+def hover(
+    fleet: Fleet,
+    i: int,
+    altitude_m: float,
+    vehicle: Vehicle,
+    airframe: Airframe | None = None,
+    battery: float = 1.0,
+) -> None:
+    """Put vehicle i into a hover above the origin, heading north, all counters at zero.
+
+    Args:
+        fleet: Where vehicle i is.
+        i: Row.
+        altitude_m: Height above the floor [m].
+        vehicle: What all vehicles share.
+        airframe: This vehicle's own; None = the nominal one.
+        battery: State of charge at the start, 1 full to 0 empty.
+    """
     for array in fleet:
         array[i] = 0
+    a = vehicle.airframe if airframe is None else airframe
+    fleet.airframe[i] = a
     fleet.position[i, 2] = -altitude_m
     fleet.quaternion[i, 0] = 1.0
-    a = vehicle.airframe
     fleet.rotor[i] = math.sqrt(a.mass * GRAVITY_M_S2 / (4.0 * a.thrust_max))
+    fleet.battery[i] = battery
     fleet.touched[i] = NOTHING
+    fleet.verdict[i] = _FLYING
 
 
 @kernel
-def advance(fleet: Fleet, arenas: ArenaBatch, ticks: NDArray[np.int64], vehicle: Vehicle) -> None:
-    """Fly every vehicle that has touched nothing for its number of `ticks` (n,) on its setpoint.
+def advance(
+    fleet: Fleet, arenas: ArenaBatch, ticks: NDArray[np.int64], vehicle: Vehicle, rules: Rules
+) -> None:
+    """Fly every vehicle whose verdict is FLYING for its number of ticks on its setpoint.
+
+    A flight ends in the tick that decides it, and its `time_us` stays there. Tests and their order
+    are the referee's (`flight.judge`): goal, collision, battery, time limit.
 
     A setpoint that was changed since the last call takes effect at once: set `repeat_us` to the
     vehicle's time to have it turned into NED by the present heading.
+
+    Args:
+        fleet: Updated in place.
+        arenas: One a vehicle; the moving obstacles' centres are updated in place.
+        ticks: (n,) how many ticks each one flies.
+        vehicle: What all vehicles share.
+        rules: What ends a flight.
     """
     for i in range(len(fleet.time_us)):
-        if fleet.touched[i] == NOTHING:
-            _fly(fleet, arenas, i, ticks[i], vehicle)
+        if fleet.verdict[i] == _FLYING:
+            _fly(fleet, arenas, i, ticks[i], vehicle, rules)
 
 
 @kernel
-def _fly(fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle) -> None:
-    airframe, gains = vehicle.airframe, vehicle.gains
+def _airframe(row: NDArray[np.float64]) -> Airframe:
+    """Return a row of `Fleet.airframe` by its names."""
+    return Airframe(
+        row[0],
+        row[1],
+        row[2],
+        row[3],
+        row[4],
+        row[5],
+        row[6],
+        row[7],
+        row[8],
+        row[9],
+        row[10],
+        row[11],
+        row[12],
+    )
+
+
+@kernel
+def _fly(
+    fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle, rules: Rules
+) -> None:
+    airframe, gains, pack = _airframe(fleet.airframe[i]), vehicle.gains, vehicle.pack
+    goal, radius = arenas.goal[i], rules.goal_radius
+    battery = fleet.battery[i]
     p = (fleet.position[i, 0], fleet.position[i, 1], fleet.position[i, 2])
     v = (fleet.velocity[i, 0], fleet.velocity[i, 1], fleet.velocity[i, 2])
     q = (
@@ -171,7 +276,11 @@ def _fly(fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle)
             (v[1] - before[1]) / TICK_S,
             (v[2] - before[2]) / TICK_S,
         )
-        energy += TICK_S * power_w(v, accel, calm, vehicle.payload_g, vehicle.power)
+        power = power_w(v, accel, calm, vehicle.payload_g, vehicle.power)
+        energy += TICK_S * power
+        rest_v = open_circuit(battery, pack.empty_v, pack.full_v)
+        current = power / terminal_voltage(rest_v, pack.resistance_ohm, power)
+        battery = drain(battery, current, pack.capacity_mah, TICK_S)
         distance += math.sqrt(
             (p[0] - moved_from[0]) ** 2 + (p[1] - moved_from[1]) ** 2 + (p[2] - moved_from[2]) ** 2
         )
@@ -189,9 +298,18 @@ def _fly(fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle)
             arenas.half_size[i],
             arenas.yaw[i],
         )
-        if hit != NOTHING:
-            fleet.touched[i] = hit
-            break
+        fleet.touched[i] = hit
+        if (p[0] - goal[0]) ** 2 + (p[1] - goal[1]) ** 2 < radius * radius:
+            fleet.verdict[i] = _SUCCESS
+        elif hit != NOTHING:
+            fleet.verdict[i] = _COLLISION
+        elif battery <= 0.0:
+            fleet.verdict[i] = _BATTERY
+        elif time_us >= rules.time_limit_us:
+            fleet.verdict[i] = _TIMEOUT
+        else:
+            continue
+        break
     for axis in range(3):
         fleet.position[i, axis] = p[axis]
         fleet.velocity[i, axis] = v[axis]
@@ -202,3 +320,4 @@ def _fly(fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle)
     fleet.time_us[i] = time_us
     fleet.distance[i] += distance
     fleet.energy[i] += energy
+    fleet.battery[i] = battery

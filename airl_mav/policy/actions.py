@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from airl_mav.policy.observation import Observation
 
 
@@ -33,7 +36,14 @@ def vertical_speed(altitude_m: float, down_m: float) -> float:
         altitude_m: Height above the start to hold [m].
         down_m: Present position, down of the start [m].
     """
-    return max(-MAX_VERTICAL_M_S, min(MAX_VERTICAL_M_S, ALTITUDE_P * (-altitude_m - down_m)))
+    return float(vertical_speeds(altitude_m, np.array(down_m)))
+
+
+def vertical_speeds(altitude_m: float, down_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the downward speeds [m/s] of n vehicles; as `vertical_speed`."""
+    error_m = -altitude_m - down_m
+    speeds: NDArray[np.float64] = np.clip(ALTITUDE_P * error_m, -MAX_VERTICAL_M_S, MAX_VERTICAL_M_S)
+    return speeds
 
 
 class Policy(Protocol):

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, Strict
 
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.constants import US_PER_S
+from airl_mav.errors import UsageError
 from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.parameters import parameter_values
 
 
 class Body(ProfileModel):
@@ -92,6 +98,18 @@ class Camera(ProfileModel):
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
 
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """The pinhole model."""
+        return Intrinsics.from_fov(
+            self.width_px, self.height_px, math.radians(self.horizontal_fov_deg)
+        )
+
+    @property
+    def period_us(self) -> int:
+        """Time between two frames [µs]."""
+        return round(US_PER_S / self.rate_hz)
+
 
 class Imu(ProfileModel):
     """Accelerometer and gyroscope: white noise, bias at start, bias random walk."""
@@ -155,3 +173,18 @@ class VehicleProfile(ProfileModel):
     parameters: dict[str, Annotated[float, Strict()]] = Field(
         default_factory=dict, description="PX4-named parameters that differ from the defaults"
     )
+
+
+def load_vehicle(name: str) -> VehicleProfile:
+    """Return a vehicle profile by name or path.
+
+    Raises:
+        UsageError: The profile cannot be used, or sets a parameter that the flight controller
+            does not know or accept.
+    """
+    vehicle = load_profile("vehicles", name, VehicleProfile)
+    try:
+        parameter_values(vehicle.parameters)
+    except UsageError as error:
+        raise UsageError(f"vehicle {name}: {error}") from None
+    return vehicle
