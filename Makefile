@@ -2,7 +2,11 @@
 
 VENV  ?= .venv
 BIN   := $(VENV)/bin
-STAMP := $(VENV)/.installed
+# What flies, and what trains and tests: torch is large, and no flight needs it.
+FLY   := $(VENV)/.installed-sim
+ALL   := $(VENV)/.installed-all
+
+comma := ,
 
 # pybullet has wheels for CPython 3.10 and 3.11 only.
 PYTHON := $(shell scripts/find-python)
@@ -13,22 +17,30 @@ PYTHON := $(shell scripts/find-python)
 help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
 
-$(STAMP): pyproject.toml constraints.txt scripts/find-python
+define install
 	@test -n "$(PYTHON)" || { scripts/find-python --explain; exit 1; }
-	$(PYTHON) -m venv $(VENV)
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-	    --constraint constraints.txt --editable '.[sim,dev]'
+	    --constraint constraints.txt --editable '.[$(1)]'
 	@touch $@
+endef
+
+$(FLY): pyproject.toml constraints.txt scripts/find-python
+	$(call install,sim)
+
+$(ALL): pyproject.toml constraints.txt scripts/find-python
+	$(call install,sim$(comma)train$(comma)dev)
+	@touch $(FLY)
 
 .PHONY: install
-install: $(STAMP)  ## Create .venv and install everything needed to fly and test
+install: $(ALL)  ## Create .venv and install everything needed to fly, train and test
 
 .PHONY: sitl
-sitl: $(STAMP)  ## Fly three episodes: airl-sitl --vehicle quad
+sitl: $(FLY)  ## Fly three episodes: airl-sitl --vehicle quad
 	$(BIN)/airl-sitl --vehicle quad
 
 .PHONY: lint
-lint: $(STAMP)  ## Format, lint, types, import contracts
+lint: $(ALL)  ## Format, lint, types, import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -39,7 +51,7 @@ test: lint  ## Everything CI checks
 	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 .PHONY: bench
-bench: $(STAMP)  ## Measure: ray caster, real-time factor of the stack
+bench: $(ALL)  ## Measure: ray caster, real-time factor of the stack
 	$(BIN)/python benchmarks/bench_depth.py
 	$(BIN)/python benchmarks/bench_stack.py
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.clock import Clock
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Policy
 from companion.camera import FrameSource
 from companion.link import STOP, LinkError, MavsdkLink
-from companion.pilot import Pilot, PilotSettings
+from companion.pilot import FRAME_WAIT_S, Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 
 ARM_TIMEOUT_S = 20.0
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
+FRAME_TIMEOUT_S = 5.0
+"""How long a camera may take to show a first frame [wall s]."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,22 @@ def fly_mission(
         notes += _come_down(link, left_offboard=watchdog.left_offboard)
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
+
+
+def first_lens(frames: FrameSource, stop: threading.Event) -> Intrinsics | None:
+    """Return the camera's intrinsics, for a look at them before take-off; None without a frame.
+
+    Args:
+        frames: The camera.
+        stop: Set from outside to stop waiting.
+    """
+    for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):
+        received = frames.wait(newer_than_sequence=-1, timeout_s=FRAME_WAIT_S)
+        if received is not None:
+            return received.frame.intrinsics
+        if stop.is_set():
+            break
+    return None
 
 
 def _come_down(link: MavsdkLink, *, left_offboard: bool) -> list[str]:

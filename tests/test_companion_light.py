@@ -18,6 +18,8 @@ HEAVY = (
     "jinja2",
     "matplotlib",
     "numba",
+    "onnx",
+    "onnxruntime",  # only with a learned policy
     "pybullet",
     "pymavlink",
     "scipy",

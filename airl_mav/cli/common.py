@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -64,6 +65,16 @@ def check_wind(wind: WindSettings) -> None:
     check_range("--wind.east-m-s", wind.east_m_s, -50.0, 50.0)
     check_range("--wind.gust-m-s", wind.gust_m_s, 0.0, 50.0)
     check_range("--wind.gust-time-s", wind.gust_time_s, 0.01, 1000.0)
+
+
+TRAIN_MODULES = ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch")
+"""What the [train] extra installs."""
+
+
+def check_train_installed() -> None:
+    """Raise UsageError unless all that training needs is installed."""
+    if missing := [name for name in TRAIN_MODULES if find_spec(name) is None]:
+        raise UsageError(f"not installed: {', '.join(missing)}; pip install 'airl-mav[train]'")
 
 
 def run_command(command: Callable[[], int]) -> None:

@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,15 +38,43 @@ from airl_mav.cli.common import (
 )
 from airl_mav.clock import Clock, WallClock
 from airl_mav.errors import UsageError
-from airl_mav.latency.injection import choose_injection
+from airl_mav.latency.injection import Injection, choose_injection
 from airl_mav.latency.samplers import LatencySampler
-from airl_mav.policy.registry import load_policy
+from airl_mav.policy.actions import Policy
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
+from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.computer import load_computer
-from companion.camera import ZmqFrameSource
+from companion.camera import FrameSource, ZmqFrameSource
 from companion.link import LinkError, MavsdkLink
-from companion.mission import MissionResult, fly_mission
+from companion.mission import MissionResult, first_lens, fly_mission
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
+
+GREATEST_THREADS = 64
+
+CHANCE_STREAM = 1
+"""Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
+
+
+@dataclass(frozen=True)
+class PilotOptions:
+    """How the policy is flown; what is left out is as the policy's card says."""
+
+    hold_s: float | None = None
+    """t3: how long an action is held before the next observation, s. None: that of the policy's
+    card, or 0.5."""
+
+    goal_radius_m: float | None = None
+    """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
+    or 2."""
+
+    altitude_m: float | None = None
+    """Height above the start that is held, m. None: that of the policy's card, or 2.5."""
+
+    max_speed_m_s: float | None = None
+    """Horizontal speed limit of all actions, m/s. None: the fastest action of the policy's card,
+    or 5."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +84,14 @@ class CompanionCommand:
     goal: tuple[float, float] = (20.0, 0.0)
     """Goal, north and east of the start, m."""
 
-    policy: str = "greedy"
-    """Policy that decides."""
+    policy: str = DEFAULT_POLICY
+    """Policy that decides: a name, or a path to a folder with policy.onnx and card.json."""
+
+    runtime: RuntimeName = "onnx"
+    """What runs a learned policy; torch needs its policy.pt2."""
+
+    threads: int = 1
+    """Threads of one inference."""
 
     connect: str = "udpin://127.0.0.1:14540"
     """MAVSDK connection to the flight controller: udpin://HOST:PORT or serial://DEVICE:BAUD."""
@@ -69,18 +103,19 @@ class CompanionCommand:
     """Computer profile to fly as: a shipped name, or a path to a .toml."""
 
     workload: str | None = None
-    """Workload of the computer profile whose latency t2 is injected. None: nothing is injected."""
+    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to this
+    policy. None: nothing is injected."""
 
     speed: float = 1.0
     """Simulated seconds per wall second of the simulator, > 0; 1 on a real aircraft."""
 
     seed: int = 1
-    """Seed of the injected latency."""
+    """Seed of the injected latency, and of random actions if the policy's card has any."""
 
     connect_timeout: float = 30.0
     """How long to wait for the flight controller, s."""
 
-    pilot: tyro.conf.OmitArgPrefixes[PilotSettings] = field(default_factory=PilotSettings)
+    pilot: tyro.conf.OmitArgPrefixes[PilotOptions] = field(default_factory=PilotOptions)
     """How the policy is flown."""
 
     watchdog: tyro.conf.OmitArgPrefixes[WatchdogSettings] = field(default_factory=WatchdogSettings)
@@ -99,14 +134,22 @@ def main() -> None:
     run_command(lambda: serve(command) if command.control else stand_alone(command))
 
 
-def check(command: CompanionCommand) -> None:
-    """Check everything that can be wrong before a connection is opened. Raises UsageError."""
+def check(command: CompanionCommand) -> PilotSettings:
+    """Check everything that can be wrong before a connection is opened.
+
+    Returns:
+        How the policy will be flown.
+
+    Raises:
+        UsageError: Names the option, its value and what is accepted.
+    """
     check_range("--speed", command.speed, 0.1, 100.0)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
     check_range("--connect-timeout", command.connect_timeout, 0.1, 3600.0)
     for metres in command.goal:
         check_range("--goal", metres, -10_000.0, 10_000.0)
-    pilot = command.pilot
+    check_range("--threads", command.threads, 1, GREATEST_THREADS)
+    pilot = pilot_settings(command.pilot, find_policy(command.policy))
     check_range("--goal-radius-m", pilot.goal_radius_m, 0.1, 50.0)
     check_range("--altitude-m", pilot.altitude_m, 0.5, 100.0)
     check_range("--max-speed-m-s", pilot.max_speed_m_s, 0.1, 30.0)
@@ -114,6 +157,22 @@ def check(command: CompanionCommand) -> None:
     if command.log is not None and not command.log.parent.is_dir():
         raise UsageError(f"--log {command.log}: no folder {command.log.parent}")
     sampler(command, command.seed)
+    return pilot
+
+
+def pilot_settings(options: PilotOptions, policy: PolicyInfo) -> PilotSettings:
+    """Return how a policy is flown: as asked, else as its card says, else by default."""
+    card = policy.card
+    known = {}
+    if card is not None:
+        known = {
+            "hold_s": card.hold_s,
+            "goal_radius_m": card.goal_radius_m,
+            "altitude_m": card.altitude_m,
+            "max_speed_m_s": card.actions.max_speed_m_s,
+        }
+    asked = {name: value for name, value in asdict(options).items() if value is not None}
+    return PilotSettings(**(known | asked))
 
 
 def check_holding(option: str, hold_s: float, watchdog: WatchdogSettings) -> None:
@@ -156,24 +215,59 @@ def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
 
 def sampler(command: CompanionCommand, seed: int) -> LatencySampler | None:
     """Return where t2 is drawn from. Raises UsageError for an unknown computer or workload."""
-    injection = choose_injection(load_computer(command.computer), command.workload)
-    return injection.sampler(np.random.default_rng(seed))
+    return injection(command).sampler(np.random.default_rng(seed))
+
+
+def injection(command: CompanionCommand) -> Injection:
+    """Return the latency to fly with. Raises UsageError for an unknown computer or workload."""
+    policy = find_policy(command.policy)
+    return choose_injection(
+        load_computer(command.computer),
+        command.workload,
+        # Alone it runs on the computer that it flies on: what was measured there is no addition.
+        policy_sha256=policy.sha256 if command.control else None,
+        macs=policy.macs,
+    )
+
+
+def load(command: CompanionCommand, pilot: PilotSettings) -> Policy:
+    """Return the policy, ready to decide. Raises UsageError when it cannot be run as asked."""
+    return load_policy(
+        command.policy,
+        pilot.hold_s,
+        runtime=command.runtime,
+        threads=command.threads,
+        rng=_chance(command.seed),
+    )
+
+
+def check_camera(policy: Policy, frames: FrameSource, stop: threading.Event) -> None:
+    """Look at the camera before take-off. Raises UsageError when the policy cannot use it."""
+    if isinstance(policy, LearnedPolicy):
+        lens = first_lens(frames, stop)
+        if lens is not None and (reason := policy.refuses(lens)) is not None:
+            raise UsageError(f"--policy {policy.card.name}: {reason}")
+
+
+def _chance(seed: int) -> np.random.Generator:
+    return np.random.default_rng((seed, CHANCE_STREAM))
 
 
 def stand_alone(command: CompanionCommand) -> int:
     """Fly one mission."""
-    check(command)
+    pilot = check(command)
     console = Console()
     clock = WallClock(command.speed)
     stop, abandon = threading.Event(), threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    policy = load_policy(command.policy, command.pilot.hold_s)
+    policy = load(command, pilot)
     latency = sampler(command, command.seed)
     try:
         with opened(command, clock, abandon) as (link, frames):
             console.print(f"waiting for a flight controller on {command.connect}", markup=False)
             link.connect(command.connect_timeout, stop)
+            check_camera(policy, frames, stop)
             result = fly_mission(
                 link,
                 frames,
@@ -183,7 +277,7 @@ def stand_alone(command: CompanionCommand) -> int:
                 stop,
                 abandon,
                 lambda phase: console.print(f"{clock.time_us() / 1e6:8.2f} s  {phase}"),
-                pilot_settings=command.pilot,
+                pilot_settings=pilot,
                 watchdog_settings=command.watchdog,
                 latency=latency,
             )
@@ -207,7 +301,7 @@ def serve(command: CompanionCommand) -> int:
     requests: queue.Queue[Any] = queue.Queue()
     stop, abandon = threading.Event(), threading.Event()
     try:
-        check(command)
+        pilot = check(command)
     except UsageError as error:
         channel.send(Failed(message=str(error)))
         return EXIT_USAGE
@@ -231,30 +325,36 @@ def serve(command: CompanionCommand) -> int:
     # setpoints end and the flight controller's offboard-loss failsafe takes over.
     channel.listen(handle, lambda: os._exit(EXIT_BROKEN))
     try:
-        policy = load_policy(command.policy, command.pilot.hold_s)
+        policy, t2 = load(command, pilot), injection(command)
         with opened(command, clock, abandon) as (link, frames):
             channel.send(Ready())
             while not isinstance(request := requests.get(), Shutdown):
                 if not link.connected:
                     link.connect(command.connect_timeout)
+                check_camera(policy, frames, stop)
                 result = fly_mission(
                     link,
                     frames,
-                    policy,
+                    _seeded(policy, request.latency_seed),
                     request.goal,
                     clock,
                     stop,
                     abandon,
                     _announce(channel, clock),
-                    pilot_settings=command.pilot,
+                    pilot_settings=pilot,
                     watchdog_settings=command.watchdog,
-                    latency=sampler(command, request.latency_seed),
+                    latency=t2.sampler(np.random.default_rng(request.latency_seed)),
                 )
                 channel.send(_ended(result, request))
     except (UsageError, LinkError) as error:
         channel.send(Failed(message=str(error)))
         return EXIT_USAGE if isinstance(error, UsageError) else EXIT_BROKEN
     return 0
+
+
+def _seeded(policy: Policy, seed: int) -> Policy:
+    """Return the policy with random actions, if it takes any, that depend on nothing but a seed."""
+    return policy.with_generator(_chance(seed)) if isinstance(policy, LearnedPolicy) else policy
 
 
 def _announce(channel: ChildChannel, clock: Clock) -> Any:

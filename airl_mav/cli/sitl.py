@@ -20,7 +20,7 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
-from airl_mav.cli.companion import check_holding
+from airl_mav.cli.companion import GREATEST_THREADS, PilotOptions, check_holding, pilot_settings
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
@@ -29,7 +29,9 @@ from airl_mav.harness.progress import RichObserver
 from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
 from airl_mav.harness.run_folder import RunFolder
 from airl_mav.latency.injection import choose_injection
-from airl_mav.policy.registry import policy_description
+from airl_mav.policy.card import vehicle_mismatch
+from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
+from airl_mav.policy.runtime import RuntimeName
 from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
@@ -59,15 +61,21 @@ class SitlCommand:
     arena: str = "static-obstacles"
     """Arena profile: a shipped name, or a path to a .toml."""
 
-    policy: str = "greedy"
-    """Policy that decides."""
+    policy: str = DEFAULT_POLICY
+    """Policy that decides: a name, or a path to a folder with policy.onnx and card.json."""
+
+    runtime: RuntimeName = "onnx"
+    """What runs a learned policy; torch needs its policy.pt2."""
+
+    threads: int = 1
+    """Threads of one inference."""
 
     computer: str = "workstation"
     """Computer profile to fly as: a shipped name, or a path to a .toml."""
 
     workload: str | None = None
-    """Workload of the computer profile whose latency t2 is injected. None: t2 is what this machine
-    takes."""
+    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to this
+    policy. None: what was measured for this very policy, or else what this machine takes."""
 
     episodes: int = 3
     """Number of episodes, >= 1."""
@@ -78,17 +86,19 @@ class SitlCommand:
     speed: float = 1.0
     """Simulated seconds per wall second, 0.5 to 10. Latencies count in simulated time."""
 
-    goal_radius: float = GOAL_RADIUS_M
-    """The goal is reached closer than this, seen from above, m."""
+    goal_radius: float | None = None
+    """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
+    or 3."""
 
     time_limit: float = TIME_LIMIT_S
     """Longest flight from the start of navigation, s."""
 
-    hold: float = PilotSettings.hold_s
-    """t3: how long an action is held before the next observation, s."""
+    hold: float | None = None
+    """t3: how long an action is held before the next observation, s. None: that of the policy's
+    card, or 0.5."""
 
-    altitude: float = PilotSettings.altitude_m
-    """Height above the start that is flown, m."""
+    altitude: float | None = None
+    """Height above the start that is flown, m. None: that of the policy's card, or 2.5."""
 
     watchdog: tyro.conf.OmitArgPrefixes[WatchdogSettings] = field(default_factory=WatchdogSettings)
     """Bounds on silence."""
@@ -123,22 +133,30 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
         UsageError: The input cannot be used; nothing was flown.
     """
     console = console or Console()
-    setup = check(command)
+    setup, pilot = check(command)
     signal.signal(signal.SIGTERM, _interrupt)
     folder = RunFolder.create(
         command.out,
-        f"sitl-{command.policy}",
-        asdict(command),
+        f"sitl-{setup.policy.name}",
+        # As flown: what was left open is filled in.
+        asdict(command)
+        | {
+            "hold": pilot.hold_s,
+            "altitude": pilot.altitude_m,
+            "goal_radius": pilot.goal_radius_m,
+        },
         setup=setup,
         seeds=[command.seed + i for i in range(command.episodes)],
     )
-    console.print(f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {command.policy}")
+    console.print(
+        f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {setup.policy.name}"
+    )
     console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
     console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
     code = 0
     with RichObserver(console, command.episodes) as observer:
         try:
-            with Rehearsal(plan(command, setup), folder, observer) as rehearsal:
+            with Rehearsal(plan(command, setup, pilot), folder, observer) as rehearsal:
                 rehearsal.run()
         except RehearsalError as error:
             console.print(f"error: {error}", style="red", markup=False, highlight=False)
@@ -155,11 +173,11 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
     return code
 
 
-def check(command: SitlCommand) -> Setup:
+def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     """Check everything that can be wrong before anything starts.
 
     Returns:
-        What is flown on what.
+        What is flown on what, and how; the goal radius is the referee's.
 
     Raises:
         UsageError: Names the option, its value and what is accepted.
@@ -167,33 +185,52 @@ def check(command: SitlCommand) -> Setup:
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
     check_range("--speed", command.speed, SLOWEST, FASTEST)
-    check_range("--goal-radius", command.goal_radius, 0.2, 50.0)
+    check_range("--threads", command.threads, 1, GREATEST_THREADS)
     check_range("--time-limit", command.time_limit, 1.0, 3600.0)
-    check_range("--altitude", command.altitude, 0.5, 100.0)
-    check_holding("--hold", command.hold, command.watchdog)
+    policy = find_policy(command.policy)
+    pilot = _flown(command, policy)
+    check_range("--goal-radius", pilot.goal_radius_m, 0.2, 50.0)
+    check_range("--altitude", pilot.altitude_m, 0.5, 100.0)
+    check_holding("--hold", pilot.hold_s, command.watchdog)
     check_wind(command.wind)
     # The companion connects to the camera by its number: it cannot be "any free one" here.
     check_ports(command.ports, free=False)
     vehicle = load_vehicle(command.vehicle)
+    if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
+        raise UsageError(f"--policy {command.policy}: vehicle {command.vehicle}: {reason}")
+    # The companion loads it again: what cannot be run is better found here.
+    load_policy(command.policy, pilot.hold_s, runtime=command.runtime, threads=command.threads)
     arena = load_profile("arenas", command.arena, ArenaSpec)
     generate(arena, command.seed, name=command.arena, vehicle_width_m=vehicle.body.width_m)
     computer = load_computer(command.computer)
-    injection = choose_injection(computer, command.workload)
+    injection = choose_injection(
+        computer, command.workload, policy_sha256=policy.sha256, macs=policy.macs
+    )
     hover_s = command.watchdog.hover_after_s
-    return Setup(
+    setup = Setup(
         level="sitl",
         vehicle=Part(command.vehicle, vehicle.description),
         arena=Part(command.arena, arena.description),
-        policy=Part(command.policy, policy_description(command.policy)),
+        policy=Part(policy.name, policy.description),
         computer=Part(command.computer, computer.description),
         computer_watts=computer.watts,
         injection=injection,
         speed=command.speed,
         between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
     )
+    return setup, pilot
 
 
-def plan(command: SitlCommand, setup: Setup) -> Plan:
+def _flown(command: SitlCommand, policy: PolicyInfo) -> PilotSettings:
+    """Return how the policy is flown: as asked, else as its card says, else by default."""
+    radius = command.goal_radius
+    if radius is None and policy.card is None:
+        radius = GOAL_RADIUS_M
+    options = PilotOptions(hold_s=command.hold, altitude_m=command.altitude, goal_radius_m=radius)
+    return pilot_settings(options, policy)
+
+
+def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
     """Turn the command into the arguments of the two processes."""
     ports, wind, watchdog = command.ports, command.wind, command.watchdog
     firmware = [
@@ -209,14 +246,15 @@ def plan(command: SitlCommand, setup: Setup) -> Plan:
     ]
     companion = [
         *("--control", "stdio"),
-        *("--policy", command.policy),
+        *("--policy", command.policy, "--runtime", command.runtime),
+        *("--threads", f"{command.threads}"),
         *("--computer", command.computer),
         *(("--workload", command.workload) if command.workload is not None else ()),
         *("--connect", f"udpin://{LOOPBACK}:{ports.api_port}"),
         *("--camera", f"tcp://{LOOPBACK}:{ports.camera_port}"),
         *("--speed", f"{command.speed!r}"),
-        *("--hold-s", f"{command.hold!r}", "--altitude-m", f"{command.altitude!r}"),
-        *("--goal-radius-m", f"{ARRIVAL_SHARE * command.goal_radius!r}"),
+        *("--hold-s", f"{pilot.hold_s!r}", "--altitude-m", f"{pilot.altitude_m!r}"),
+        *("--goal-radius-m", f"{ARRIVAL_SHARE * pilot.goal_radius_m!r}"),
         *("--decision-timeout-s", f"{watchdog.decision_timeout_s!r}"),
         *("--leave-after-s", f"{watchdog.leave_after_s!r}"),
         *("--hover-after-s", f"{watchdog.hover_after_s!r}"),
@@ -227,7 +265,7 @@ def plan(command: SitlCommand, setup: Setup) -> Plan:
         arena=command.arena,
         seed=command.seed,
         episodes=command.episodes,
-        goal_radius_m=command.goal_radius,
+        goal_radius_m=pilot.goal_radius_m,
         time_limit_s=command.time_limit,
         speed=command.speed,
         computer_watts=setup.computer_watts,

@@ -25,7 +25,7 @@ from airl_mav.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.provenance import describe_machine, git_state, package_versions
+from airl_mav.provenance import describe_machine, git_state, package_versions
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""

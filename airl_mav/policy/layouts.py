@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
@@ -51,6 +52,15 @@ class ObservationSpec(ProfileModel):
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
     range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
+
+    @model_validator(mode="after")
+    def _camera_has_rows(self) -> ObservationSpec:
+        if self.camera_rows < 1:
+            raise ValueError(
+                f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
+                "the strip of layout 'paper'"
+            )
+        return self
 
     @property
     def camera_rows(self) -> int:

@@ -1,12 +1,23 @@
-"""Policies by name."""
+"""Policies by name: built in, shipped with a card, or any folder with one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
 
 from airl_mav.errors import UsageError
 from airl_mav.policy.actions import Policy
+from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
+from airl_mav.policy.learned import load_learned
+from airl_mav.policy.runtime import RuntimeName
+from airl_mav.profiles.loading import profiles_dir
+
+DEFAULT_POLICY = "greedy"
+"""What flies when nobody says what."""
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (
@@ -14,26 +25,99 @@ POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
         lambda hold_s: GreedyPolicy(GreedySettings(period_s=hold_s)),
     ),
 }
-"""Name -> description and a maker that takes the time an action is held [s]."""
+"""Built-in policies: name -> description and a maker that takes the time an action is held [s]."""
+
+
+@dataclass(frozen=True)
+class PolicyInfo:
+    """What is known of a policy before it is loaded."""
+
+    name: str
+    """Short, for people and for the names of folders."""
+    description: str
+    card: PolicyCard | None = None
+    """None: not a learned one."""
+
+    @property
+    def sha256(self) -> str | None:
+        """Digest of the policy's file."""
+        return None if self.card is None else self.card.sha256
+
+    @property
+    def macs(self) -> int | None:
+        """Multiply-accumulates of one inference."""
+        return None if self.card is None else self.card.macs
+
+
+def policy_names() -> list[str]:
+    """Return the names of all policies that need no path."""
+    return [*POLICIES, *(name for name in _shipped() if name not in POLICIES)]
+
+
+def find_policy(name: str) -> PolicyInfo:
+    """Return what is known of a policy, by name or by the path of its folder.
+
+    Raises:
+        UsageError: There is no such policy (lists those that exist), or its card does not fit it.
+    """
+    folder = _folder(name)
+    if folder is None:
+        return PolicyInfo(name, POLICIES[name][0])
+    card = load_card(folder)
+    return PolicyInfo(card.name, card.description, card)
 
 
 def policy_description(name: str) -> str:
-    """Return one line about a policy. Raises UsageError for an unknown one."""
-    _check(name)
-    return POLICIES[name][0]
+    """Return one line about a policy. Raises UsageError as `find_policy` does."""
+    return find_policy(name).description
 
 
-def load_policy(name: str, hold_s: float) -> Policy:
-    """Return a policy by name. Raises UsageError for an unknown one, listing those that exist.
+def load_policy(
+    name: str,
+    hold_s: float,
+    *,
+    runtime: RuntimeName = "onnx",
+    threads: int = 1,
+    rng: np.random.Generator | None = None,
+    ablate: str | None = None,
+) -> Policy:
+    """Return a policy by name, or by the path of its folder.
 
     Args:
-        name: Its name.
+        name: Its name or path.
         hold_s: How long each of its actions will be held [s].
+        runtime: What runs the network of a learned policy.
+        threads: Threads of one of its inferences.
+        rng: Source of its random actions; a card with an epsilon needs one.
+        ablate: Input of a learned policy that is made zero; None: none.
+
+    Raises:
+        UsageError: There is no such policy (lists those that exist), its card does not fit it, or
+            it cannot be run as asked.
     """
-    _check(name)
+    folder = _folder(name)
+    if folder is not None:
+        return load_learned(folder, runtime=runtime, threads=threads, rng=rng, ablate=ablate)
+    if runtime != "onnx" or ablate is not None:
+        raise UsageError(f"--policy {name!r}: not a learned policy: no runtime or ablation of it")
     return POLICIES[name][1](hold_s)
 
 
-def _check(name: str) -> None:
-    if name not in POLICIES:
-        raise UsageError(f"--policy {name!r}: no such policy; known: {', '.join(POLICIES)}")
+def _shipped() -> list[str]:
+    """Return the names of the policies that come with the package, sorted."""
+    return sorted(path.parent.name for path in (profiles_dir() / "policies").glob(f"*/{CARD_FILE}"))
+
+
+def _folder(name: str) -> Path | None:
+    """Return the folder of a policy; None for a built-in one. Raises UsageError for neither."""
+    if name in POLICIES:
+        return None
+    if name in _shipped():
+        return profiles_dir() / "policies" / name
+    path = Path(name)
+    if path.is_dir():
+        return path
+    raise UsageError(
+        f"--policy {name!r}: no such policy; known: {', '.join(policy_names())} "
+        f"(or a path to a folder with {ONNX_FILE} and {CARD_FILE})"
+    )

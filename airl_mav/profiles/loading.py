@@ -18,7 +18,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Kind = Literal["vehicles", "computers", "arenas"]
+Kind = Literal["vehicles", "computers", "arenas", "training"]
+_SINGULAR: dict[Kind, str] = {
+    "vehicles": "vehicle",
+    "computers": "computer",
+    "arenas": "arena",
+    "training": "training",
+}
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -46,7 +52,7 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     if not path.is_file():
         known = ", ".join(list_profiles(kind))
         raise UsageError(
-            f"no {kind[:-1]} profile {name!r}; shipped: {known} (or a path to a .toml)"
+            f"no {_SINGULAR[kind]} profile {name!r}; shipped: {known} (or a path to a .toml)"
         )
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))

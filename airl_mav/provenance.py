@@ -86,7 +86,7 @@ def git_state(checkout: Path | None = None) -> dict[str, Any] | None:
     Returns:
         `commit` and `changed`, or None when this is no checkout or git is not there.
     """
-    root = checkout or Path(__file__).resolve().parents[2]
+    root = checkout or Path(__file__).resolve().parents[1]
     git = shutil.which("git")
     if git is None or not (root / ".git").exists():
         return None

@@ -1,0 +1,211 @@
+"""The policy card: what a policy file takes and gives, what made it, and how well it flies.
+
+A policy is a folder with `policy.onnx` and `card.json`. The card names the file by its digest, so
+that no card ever speaks for another file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, Strict, ValidationError, model_validator
+
+from airl_mav.atomic import replace_file
+from airl_mav.errors import UsageError
+from airl_mav.flight.setup import Level
+from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
+from airl_mav.policy.runtime import OnnxRuntime
+from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.profiles.loading import explain
+from airl_mav.profiles.vehicle import Camera
+
+SCHEMA = 1
+"""Version of the card's fields."""
+
+CARD_FILE = "card.json"
+ONNX_FILE = "policy.onnx"
+TORCH_FILE = "policy.pt2"
+"""The same network as a torch program (`torch.export`): optional."""
+
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Count = Annotated[int, Strict()]
+
+
+class Training(ProfileModel):
+    """What made a policy. A policy from elsewhere may not know."""
+
+    arena: str | None = Field(default=None, description="arena profile it was trained in")
+    first_arena_seed: Count | None = Field(default=None, description="first seed of the arenas")
+    last_arena_seed: Count | None = Field(default=None, description="last seed of the arenas")
+    seed: Count | None = Field(default=None, description="seed of the training")
+    env_steps: int | None = quantity("decisions it was trained on", "1", ge=0, default=None)
+    config_file: str | None = Field(default=None, description="name of the training's settings")
+    config: dict[str, Any] = Field(default_factory=dict, description="the settings in full")
+    command: str | None = Field(default=None, description="command that made the policy")
+    versions: dict[str, str] = Field(default_factory=dict, description="packages by name")
+    date_utc: str | None = Field(default=None, description="when it was exported, ISO 8601")
+
+
+class Result(ProfileModel):
+    """How a policy flew a set of episodes; means over the successful ones."""
+
+    arena: str = Field(description="arena profile")
+    level: Level = Field(description="rung of the fidelity ladder")
+    episodes: int = quantity("episodes flown", "1", ge=1)
+    seed: Count = Field(description="seed of the first episode; each has the next")
+    success_rate: float = quantity("share of episodes that reached the goal", "1", ge=0, le=1)
+    flight_time_s: float | None = quantity("flight time", "s", ge=0, default=None)
+    distance_m: float | None = quantity("distance flown", "m", ge=0, default=None)
+    energy_j: float | None = quantity("energy drawn", "J", ge=0, default=None)
+
+
+class PolicyFacts(ProfileModel):
+    """What its maker knows of a policy: everything that the file itself cannot tell."""
+
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$",
+        description="short name: letters, digits, '.', '_', '-'",
+    )
+    description: str = Field(default="", description="one line for people")
+    observation: ObservationSpec
+    actions: ActionSpec = Field(default_factory=ActionSpec)
+    hold_s: float = quantity("t3: how long each action is held", "s", ge=0, le=10)
+    goal_radius_m: float = quantity("radius of the goal in training", "m", ge=0.2, le=50)
+    altitude_m: float = quantity("height above the start", "m", ge=0.5, le=100)
+    hover_after_s: float | None = quantity(
+        "the vehicle hovers when a command is this old; none: the last one keeps flying",
+        "s",
+        ge=0,
+        le=60,
+        default=None,
+    )
+    algorithm: str = Field(default="", description="what trained it")
+    epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)
+    training: Training = Field(default_factory=Training)
+    results: tuple[Result, ...] = Field(default=(), description="how well it flies")
+
+    @model_validator(mode="after")
+    def _random_actions_are_discrete(self) -> PolicyFacts:
+        if self.epsilon and discrete_actions(self.actions) is None:
+            raise ValueError(
+                f"epsilon = {self.epsilon:g}: accepted: 0 with the action set {self.actions.set!r}"
+            )
+        return self
+
+
+class PolicyCard(PolicyFacts):
+    """All of the card."""
+
+    sha256: Digest = Field(description=f"SHA-256 digest of {ONNX_FILE}")
+    torch_sha256: Digest | None = Field(
+        default=None, description=f"SHA-256 digest of {TORCH_FILE}, if there is one"
+    )
+    network: str = Field(description="its layers, in words")
+    parameters: int = quantity("weights and biases", "1", ge=1)
+    macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
+
+
+def digest(data: bytes) -> str:
+    """Return the SHA-256 of a file's bytes, as a card names it."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def read_card(folder: Path) -> PolicyCard:
+    """Read the card of a policy without a look at the policy itself.
+
+    Raises:
+        UsageError: There is none, or it has a field that is missing, unknown or out of range.
+    """
+    path = folder / CARD_FILE
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: not valid JSON: {error}") from None
+    schema = data.pop("schema", None) if isinstance(data, dict) else None
+    if schema != SCHEMA:
+        raise UsageError(f"{path}: schema = {schema!r}: accepted: {SCHEMA}")
+    try:
+        return PolicyCard.model_validate(data)
+    except ValidationError as error:
+        raise UsageError(f"{path}: {explain(error, PolicyCard)}") from None
+
+
+def read_model(folder: Path, card: PolicyCard) -> bytes:
+    """Return the bytes of the policy that a card is for. Raises UsageError for another one."""
+    return _read_bound(folder / ONNX_FILE, card.sha256)
+
+
+def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
+    """Return the bytes of the card's torch program. Raises UsageError for none or another one."""
+    if card.torch_sha256 is None:
+        raise UsageError(
+            f"{folder / TORCH_FILE}: the card names none; export the policy with --with-torch"
+        )
+    return _read_bound(folder / TORCH_FILE, card.torch_sha256)
+
+
+def load_card(folder: Path) -> PolicyCard:
+    """Read the card of a policy and hold the policy against it.
+
+    Raises:
+        UsageError: See `read_card`; also when the file has another digest, or other inputs and
+            outputs than the card says.
+    """
+    card = read_card(folder)
+    open_model(folder, card)
+    return card
+
+
+def open_model(folder: Path, card: PolicyCard, threads: int = 1) -> OnnxRuntime:
+    """Return the policy of a card, ready to infer. Raises UsageError as `load_card` does."""
+    model = read_model(folder, card)
+    try:
+        return OnnxRuntime(model, card.observation, card.actions, threads)
+    except ValueError as error:
+        raise UsageError(f"{folder / ONNX_FILE}: {error}") from None
+
+
+def write_card(folder: Path, card: PolicyCard) -> None:
+    """Write the card beside the policy that it is for; the old card stays until the new is whole.
+
+    Raises:
+        UsageError: The folder holds another policy, or none.
+    """
+    read_model(folder, card)
+    if card.torch_sha256 is not None:
+        read_torch_program(folder, card)
+    plain = {"schema": SCHEMA, **card.model_dump(mode="json")}
+    text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    replace_file(folder / CARD_FILE, text.encode())
+
+
+def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
+    """Return why a vehicle's camera cannot serve a policy, or None when it can."""
+    if (reason := camera_mismatch(card.observation, camera.intrinsics)) is not None:
+        return reason
+    # What lies between the two would look free, and was not so in training.
+    if camera.range_m < card.observation.range_m:
+        return (
+            f"camera with a range of {camera.range_m:g} m; "
+            f"accepted: {card.observation.range_m:g} m or more"
+        )
+    return None
+
+
+def _read_bound(path: Path, sha256: str) -> bytes:
+    """Return a file's bytes if they have the digest. Raises UsageError."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    if (found := digest(data)) != sha256:
+        raise UsageError(
+            f"{path}: SHA-256 {found[:12]}...; accepted: {sha256[:12]}..., that of {CARD_FILE}"
+        )
+    return data

@@ -1,0 +1,194 @@
+"""A learned policy: encode, infer, decide. One rule for the rehearsal and for training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.errors import UsageError
+from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
+from airl_mav.policy.actions import Action
+from airl_mav.policy.card import (
+    TORCH_FILE,
+    PolicyCard,
+    open_model,
+    read_card,
+    read_torch_program,
+)
+from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
+from airl_mav.policy.observation import Observation
+from airl_mav.policy.runtime import Runtime, RuntimeName, TorchRuntime, outputs_of
+
+
+class LearnedPolicy:
+    """A network with its card. Implements `actions.Policy`."""
+
+    def __init__(
+        self,
+        card: PolicyCard,
+        runtime: Runtime,
+        *,
+        rng: np.random.Generator | None = None,
+        ablate: str | None = None,
+    ) -> None:
+        """Put a policy together.
+
+        Args:
+            card: What the network takes and gives.
+            runtime: The network.
+            rng: Source of random actions; a card with an epsilon needs one.
+            ablate: Input that is made zero, as the paper's sensor ablation does; None: none.
+
+        Raises:
+            UsageError: The layout has no such input.
+        """
+        if ablate is not None and ablate not in boxes(card.observation):
+            known = ", ".join(boxes(card.observation))
+            raise UsageError(f"ablate = {ablate!r}: accepted: {known}")
+        self.card = card
+        self._runtime = runtime
+        self._rng = rng
+        self._ablate = ablate
+        self._fitting: Intrinsics | None = None
+        """The camera that was found to fit."""
+
+    def with_generator(self, rng: np.random.Generator) -> LearnedPolicy:
+        """Return the same policy with another source of random actions."""
+        return LearnedPolicy(self.card, self._runtime, rng=rng, ablate=self._ablate)
+
+    def refuses(self, camera: Intrinsics) -> str | None:
+        """Return why a camera cannot serve the policy, or None when it can."""
+        return camera_mismatch(self.card.observation, camera)
+
+    def act(self, observation: Observation) -> Action:
+        """Return the action for an observation of one vehicle.
+
+        Raises:
+            UsageError: The camera is not one that the policy was trained with.
+            ValueError: The network gives no number.
+        """
+        if observation.intrinsics != self._fitting:
+            if (reason := self.refuses(observation.intrinsics)) is not None:
+                raise UsageError(f"policy {self.card.name}: {reason}")
+            self._fitting = observation.intrinsics
+        encoded = encode_layout(self.card.observation, _as_batch(observation))
+        return command(self.card.actions, self.act_batch(encoded)[0])
+
+    def act_batch(
+        self, encoded: Mapping[str, NDArray[Any]], rng: np.random.Generator | None = None
+    ) -> NDArray[Any]:
+        """Return the actions of n vehicles, as `action_sets.commands` takes them.
+
+        Args:
+            encoded: The arrays of the card's layout, each with n rows.
+            rng: Source of random actions in this call; None: the policy's own.
+
+        Returns:
+            (n,) int64 of a discrete set, (n, 2) float32 of the continuous one.
+
+        Raises:
+            ValueError: The network gives no number.
+        """
+        if self._ablate is not None:
+            encoded = ablated(encoded, self._ablate)
+        outputs = self._runtime.infer(encoded)
+        return decide(self.card.actions, outputs, self.card.epsilon, rng or self._rng)
+
+
+def decide(
+    actions: ActionSpec,
+    outputs: NDArray[np.float32],
+    epsilon: float = 0.0,
+    rng: np.random.Generator | None = None,
+) -> NDArray[Any]:
+    """Turn a network's outputs (n, k) into actions: the best score wins, or chance.
+
+    Args:
+        actions: The action set.
+        outputs: A score for each discrete action, or the continuous action itself.
+        epsilon: Share of random actions; discrete sets only.
+        rng: Source of random actions; needed with an epsilon.
+
+    Returns:
+        (n,) int64 of a discrete set, (n, 2) float32 of the continuous one.
+
+    Raises:
+        ValueError: An output is not a number, or chance has no source.
+    """
+    if np.isnan(outputs).any():
+        raise ValueError("the network's output is not a number")
+    count = discrete_actions(actions)
+    if count is None:
+        return outputs
+    chosen: NDArray[np.int64] = outputs.argmax(axis=1)
+    if epsilon > 0.0:
+        if rng is None:
+            raise ValueError(f"epsilon = {epsilon:g} needs a random generator")
+        random = rng.integers(0, count, len(chosen))
+        chosen = np.where(rng.random(len(chosen)) < epsilon, random, chosen)
+    return chosen
+
+
+def load_learned(
+    folder: Path,
+    *,
+    runtime: RuntimeName = "onnx",
+    threads: int = 1,
+    rng: np.random.Generator | None = None,
+    ablate: str | None = None,
+) -> LearnedPolicy:
+    """Load a policy from a folder with `policy.onnx` and `card.json`.
+
+    Args:
+        folder: The folder.
+        runtime: What runs the network; `torch` takes the folder's `policy.pt2`.
+        threads: Threads of one inference.
+        rng: Source of random actions; a card with an epsilon needs one.
+        ablate: Input that is made zero; None: none.
+
+    Raises:
+        UsageError: Card and policy do not fit each other, or the runtime is not installed.
+    """
+    card = read_card(folder)
+    network: Runtime
+    if runtime == "onnx":
+        network = open_model(folder, card, threads)
+    else:
+        program = read_torch_program(folder, card)
+        try:
+            network = TorchRuntime(program, card.observation, threads)
+        except ValueError as error:
+            raise UsageError(f"{folder / TORCH_FILE}: {error}") from None
+    policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
+    _warm_up(policy, network)
+    return policy
+
+
+def _warm_up(policy: LearnedPolicy, network: Runtime) -> None:
+    """Infer once, so that the first decision in the air is no slower than the others."""
+    blank = {
+        key: np.zeros((1, *box.shape), box.dtype)
+        for key, box in boxes(policy.card.observation).items()
+    }
+    found, wanted = network.infer(blank).shape, (1, outputs_of(policy.card.actions))
+    if found != wanted:
+        raise UsageError(f"policy {policy.card.name}: output {found}; accepted: {wanted}")
+
+
+def _as_batch(seen: Observation) -> Observation:
+    """Return the observation of one vehicle as one of n = 1."""
+    return replace(
+        seen,
+        depth_mm=seen.depth_mm[None],
+        goal=seen.goal[None],
+        velocity=seen.velocity[None],
+        roll=np.array([seen.roll]),
+        pitch=np.array([seen.pitch]),
+        yaw=np.array([seen.yaw]),
+    )

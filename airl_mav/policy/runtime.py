@@ -1,0 +1,155 @@
+"""What runs a network: ONNX Runtime, or torch where it is installed.
+
+Both are imported only when a network is opened: a classical policy needs neither.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.layouts import ObservationSpec, boxes
+
+RuntimeName = Literal["onnx", "torch"]
+
+ACTION = "action"
+"""Name of the network's only output."""
+
+CONTINUOUS_OUTPUTS = 2
+"""Numbers of a continuous action: forward and right speed."""
+
+_ERRORS_ONLY = 3
+"""ONNX Runtime's severity: warnings about the machine are not for the pilot."""
+
+_ONNX_TYPES: dict[type[np.generic], str] = {
+    np.uint8: "tensor(uint8)",
+    np.float32: "tensor(float)",
+}
+
+
+class Runtime(Protocol):
+    """A network ready to infer."""
+
+    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
+        ...
+
+
+def outputs_of(actions: ActionSpec) -> int:
+    """Return the number of outputs: a score for each discrete action, or the action itself."""
+    return discrete_actions(actions) or CONTINUOUS_OUTPUTS
+
+
+class OnnxRuntime:
+    """A network in ONNX Runtime, on the CPU. Implements `Runtime`."""
+
+    def __init__(
+        self, model: bytes, observation: ObservationSpec, actions: ActionSpec, threads: int = 1
+    ) -> None:
+        """Open a network.
+
+        Args:
+            model: The bytes of an .onnx file that holds its weights.
+            observation: What it must take.
+            actions: What it must give.
+            threads: Threads of one inference. Small networks are fastest with one.
+
+        Raises:
+            ValueError: No ONNX, or other inputs or outputs.
+        """
+        import onnxruntime
+
+        onnxruntime.set_default_logger_severity(_ERRORS_ONLY)
+        onnxruntime.disable_telemetry_events()
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = _ERRORS_ONLY
+        # A waiting thread must not burn a core that telemetry needs.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        try:
+            self._session = onnxruntime.InferenceSession(
+                model, options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # ONNX Runtime's errors share no other base class.
+            raise ValueError(f"not a model that ONNX Runtime loads: {_line(error)}") from None
+        _check_signature(self._session, observation, actions)
+
+    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs (n, k) for the arrays of a layout."""
+        found: NDArray[np.float32] = self._session.run([ACTION], dict(encoded))[0]
+        return found
+
+
+class TorchRuntime:
+    """A network as a torch program (`torch.export`), on the CPU. Implements `Runtime`."""
+
+    def __init__(self, program: bytes, observation: ObservationSpec, threads: int = 1) -> None:
+        """Open a network.
+
+        Args:
+            program: The bytes of a .pt2 file.
+            observation: What it takes.
+            threads: Threads of torch, in the whole process.
+
+        Raises:
+            ValueError: torch is not installed, or cannot load the program.
+        """
+        try:
+            import torch
+        except ImportError:
+            raise ValueError("torch is not installed; pip install 'airl-mav[train]'") from None
+        torch.set_num_threads(threads)
+        try:
+            self._module = torch.export.load(io.BytesIO(program)).module()
+        except Exception as error:  # Anything, from a bad archive to an unknown operator.
+            raise ValueError(f"not a program that torch loads: {_line(error)}") from None
+        self._torch = torch
+        self._keys = tuple(boxes(observation))
+
+    def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs (n, k) for the arrays of a layout."""
+        with self._torch.inference_mode():
+            tensors = [self._torch.from_numpy(np.ascontiguousarray(encoded[k])) for k in self._keys]
+            found: NDArray[np.float32] = self._module(*tensors).numpy()
+        return found
+
+
+def _check_signature(session: Any, observation: ObservationSpec, actions: ActionSpec) -> None:
+    """Raise ValueError unless a session takes and gives what its card says."""
+    wanted = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
+    _compare("inputs", session.get_inputs(), wanted)
+    _compare("outputs", session.get_outputs(), {ACTION: ("tensor(float)", (outputs_of(actions),))})
+
+
+def _compare(
+    what: str, nodes: list[Any], wanted: Mapping[str, tuple[str, tuple[int, ...]]]
+) -> None:
+    """Compare inputs or outputs by name, type and shape; the first axis must be free."""
+    found = {node.name: (node.type, tuple(node.shape)) for node in nodes}
+    fits = found.keys() == wanted.keys() and all(
+        found[name][0] == kind
+        and found[name][1][1:] == shape
+        and not isinstance(found[name][1][0], int)
+        for name, (kind, shape) in wanted.items()
+    )
+    if not fits:
+        accepted = {name: (kind, ("n", *shape)) for name, (kind, shape) in wanted.items()}
+        raise ValueError(f"{what} {_signature(found)}; accepted: {_signature(accepted)}")
+
+
+def _signature(nodes: Mapping[str, tuple[str, tuple[Any, ...]]]) -> str:
+    return ", ".join(
+        f"{name} {kind} ({', '.join(str(axis) for axis in shape)})"
+        for name, (kind, shape) in nodes.items()
+    )
+
+
+def _line(error: Exception) -> str:
+    """Return the first line of an error."""
+    return (str(error) or type(error).__name__).splitlines()[0]

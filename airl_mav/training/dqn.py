@@ -1,0 +1,173 @@
+"""Double DQN with n-step returns, on stable-baselines3's DQN.
+
+Double Q-learning: van Hasselt et al., "Deep Reinforcement Learning with Double Q-learning" (AAAI
+2016). N-step returns: Sutton, "Learning to predict by the methods of temporal differences" (1988);
+as in Rainbow, the behaviour within the n steps is not corrected for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import DQN
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.dqn.policies import DQNPolicy
+from torch.nn import functional
+
+from airl_mav.training.replay import Batch, NStepReplay
+from airl_mav.training.spec import Precision
+
+
+class DoubleDQN(DQN):
+    """DQN with double Q-learning, n-step returns and Dict observations of n vehicles.
+
+    All intervals count steps of single vehicles, whatever their number. Vehicles explore each for
+    itself. One generator draws exploration and samples, so that a run can be continued exactly.
+
+    Args:
+        policy: "MultiInputPolicy".
+        env: The vectorised environment.
+        n_step: Rewards summed before the bootstrap.
+        double: Choose the next action with the online network, not with the target network.
+        env_steps_per_update: Steps for each update.
+        target_update_interval: Steps between two updates of the target network.
+        precision: Numbers of the networks' passes; weights and their updates stay float32.
+        arguments: Further arguments of stable-baselines3's DQN.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[DQNPolicy],
+        env: Any,
+        *,
+        n_step: int = 3,
+        double: bool = True,
+        env_steps_per_update: int = 32,
+        target_update_interval: int = 8000,
+        precision: Precision = "float32",
+        _init_setup_model: bool = True,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            train_freq=1,
+            gradient_steps=1,
+            target_update_interval=target_update_interval,
+            _init_setup_model=False,
+            **arguments,
+        )
+        self.n_step = n_step
+        self.double = double
+        self.env_steps_per_update = env_steps_per_update
+        self.precision = precision
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        assert isinstance(self.observation_space, spaces.Dict)  # noqa: S101 (MultiInputPolicy's)
+        boxes = {k: cast("spaces.Box", v) for k, v in self.observation_space.spaces.items()}
+        shapes = {k: (box.shape, box.dtype) for k, box in boxes.items()}
+        self.replay = NStepReplay(self.buffer_size, self.n_envs, shapes, self.n_step, self.gamma)
+        # The base class only hands it from one method to another, and those are overridden below.
+        self.replay_buffer = cast("ReplayBuffer", self.replay)
+        # Before the first whole chain there is nothing to learn from.
+        self.learning_starts = max(self.learning_starts, self.n_step * self.n_envs)
+        self.generator = np.random.default_rng(self.seed)
+        super()._setup_model()
+
+    def _sample_action(
+        self,
+        learning_starts: int,
+        action_noise: ActionNoise | None = None,  # noqa: ARG002 (the base class's signature)
+        n_envs: int = 1,
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return an action for each vehicle, twice: as flown and as remembered."""
+        warm_up = self.num_timesteps < learning_starts
+        share = 1.0 if warm_up else self.exploration_rate
+        greedy = self.generator.random(n_envs) >= share
+        choices = int(cast("spaces.Discrete", self.action_space).n)
+        actions = self.generator.integers(choices, size=n_envs)
+        if greedy.any():
+            seen = cast("Mapping[str, NDArray[Any]]", self._last_obs)
+            with torch.no_grad(), self._autocast():
+                values = self.q_net(self._tensors({k: v[greedy] for k, v in seen.items()}))
+            actions[greedy] = values.argmax(dim=1).cpu().numpy()
+        return actions, actions
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,  # noqa: ARG002 (the base class's signature)
+        buffer_action: NDArray[Any],
+        new_obs: NDArray[Any] | dict[str, NDArray[Any]],
+        reward: NDArray[Any],
+        dones: NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        seen = cast("Mapping[str, NDArray[Any]]", self._last_obs)
+        self.replay.add(seen, buffer_action, reward, dones, infos)
+        self._last_obs = new_obs
+
+    def _on_step(self) -> None:
+        if self._due(self.target_update_interval):
+            polyak_update(self.q_net.parameters(), self.q_net_target.parameters(), self.tau)
+        self.exploration_rate = self.exploration_schedule(self._current_progress_remaining)
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Make the updates that the last step of all vehicles has earned."""
+        updates = gradient_steps * self._due(self.env_steps_per_update)
+        if not updates:
+            return
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = [
+            self._update(self.replay.sample(batch_size, self.generator)) for _ in range(updates)
+        ]
+        self._n_updates += updates
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", float(np.mean(losses)))
+
+    def _update(self, batch: Batch) -> float:
+        """Make one update and return its loss."""
+        following = self._tensors(batch.next_observations)
+        returns, discounts = self._tensor(batch.returns), self._tensor(batch.discounts)
+        with torch.no_grad(), self._autocast():
+            values = self.q_net_target(following).float()
+            chooser = self.q_net(following) if self.double else values
+            chosen = chooser.argmax(dim=1, keepdim=True)
+            target = returns + discounts * values.gather(1, chosen).squeeze(1)
+        with self._autocast():
+            estimates = self.q_net(self._tensors(batch.observations)).float()
+        taken = estimates.gather(1, self._tensor(batch.actions)[:, None]).squeeze(1)
+        loss = functional.smooth_l1_loss(taken, target)
+        self.policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.q_net.parameters(), self.max_grad_norm)
+        self.policy.optimizer.step()
+        return loss.item()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "replay", "generator"]
+
+    def _due(self, interval: int) -> int:
+        """Return how many multiples of an interval lie within the last step of all vehicles."""
+        return self.num_timesteps // interval - (self.num_timesteps - self.n_envs) // interval
+
+    def _autocast(self) -> AbstractContextManager[Any]:
+        wanted = self.precision == "bfloat16"
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=wanted)
+
+    def _tensor(self, array: NDArray[Any]) -> torch.Tensor:
+        return torch.from_numpy(array).to(self.device)
+
+    def _tensors(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+        return {key: self._tensor(array) for key, array in arrays.items()}

@@ -1,0 +1,163 @@
+"""All that a learner and its environment consist of, as weights, arrays and plain values."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Mapping
+from operator import attrgetter
+from typing import Any, Protocol, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from airl_mav.training.dqn import DoubleDQN
+
+Arrays = dict[str, NDArray[Any]]
+
+COUNTERS = (
+    "num_timesteps",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_episode_num",
+    "_n_updates",
+    "_n_calls",
+    "_current_progress_remaining",
+    "exploration_rate",
+)
+"""Plain numbers of a learner; not every one has all of them."""
+
+
+class Restorable(Protocol):
+    """A VecEnv that can be put back to where it was."""
+
+    def get_state(self) -> Mapping[str, NDArray[Any]]:
+        """Return everything that its future depends on, by name."""
+        ...
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take over what `get_state` gave."""
+        ...
+
+
+def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
+    """Return all that a learner and its environment consist of: weights, arrays, the rest."""
+    weights: dict[str, Any] = {
+        "states": model.get_parameters(),
+        "variables": {n: attrgetter(n)(model).detach() for n in _variables(model)},
+        "rng": {"cpu": torch.get_rng_state()},
+    }
+    if model.device.type == "cuda":
+        weights["rng"]["cuda"] = torch.cuda.get_rng_state(model.device)
+    last = cast("Mapping[str, NDArray[Any]]", model._last_obs)
+    arrays = {f"last_obs/{key}": array for key, array in last.items()}
+    arrays["last_episode_starts"] = np.asarray(model._last_episode_starts)
+    arrays |= {f"env/{key}": array for key, array in _env(model).get_state().items()}
+    arrays |= {f"replay/{key}": array for key, array in _get_replay(model).items()}
+    state = {
+        "counters": {name: getattr(model, name) for name in COUNTERS if hasattr(model, name)},
+        "episodes": list(model.ep_info_buffer or ()),
+        "successes": list(model.ep_success_buffer or ()),
+        "random": {
+            "python": random.getstate(),
+            # stable-baselines3 shuffles and explores with the global generator.
+            "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
+            "generators": [each.bit_generator.state for each in _generators(model)],
+        },
+    }
+    return weights, arrays, state
+
+
+def restore(
+    model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
+) -> None:
+    """Put back what `collect` gave.
+
+    Raises:
+        KeyError, RuntimeError, ValueError: It is of a learner of another specification.
+    """
+    model.set_parameters(weights["states"], exact_match=True, device=model.device)
+    for name in _variables(model):
+        attrgetter(name)(model).data.copy_(weights["variables"][name])
+    starts = arrays["last_episode_starts"]
+    if starts.shape != (model.n_envs,):
+        raise ValueError(f"{len(starts)} vehicles, not {model.n_envs}")
+    model._last_obs = _below("last_obs/", arrays)
+    model._last_episode_starts = starts
+    _set_replay(model, _below("replay/", arrays))
+    _env(model).set_state(_below("env/", arrays))
+    for name, value in state["counters"].items():
+        setattr(model, name, value)
+    window = model._stats_window_size
+    model.ep_info_buffer = deque(state["episodes"], maxlen=window)
+    model.ep_success_buffer = deque(state["successes"], maxlen=window)
+    # Last: what came before may have drawn.
+    version, internal, gauss = state["random"]["python"]
+    random.setstate((version, tuple(internal), gauss))
+    np.random.set_state(state["random"]["numpy"])  # noqa: NPY002
+    for generator, saved in zip(_generators(model), state["random"]["generators"], strict=True):
+        generator.bit_generator.state = saved
+    torch.set_rng_state(weights["rng"]["cpu"])
+    if model.device.type == "cuda":
+        torch.cuda.set_rng_state(weights["rng"]["cuda"], model.device)
+
+
+def _variables(model: BaseAlgorithm) -> list[str]:
+    return model._get_torch_save_params()[1]
+
+
+def _generators(model: BaseAlgorithm) -> list[np.random.Generator]:
+    """Return the generators that a learner draws from, beside the global ones."""
+    own = getattr(model, "generator", None)
+    return [model.action_space.np_random, *([] if own is None else [own])]
+
+
+def _env(model: BaseAlgorithm) -> Restorable:
+    if not hasattr(model.env, "get_state"):
+        raise TypeError(f"{type(model.env).__name__} has no get_state/set_state")
+    return cast("Restorable", model.env)
+
+
+def _below(prefix: str, arrays: Arrays) -> Arrays:
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _get_replay(model: BaseAlgorithm) -> Arrays:
+    """Return the filled part of a learner's replay memory by name; nothing when it has none."""
+    if isinstance(model, DoubleDQN):
+        return model.replay.get_state()
+    buffer = _stock_buffer(model)
+    if buffer is None:
+        return {}
+    filled = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {name: array[:filled] for name, array in _stock_arrays(buffer).items()}
+    return arrays | {"pos": np.array(buffer.pos), "full": np.array(buffer.full)}
+
+
+def _set_replay(model: BaseAlgorithm, saved: Mapping[str, NDArray[Any]]) -> None:
+    """Put back what `_get_replay` gave. Raises ValueError when it is of another size."""
+    if isinstance(model, DoubleDQN):
+        model.replay.set_state(saved)
+        return
+    buffer = _stock_buffer(model)
+    if buffer is None:
+        return
+    for name, array in _stock_arrays(buffer).items():
+        array[: len(saved[name])] = saved[name]
+    buffer.pos, buffer.full = int(saved["pos"]), bool(saved["full"])
+
+
+def _stock_buffer(model: BaseAlgorithm) -> DictReplayBuffer | None:
+    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    return buffer if isinstance(buffer, DictReplayBuffer) else None
+
+
+def _stock_arrays(buffer: DictReplayBuffer) -> Arrays:
+    names = ("actions", "rewards", "dones", "timeouts")
+    arrays: Arrays = {name: getattr(buffer, name) for name in names}
+    arrays |= {f"observations/{key}": array for key, array in buffer.observations.items()}
+    return arrays | {f"next/{key}": array for key, array in buffer.next_observations.items()}

@@ -1,0 +1,135 @@
+"""Networks from their specification, as stable-baselines3 takes them.
+
+The extractor holds the convolutions and joins their output with velocity and goal; the dense layers
+are the policy's `net_arch`, so that every algorithm builds its own heads on it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from torch import nn
+
+from airl_mav.errors import UsageError
+from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY
+from airl_mav.training.spec import NetworkSpec
+
+VECTORS = (VELOCITY, GOAL)
+VECTOR_INPUTS = 6
+
+
+class Convolution(NamedTuple):
+    """One convolution with square kernel, followed by a ReLU."""
+
+    filters: int
+    kernel: int
+    stride: int
+    padding: int
+
+
+def convolutions(spec: NetworkSpec, height_px: int) -> list[Convolution]:
+    """Return the convolutions of a network for images of a height."""
+    if spec.kind == "template":
+        assert spec.layers is not None and spec.filters is not None  # noqa: S101 (the validator's)
+        return [Convolution(spec.filters, 3, 1, 1)] * spec.layers
+    if spec.kind == "small":
+        strides = spec.strides or (2, 2, 2, 1)
+        return [
+            Convolution(filters, 3, stride, 1)
+            for filters, stride in zip((16, 32, 32, 32), strides, strict=True)
+        ]
+    # Air Learning's code has 4, 2, 1, 1 for 154 rows; a low image would be gone after two layers.
+    strides = spec.strides or ((4, 2, 1, 1) if height_px >= 48 else (2, 2, 1, 1))
+    return [
+        Convolution(filters, kernel, stride, 0)
+        for filters, kernel, stride in zip((32, 64, 128, 64), (4, 4, 2, 1), strides, strict=True)
+    ]
+
+
+def dense_units(spec: NetworkSpec) -> list[int]:
+    """Return the units of each dense layer, without the output."""
+    if spec.kind == "template":
+        assert spec.layers is not None and spec.filters is not None  # noqa: S101 (the validator's)
+        return [spec.filters] * spec.layers
+    return [256] * 3 if spec.kind == "appendix" else [128] * 2
+
+
+def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
+    """Return the numbers that the convolutions give for an image.
+
+    Raises:
+        UsageError: The image is too small for them.
+    """
+    height, width, filters = height_px, width_px, 1
+    for filters, kernel, stride, padding in convolutions(spec, height_px):  # noqa: B007
+        height = (height + 2 * padding - kernel) // stride + 1
+        width = (width + 2 * padding - kernel) // stride + 1
+        if min(height, width) < 1:
+            raise UsageError(
+                f"network {spec.kind!r}: an image of {width_px}x{height_px} px is too small "
+                "for its convolutions; take smaller strides or a larger image"
+            )
+    return filters * height * width
+
+
+class DepthExtractor(BaseFeaturesExtractor):
+    """Convolutions over `depth` (n, 1, height, width), joined with `velocity` and `goal`.
+
+    The image comes in scaled to 0..1, which stable-baselines3 does with uint8 images.
+    """
+
+    def __init__(self, observation_space: spaces.Dict, spec: NetworkSpec) -> None:
+        shape = observation_space[DEPTH].shape
+        assert shape is not None  # noqa: S101 (a Box has a shape)
+        super().__init__(observation_space, flat_size(spec, *shape[1:]) + VECTOR_INPUTS)
+        self.convolutions = _convolution_stack(spec, shape[1])
+
+    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the features (n, features_dim)."""
+        flat = self.convolutions(observations[DEPTH])
+        # Under autocast the convolutions give bfloat16, the vectors are float32.
+        vectors = [observations[key].to(flat.dtype) for key in VECTORS]
+        return torch.cat([flat, *vectors], dim=1)
+
+
+def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
+    """Return the `policy_kwargs` with which a MultiInputPolicy builds a network."""
+    return {
+        "features_extractor_class": DepthExtractor,
+        "features_extractor_kwargs": {"spec": spec},
+        "net_arch": dense_units(spec),
+        "activation_fn": nn.ReLU,
+    }
+
+
+def to_channels_last(policy: nn.Module) -> None:
+    """Lay the convolutions' weights out for the CPU's fast kernels; the numbers stay the same.
+
+    Only on a finished policy: orthogonal initialisation cannot view such weights.
+    """
+    for module in policy.modules():
+        if isinstance(module, nn.Conv2d):
+            module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def count_parameters(spec: NetworkSpec, height_px: int, width_px: int, outputs: int = 25) -> int:
+    """Return the weights and biases of a network, from the image to its outputs."""
+    with torch.device("meta"):
+        features = flat_size(spec, height_px, width_px) + VECTOR_INPUTS
+        layers = [
+            *_convolution_stack(spec, height_px),
+            *create_mlp(features, outputs, dense_units(spec)),
+        ]
+        return sum(weights.numel() for layer in layers for weights in layer.parameters())
+
+
+def _convolution_stack(spec: NetworkSpec, height_px: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    channels = 1
+    for filters, kernel, stride, padding in convolutions(spec, height_px):
+        layers += [nn.Conv2d(channels, filters, kernel, stride, padding), nn.ReLU()]
+        channels = filters
+    return nn.Sequential(*layers, nn.Flatten())

@@ -1,0 +1,254 @@
+"""Train: the learner, periodic evaluation, the best weights, checkpoints.
+
+All that is not learning happens between two rollouts, where a run can be taken up again exactly.
+"""
+
+from __future__ import annotations
+
+import io
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+
+from airl_mav.clock import WallClock
+from airl_mav.constants import US_PER_S
+from airl_mav.envs.evaluation import Flown, fly_episodes, success_rate
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.spec import EnvironmentSpec, Randomisation
+from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.policy.layouts import Encoded
+from airl_mav.training.algorithms import make_model
+from airl_mav.training.checkpoint import load_latest, save_checkpoint
+from airl_mav.training.config import SELECTION_SEED, TrainingConfig
+from airl_mav.training.store import Evaluation, TrainingFolder
+
+RECENT = 200
+"""Episodes in training that the shown success rate is of."""
+
+LOG_EVERY = 100
+"""Episodes (off-policy) between two points of the TensorBoard curves."""
+
+
+class Watcher(Protocol):
+    """Whoever shows the progress."""
+
+    def progress(self, steps: int, success: float | None, zone: int | None) -> None:
+        """Training goes on."""
+        ...
+
+    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
+        """An evaluation is done."""
+        ...
+
+    def checkpointed(self, steps: int) -> None:
+        """A checkpoint lies on the disk."""
+        ...
+
+
+def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Return the environment that policies are judged in: the whole arena, nothing randomised."""
+    return spec.model_copy(update={"curriculum": None, "randomisation": Randomisation()})
+
+
+def train(config: TrainingConfig, folder: TrainingFolder, watcher: Watcher) -> Evaluation:
+    """Train to the end, from the newest checkpoint if there is one.
+
+    Args:
+        config: What to train.
+        folder: Where everything goes.
+        watcher: Is told how it goes.
+
+    Returns:
+        The evaluation of the best weights, which lie in `folder.best_model`.
+
+    Raises:
+        UsageError: The algorithm does not fit the environment, an arena cannot be made.
+    """
+    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment))
+    env.seed(config.seed)
+    model = make_model(config.algorithm, config.network, env, config.seed)
+    model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
+    callback = _Between(config, folder, watcher, env)
+    meta = load_latest(folder.checkpoints, model)
+    if meta is not None:
+        callback.restore(meta)
+        folder.forget_after(model.num_timesteps)
+    left = config.steps - model.num_timesteps
+    if left > 0 and not callback.done:
+        model.learn(
+            left, callback=callback, log_interval=LOG_EVERY, reset_num_timesteps=meta is None
+        )
+    callback.finish(model)
+    best = folder.best()
+    assert best is not None  # noqa: S101 - finish() has evaluated
+    return best
+
+
+class _Between(BaseCallback):
+    """What happens between two rollouts."""
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        folder: TrainingFolder,
+        watcher: Watcher,
+        env: NavigationVecEnv,
+    ) -> None:
+        super().__init__()
+        self.done = False
+        self._config = config
+        self._folder = folder
+        self._watcher = watcher
+        self._env = env
+        self._recent: deque[bool] = deque(maxlen=RECENT)
+        self._evaluated = -1
+        self._saved = 0
+        self._before_s = 0.0
+        self._clock = WallClock()
+        self._paused_us = 0
+
+    # --- checkpoints
+
+    def restore(self, meta: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self._recent.extend(meta["recent"])
+        self._evaluated = meta["evaluated"]
+        self._saved = meta["steps"]
+        self._before_s = meta["seconds"]
+        self.done = meta["done"]
+
+    def _meta(self) -> dict[str, Any]:
+        return {
+            "steps": self.model.num_timesteps,
+            "seconds": self._seconds(),
+            "recent": list(self._recent),
+            "evaluated": self._evaluated,
+            "done": self.done,
+        }
+
+    def _save(self) -> None:
+        self._saved = self.model.num_timesteps
+        save_checkpoint(self._folder.checkpoints, self.model, self._meta())
+        self._watcher.checkpointed(self._saved)
+
+    # --- SB3's hooks
+
+    def _on_rollout_start(self) -> None:
+        steps, selection = self.model.num_timesteps, self._config.selection
+        if steps // selection.every > max(self._evaluated, 0) // selection.every:
+            self._evaluate(self.model)
+        if steps - self._saved >= self._config.checkpoint_every:
+            self._save()
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "episode" in info:
+                self._recent.append(bool(info["is_success"]))
+        curriculum = self._env.env.curriculum
+        zone = None if curriculum is None else curriculum.zone
+        if zone is not None:
+            self.logger.record("rollout/zone", zone)
+        self._watcher.progress(self.model.num_timesteps, self._success(), zone)
+        return not self.done
+
+    def finish(self, model: BaseAlgorithm) -> None:
+        """Evaluate and save the last weights, unless that has been done."""
+        self.model = model
+        if self._evaluated < model.num_timesteps:
+            self._evaluate(model)
+        self.done = True
+        if self._saved < model.num_timesteps:
+            self._save()
+
+    # --- evaluation
+
+    def _evaluate(self, model: BaseAlgorithm) -> None:
+        seconds, began_us = self._seconds(), self._clock.time_us()
+        selection = self._config.selection
+        seeds = range(SELECTION_SEED, SELECTION_SEED + selection.episodes)
+        flown = list(fly_episodes(nominal(self._config.environment), greedy(model), seeds))
+        curriculum = self._env.env.curriculum
+        evaluation = summary(
+            flown,
+            steps=model.num_timesteps,
+            seconds=seconds,
+            training_success=self._success(),
+            zone=None if curriculum is None else curriculum.zone,
+        )
+        self._evaluated = model.num_timesteps
+        best = self._folder.best()
+        better = best is None or evaluation.rank > best.rank
+        if better:
+            self._folder.save_best(saved(model), evaluation)
+        self._folder.add_evaluation(evaluation)
+        model.logger.record("eval/success_rate", evaluation.success_rate)
+        if evaluation.flight_time_s is not None:
+            model.logger.record("eval/flight_time_s", evaluation.flight_time_s)
+        model.logger.dump(model.num_timesteps)
+        if selection.stop_at is not None and evaluation.success_rate >= selection.stop_at:
+            self.done = True
+        self._paused_us += self._clock.time_us() - began_us
+        self._watcher.evaluated(evaluation, best=better)
+
+    def _success(self) -> float | None:
+        return sum(self._recent) / len(self._recent) if self._recent else None
+
+    def _seconds(self) -> float:
+        return self._before_s + (self._clock.time_us() - self._paused_us) / US_PER_S
+
+
+def greedy(model: BaseAlgorithm) -> Callable[[Encoded], NDArray[Any]]:
+    """Return the decisions of a learner without exploration."""
+
+    def decide(seen: Encoded) -> NDArray[Any]:
+        actions, _ = model.predict(seen, deterministic=True)
+        return actions
+
+    return decide
+
+
+def summary(
+    flown: Sequence[Flown],
+    *,
+    steps: int,
+    seconds: float,
+    training_success: float | None,
+    zone: int | None,
+) -> Evaluation:
+    """Return an evaluation in figures."""
+    good = [each for each in flown if each.verdict == Verdict.SUCCESS]
+    crashed = sum(each.verdict == Verdict.COLLISION for each in flown)
+    return Evaluation(
+        steps=steps,
+        seconds=seconds,
+        episodes=len(flown),
+        success_rate=success_rate(flown),
+        collision_rate=crashed / len(flown),
+        flight_time_s=float(np.mean([each.flight_time_s for each in good])) if good else None,
+        distance_m=float(np.mean([each.distance_m for each in good])) if good else None,
+        training_success=training_success,
+        zone=zone,
+    )
+
+
+def saved(model: BaseAlgorithm) -> bytes:
+    """Return a learner as stable-baselines3 saves it, without its replay."""
+    buffer = io.BytesIO()
+    model.save(buffer, exclude=["replay", "replay_buffer", "generator"])
+    return buffer.getvalue()
+
+
+def load_best(folder: TrainingFolder, config: TrainingConfig) -> BaseAlgorithm:
+    """Return a learner with the best weights of a run."""
+    env = NavigationVecEnv(NavigationVectorEnv(1, config.environment))
+    model = make_model(config.algorithm, config.network, env, config.seed)
+    model.set_parameters(str(Path(folder.best_model)), device="cpu")
+    return model

@@ -1,0 +1,230 @@
+"""Stable-Baselines3 models, ours or foreign, to policies that fly."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import zipfile
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import preprocess_obs
+from torch import nn
+
+from airl_mav.errors import UsageError
+from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.card import PolicyCard, PolicyFacts
+from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
+from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS
+from airl_mav.training.export import TOLERANCE, export_network, random_inputs
+
+CHECKED = 64
+"""Random observations on which the model's own decisions are compared."""
+
+_LIBRARIES = ("airl_mav.training.dqn", "stable_baselines3", "sb3_contrib")
+
+
+class _Network(nn.Module):
+    """From the three inputs to SB3's Dict of observations."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(
+        self, depth: torch.Tensor, velocity: torch.Tensor, goal: torch.Tensor
+    ) -> torch.Tensor:
+        found: torch.Tensor = self.inner({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
+        return found
+
+
+class _MeanOfQuantiles(nn.Module):
+    """QR-DQN: the value of an action is the mean of its quantiles."""
+
+    def __init__(self, quantiles: nn.Module) -> None:
+        super().__init__()
+        self.quantiles = quantiles
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        found: torch.Tensor = self.quantiles(seen).mean(dim=1)
+        return found
+
+
+class _Actor(nn.Module):
+    """The way from observations to actions alone: no noise, no value function."""
+
+    def __init__(self, owner: Any, extractor: nn.Module, *layers: nn.Module) -> None:
+        super().__init__()
+        self.space, self.scaled = owner.observation_space, owner.normalize_images
+        self.extractor = extractor
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        # SB3 divides uint8 images by 255 here.
+        scaled = preprocess_obs(cast("Any", seen), self.space, normalize_images=self.scaled)
+        found: torch.Tensor = self.layers(self.extractor(scaled))
+        return found
+
+
+def network_of(model: BaseAlgorithm) -> nn.Module:
+    """Return the part of a model that decides, as `export_network` takes it.
+
+    Raises:
+        UsageError: The policy has a memory, or is of a kind that is not known.
+    """
+    policy: Any = model.policy
+    if hasattr(policy, "lstm_actor"):
+        raise UsageError(f"{type(model).__name__}: recurrent policies cannot be exported")
+    if hasattr(policy, "quantile_net"):
+        return _Network(_MeanOfQuantiles(policy.quantile_net))
+    if hasattr(policy, "q_net"):
+        return _Network(policy.q_net)
+    actor: Any = getattr(policy, "actor", None)
+    if hasattr(actor, "latent_pi"):
+        # SAC and its kin: the mode of the squashed Gaussian is the squashed mean.
+        return _Network(
+            _Actor(actor, actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
+        )
+    if actor is not None:
+        return _Network(actor)
+    if hasattr(policy, "mlp_extractor"):
+        # PPO and its kin: logits of discrete actions; else the mean, squashed or cut off.
+        last: nn.Module = nn.Identity()
+        if isinstance(policy.action_space, spaces.Box):
+            last = nn.Tanh() if policy.squash_output else nn.Hardtanh(-1.0, 1.0)
+        hidden = policy.mlp_extractor.policy_net
+        extractor = policy.pi_features_extractor
+        return _Network(_Actor(policy, extractor, hidden, policy.action_net, last))
+    raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
+
+
+def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpec) -> None:
+    """Raise UsageError unless a model takes the arrays of a layout and gives an action set."""
+    seen = model.observation_space
+    wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
+    accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
+    parts = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"not a Dict": seen}
+    fits = parts.keys() == wanted.keys() and all(
+        isinstance(part, spaces.Box)
+        and part.shape == wanted[key][0]
+        # SB3 turns all floats into float32.
+        and (part.dtype == np.uint8 if key == DEPTH else part.dtype.kind == "f")
+        for key, part in parts.items()
+    )
+    if not fits:
+        found = ", ".join(f"{key} {part.dtype} {part.shape}" for key, part in parts.items())
+        raise UsageError(f"observation space {found}; accepted with this layout: {accepted}")
+    space, count = model.action_space, discrete_actions(actions)
+    if count is not None:
+        if not (isinstance(space, spaces.Discrete) and space.n == count and space.start == 0):
+            raise UsageError(
+                f"action space {space}; accepted with {actions.set!r}: Discrete({count})"
+            )
+    elif not (
+        isinstance(space, spaces.Box)
+        and space.shape == (CONTINUOUS_OUTPUTS,)
+        and (space.low == -1.0).all()
+        and (space.high == 1.0).all()
+    ):
+        raise UsageError(
+            f"action space {space}; accepted with {actions.set!r}: "
+            f"Box(-1.0, 1.0, ({CONTINUOUS_OUTPUTS},), float32)"
+        )
+
+
+def export_sb3(
+    model: BaseAlgorithm, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
+) -> PolicyCard:
+    """Write a model as `policy.onnx` with its card, and return the card.
+
+    Args:
+        model: Any algorithm of stable-baselines3 or sb3-contrib without memory.
+        facts: What the card says beyond the network.
+        folder: Where to write; made if need be.
+        with_torch: Also write the network as a torch program.
+
+    Raises:
+        UsageError: The model's spaces do not fit the facts, or it cannot be exported.
+    """
+    check_spaces(model, facts.observation, facts.actions)
+    network = network_of(model)
+    training = model.policy.training
+    model.policy.set_training_mode(False)
+    try:
+        _check_decisions(model, network, facts)
+        return export_network(network, facts, folder, with_torch=with_torch)
+    finally:
+        model.policy.set_training_mode(training)
+
+
+def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
+    """Load a model from the .zip that its `save` wrote.
+
+    The archive holds pickled Python objects: load only those of people you trust.
+
+    Args:
+        path: The .zip.
+        algorithm: Name of the class that wrote it.
+
+    Raises:
+        UsageError: No such file or algorithm, or the archive is not one of its.
+    """
+    learner = algorithm_class(algorithm)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    if not zipfile.is_zipfile(path):
+        raise UsageError(f"{path}: not a .zip of stable-baselines3")
+    try:
+        # Nothing will be learned: no room for a million steps.
+        model: BaseAlgorithm = learner.load(
+            path, device="cpu", custom_objects={"buffer_size": 1000, "tensorboard_log": None}
+        )
+    except Exception as error:  # Unpickling raises whatever the pickled objects do.
+        line = (str(error) or type(error).__name__).splitlines()[0]
+        raise UsageError(f"{path}: not a model of {learner.__name__}: {line}") from None
+    return model
+
+
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """Return an algorithm by the name of its class, in any case.
+
+    Raises:
+        UsageError: There is none (lists those that exist).
+    """
+    known: dict[str, type[BaseAlgorithm]] = {}
+    for library in _LIBRARIES:
+        members = inspect.getmembers(importlib.import_module(library), inspect.isclass)
+        known |= {
+            key: found
+            for key, found in members
+            if issubclass(found, BaseAlgorithm) and not inspect.isabstract(found)
+        }
+    for key, found in known.items():
+        if key.lower() == name.lower():
+            return found
+    raise UsageError(f"--algorithm {name!r}: accepted: {', '.join(sorted(known))}")
+
+
+def _check_decisions(model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts) -> None:
+    """Raise UsageError unless the network decides as the model's own `predict` does."""
+    seen = random_inputs(facts.observation, CHECKED, np.random.default_rng(2))
+    decided, _ = model.policy.predict(cast("Any", seen), deterministic=True)
+    device = model.device
+    with torch.no_grad():
+        tensors = [torch.from_numpy(seen[key]).to(device) for key in boxes(facts.observation)]
+        outputs = network(*tensors).cpu().numpy()
+    slack = TOLERANCE * max(1.0, float(np.abs(outputs).max()))
+    if discrete_actions(facts.actions) is None:
+        same = np.abs(outputs - decided).max() <= slack
+    else:
+        # Of two that are as good as each other either may win.
+        same = (outputs[np.arange(CHECKED), decided] >= outputs.max(axis=1) - slack).all()
+    if not same:
+        raise UsageError(
+            f"{type(model).__name__}: its {type(model.policy).__name__} decides by more than its "
+            "network: it cannot be exported"
+        )

@@ -1,0 +1,170 @@
+"""The folder of a training run: what is in it, and how it is written.
+
+train.json          the configuration and what it was made with
+evaluations.jsonl   one line an evaluation on the selection seeds
+tensorboard/        curves
+checkpoints/        everything needed to go on
+best/               the best weights so far, and which they are
+policy/             the result: policy.onnx and card.json
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from airl_mav.atomic import replace_file
+from airl_mav.clock import utc_now
+from airl_mav.errors import UsageError
+from airl_mav.provenance import describe_machine, git_state, package_versions
+from airl_mav.training.config import TrainingConfig
+
+SCHEMA = 1
+CONFIG_FILE = "train.json"
+EVALUATIONS_FILE = "evaluations.jsonl"
+BEST_FILE = "best.json"
+BEST_MODEL = "model.zip"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation on the selection seeds, and how training stood."""
+
+    steps: int
+    """Decisions of all vehicles so far."""
+    seconds: float
+    """Wall time of the training so far, evaluations left out [s]."""
+    episodes: int
+    success_rate: float
+    collision_rate: float
+    flight_time_s: float | None
+    """Mean of the successful ones; None when there is none."""
+    distance_m: float | None
+    training_success: float | None
+    """Of the last episodes in training, exploration included."""
+    zone: int | None
+    """Curriculum zone that is open; None without a curriculum."""
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """What is better is greater: success, then speed."""
+        return self.success_rate, -(self.flight_time_s or 1e9)
+
+
+class TrainingFolder:
+    """A training run on disk. Whatever is killed when: it can be read, and gone on from."""
+
+    def __init__(self, path: Path) -> None:
+        """Wrap a folder; use `create` or `open`."""
+        self.path = path
+
+    @classmethod
+    def create(cls, path: Path, config: TrainingConfig, command: str) -> TrainingFolder:
+        """Make the folder. Raises UsageError when it already holds a run."""
+        if (path / CONFIG_FILE).exists():
+            raise UsageError(
+                f"--out {path}: holds a training run already; --resume goes on with it"
+            )
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--out {path}: {error.strerror}") from None
+        about = {
+            "schema": SCHEMA,
+            "created_utc": utc_now().isoformat(timespec="seconds"),
+            "command": command,
+            "config": config.model_dump(mode="json", exclude_none=True),
+            "versions": package_versions(),
+            "machine": describe_machine(),
+            "git": git_state(),
+        }
+        replace_file(path / CONFIG_FILE, (json.dumps(about, indent=2) + "\n").encode())
+        return cls(path)
+
+    @classmethod
+    def open(cls, path: Path, config: TrainingConfig) -> TrainingFolder:
+        """Go on with a run. Raises UsageError when there is none, or one of another config."""
+        folder = cls(path)
+        theirs = TrainingConfig.model_validate(folder.about()["config"])
+        if theirs != config:
+            changed = [
+                name
+                for name in TrainingConfig.model_fields
+                if getattr(theirs, name) != getattr(config, name)
+            ]
+            raise UsageError(
+                f"--resume: {path} was begun with another configuration "
+                f"({', '.join(changed)}); accepted: the same"
+            )
+        return folder
+
+    def about(self) -> dict[str, Any]:
+        """Return what `train.json` holds. Raises UsageError when there is no run."""
+        try:
+            about = json.loads((self.path / CONFIG_FILE).read_bytes())
+        except OSError as error:
+            raise UsageError(
+                f"{self.path}: no training run here: {CONFIG_FILE}: {error.strerror}"
+            ) from None
+        except ValueError as error:
+            raise UsageError(f"{self.path / CONFIG_FILE}: not JSON: {error}") from None
+        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+            raise UsageError(f"{self.path / CONFIG_FILE}: schema: accepted: {SCHEMA}")
+        return about
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where checkpoints lie."""
+        return self.path / "checkpoints"
+
+    @property
+    def tensorboard(self) -> Path:
+        """Where TensorBoard looks."""
+        return self.path / "tensorboard"
+
+    @property
+    def best_model(self) -> Path:
+        """The best weights so far, as stable-baselines3 saves them."""
+        return self.path / "best" / BEST_MODEL
+
+    @property
+    def policy(self) -> Path:
+        """The exported result."""
+        return self.path / "policy"
+
+    def evaluations(self) -> list[Evaluation]:
+        """Return the evaluations so far; a line cut short by a kill is passed over."""
+        file = self.path / EVALUATIONS_FILE
+        data = file.read_bytes() if file.exists() else b""
+        whole = data[: data.rfind(b"\n") + 1]
+        return [Evaluation(**json.loads(line)) for line in whole.splitlines()]
+
+    def add_evaluation(self, evaluation: Evaluation) -> None:
+        """Append a line; on return it is on the disk."""
+        with (self.path / EVALUATIONS_FILE).open("ab") as file:
+            file.write(json.dumps(asdict(evaluation)).encode() + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+    def forget_after(self, steps: int) -> None:
+        """Drop evaluations later than a checkpoint: going on from it will make them again."""
+        kept = [each for each in self.evaluations() if each.steps <= steps]
+        lines = "".join(json.dumps(asdict(each)) + "\n" for each in kept)
+        replace_file(self.path / EVALUATIONS_FILE, lines.encode())
+
+    def best(self) -> Evaluation | None:
+        """Return which evaluation the best weights are of."""
+        file = self.path / "best" / BEST_FILE
+        if not file.exists() or not self.best_model.exists():
+            return None
+        return Evaluation(**json.loads(file.read_bytes()))
+
+    def save_best(self, model: bytes, evaluation: Evaluation) -> None:
+        """Keep the best weights. Killed in between, the old line stands for the new weights."""
+        self.best_model.parent.mkdir(exist_ok=True)
+        replace_file(self.best_model, model)
+        text = json.dumps(asdict(evaluation), indent=2) + "\n"
+        replace_file(self.best_model.parent / BEST_FILE, text.encode())

@@ -1,0 +1,73 @@
+"""Samples a second that an update of the double DQN learns from, on one thread.
+
+Run as `python benchmarks/bench_learner.py`. The memory is filled by the real environment; an update
+is a draw of 128, two passes without gradients, one with, and the optimiser's step. Weights lie as
+torch has them by default ("plain") or as its convolutions like them ("channels last", what
+`make_model` does).
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import nn
+
+from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
+from airl_mav.training.algorithms import BATCH, make_model
+from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.networks import count_parameters
+
+SIZES = ((32, 24), (64, 48))
+NETWORKS = {"small": NetworkSpec(), "appendix": NetworkSpec(kind="appendix")}
+VEHICLES = 32
+SECONDS = 1.5  # of each measurement
+
+
+def fastest(model: DoubleDQN) -> float:
+    """Samples a second of CPU time, of the fastest tenth of the updates: what an idle core does."""
+    took = []
+    end = time.perf_counter() + SECONDS
+    while time.perf_counter() < end or len(took) < 20:
+        start = time.process_time()
+        model._update(model.replay.sample(BATCH, model.generator))
+        took.append(time.process_time() - start)
+    return float(BATCH / np.quantile(took, 0.1))
+
+
+def as_plain(policy: nn.Module) -> None:
+    for module in policy.modules():
+        if isinstance(module, nn.Conv2d):
+            module.to(memory_format=torch.contiguous_format)
+    policy.optimizer.state.clear()
+
+
+def main() -> None:
+    table = Table(title=f"samples a second, batch {BATCH}, one thread")
+    for column in ("network", "image", "parameters", "precision", "plain", "channels last"):
+        table.add_column(column, justify="left" if column in ("network", "precision") else "right")
+    for width, height in SIZES:
+        spec = EnvironmentSpec(image_width_px=width, image_height_px=height)
+        env = NavigationVecEnv(NavigationVectorEnv(VEHICLES, spec))
+        for name, network in NETWORKS.items():
+            for precision in ("float32", "bfloat16"):
+                fields = AlgorithmSpec(precision=precision, buffer_size=10_000)
+                model = make_model(fields, network, env, seed=0)
+                assert isinstance(model, DoubleDQN)
+                model.learn(2500)
+                last = fastest(model)
+                as_plain(model.policy)
+                size = f"{count_parameters(network, height, width):,}"
+                rates = (f"{fastest(model):,.0f}", f"{last:,.0f}")
+                table.add_row(name, f"{width}x{height}", size, precision, *rates)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

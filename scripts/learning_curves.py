@@ -1,0 +1,141 @@
+"""Learning curves: several configurations, several seeds each, one picture and one table.
+
+    python scripts/learning_curves.py [--configs NAME ...] [--seeds N] [--steps N] [--out DIR]
+
+By default the paper's algorithm exploration (DQN and PPO, with and without curriculum). Each run is
+an `airl train` of its own that survives a kill: start the script again and it goes on where it was.
+The picture shows the success rate on the selection seeds, mean over the training seeds with a 95 %
+interval (Student's t); the table says when each configuration reached 97 %.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import stats
+
+from airl_mav.training.store import Evaluation, TrainingFolder
+
+PAPER = ("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum")
+REACHED = 0.97
+
+
+@dataclass(frozen=True)
+class Command:
+    """Train, collect, draw."""
+
+    configs: tuple[str, ...] = PAPER
+    """Training configurations: shipped names or paths."""
+
+    seeds: int = 5
+    """Training seeds of each, 1 to N."""
+
+    steps: int | None = None
+    """Decisions of each run. None: the configuration's."""
+
+    jobs: int = 1
+    """Runs at a time; each takes one core."""
+
+    out: Path = Path("runs/learning-curves")
+    """Where the runs, curves.png and curves.md go."""
+
+
+def main() -> None:
+    command = tyro.cli(Command, description=__doc__)
+    runs = [(name, seed) for name in command.configs for seed in range(1, command.seeds + 1)]
+    with ThreadPoolExecutor(command.jobs) as pool:
+        codes = list(pool.map(lambda run: train(command, *run), runs))
+    if any(codes):
+        sys.exit("a run did not finish; start again to go on")
+    curves = {name: collect(command, name) for name in command.configs}
+    draw(curves, command.out / "curves.png")
+    text = table(curves)
+    (command.out / "curves.md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+def folder(command: Command, name: str, seed: int) -> Path:
+    return command.out / f"{Path(name).stem}-{seed}"
+
+
+def train(command: Command, name: str, seed: int) -> int:
+    out = folder(command, name, seed)
+    if (out / "policy" / "card.json").exists():
+        return 0
+    words = [sys.executable, "-m", "airl_mav.cli.main", "train", name]
+    words += ["--seed", f"{seed}", "--out", f"{out}", "--resume"]
+    if command.steps is not None:
+        words += ["--steps", f"{command.steps}"]
+    print(f"{name}, seed {seed}", flush=True)
+    command.out.mkdir(parents=True, exist_ok=True)
+    with (command.out / f"{out.name}.log").open("ab") as log:
+        return subprocess.run(words, stdout=log, stderr=log, check=False).returncode
+
+
+def collect(command: Command, name: str) -> list[list[Evaluation]]:
+    seeds = range(1, command.seeds + 1)
+    return [TrainingFolder(folder(command, name, seed)).evaluations() for seed in seeds]
+
+
+def grid(runs: Sequence[Sequence[Evaluation]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return steps (k,) and success rates (seeds, k) at the evaluations that all runs have."""
+    k = min(len(run) for run in runs)
+    steps = np.array([each.steps for each in runs[0][:k]], np.float64)
+    return steps, np.array([[each.success_rate for each in run[:k]] for run in runs])
+
+
+def draw(curves: dict[str, list[list[Evaluation]]], path: Path) -> None:
+    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+    ax = figure.add_subplot()
+    for name, runs in curves.items():
+        steps, rates = grid(runs)
+        mean = rates.mean(axis=0)
+        half = (
+            stats.t.ppf(0.975, len(rates) - 1) * stats.sem(rates, axis=0) if len(rates) > 1 else 0
+        )
+        (line,) = ax.plot(steps / 1e3, 100 * mean, label=f"{Path(name).stem} (n = {len(rates)})")
+        low, high = np.clip(mean - half, 0, 1), np.clip(mean + half, 0, 1)
+        ax.fill_between(steps / 1e3, 100 * low, 100 * high, alpha=0.15, color=line.get_color())
+    ax.set_xlabel("decisions of all vehicles, thousands")
+    ax.set_ylabel("success on the selection seeds, %")
+    ax.set_ylim(0, 101)
+    ax.grid(alpha=0.25)
+    ax.legend(frameon=False, fontsize=8.5, loc="lower right")
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=150)
+
+
+def table(curves: dict[str, list[list[Evaluation]]]) -> str:
+    lines = [
+        "| configuration | seeds | best, mean (least) | last, mean | 97 % reached "
+        "| after, s: median (longest) |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, runs in curves.items():
+        best = [max(each.success_rate for each in run) for run in runs]
+        last = [run[-1].success_rate for run in runs]
+        times = [
+            next((each.seconds for each in run if each.success_rate >= REACHED), None)
+            for run in runs
+        ]
+        reached = [t for t in times if t is not None]
+        when = f"{np.median(reached):.0f} ({max(reached):.0f})" if reached else "-"
+        lines.append(
+            f"| {Path(name).stem} | {len(runs)} | {np.mean(best):.1%} ({min(best):.1%}) "
+            f"| {np.mean(last):.1%} | {len(reached)} of {len(runs)} | {when} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,350 @@
+"""Observation layouts against independent references: values by hand, scipy, block reductions."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
+
+from airl_mav.camera.frame import depth_to_z16
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.policy.layouts import (
+    STRIP_ROWS,
+    Encoded,
+    ObservationSpec,
+    ablated,
+    boxes,
+    camera_mismatch,
+    encode_layout,
+)
+from airl_mav.policy.observation import Kinematics, Observation, observe
+
+FAR_MM = 65_535
+
+
+def spec(layout: str = "body", height: int = 24, width: int = 32, **more: Any) -> ObservationSpec:
+    known = {"layout": layout, "height_px": height, "width_px": width}
+    return ObservationSpec.model_validate(
+        known | {"horizontal_fov_deg": 90.0, "range_m": 20.0} | more
+    )
+
+
+def lens(width: int, height: int, fov_deg: float = 90.0) -> Intrinsics:
+    return Intrinsics.from_fov(width, height, math.radians(fov_deg))
+
+
+def seen(depth_mm: Any, **more: Any) -> Observation:
+    """Return n vehicles at rest, nose north, the goal 10 m ahead."""
+    depth = np.asarray(depth_mm, np.uint16)
+    n, height, width = depth.shape
+    still: dict[str, Any] = {
+        "goal": np.tile([10.0, 0.0], (n, 1)),
+        "velocity": np.zeros((n, 3)),
+        "roll": np.zeros(n),
+        "pitch": np.zeros(n),
+        "yaw": np.zeros(n),
+    }
+    return Observation(depth_mm=depth, intrinsics=lens(width, height), **(still | more))
+
+
+def grey(layout: ObservationSpec, depth_m: float | None) -> int:
+    """Return the grey value of a wall at a depth; None: no return."""
+    rows = layout.camera_rows
+    value = 0 if depth_m is None else int(depth_to_z16(np.array(depth_m)))
+    image = encode_layout(layout, seen(np.full((1, rows, layout.width_px), value)))["depth"]
+    camera = image[0, 0, layout.height_px - rows :]
+    assert camera.min() == camera.max()
+    return int(camera[0, 0])
+
+
+# --- grey values
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "wanted"),
+    [
+        # By hand, airlearning-rl's getScreenDepthVis: 255 // max(1, d), inverted, to the tenth
+        # power of its share: d = 5 -> 51 -> 204 -> 255 (0.8)^10 = 27.38.
+        (0.001, 0),
+        (0.5, 0),
+        (1.0, 0),
+        (2.0, 0),
+        (5.0, 27),
+        (10.0, 90),
+        (20.0, 157),
+        (50.0, 209),
+    ],
+)
+def test_grey_values_of_the_paper(depth_m: float, wanted: int) -> None:
+    assert grey(spec("paper", 34, range_m=60.0), depth_m) == wanted
+
+
+@pytest.mark.parametrize("depth_m", [None, 60.001, 64.0, 65.535])
+def test_the_paper_sees_white_where_nothing_is(depth_m: float | None) -> None:
+    assert grey(spec("paper", 34, range_m=60.0), depth_m) == 255
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "wanted"),
+    [
+        (0.001, 0),
+        (0.039, 0),  # 255 * 0.039 / 20 = 0.497
+        (0.040, 1),  # 0.51
+        (5.0, 64),  # 63.75
+        (10.0, 128),  # 127.5, rounded to even
+        (15.0, 191),  # 191.25
+        (19.99, 255),  # 254.87
+        (20.0, 255),
+        (20.001, 255),
+        (65.535, 255),
+        (None, 255),
+    ],
+)
+def test_grey_values_in_proportion_to_the_range(depth_m: float | None, wanted: int) -> None:
+    assert grey(spec(), depth_m) == wanted
+
+
+@given(range_m=st.floats(0.6, 65.0), depth_mm=st.integers(1, FAR_MM))
+def test_nearer_is_never_brighter(range_m: float, depth_mm: int) -> None:
+    layout = spec(range_m=range_m)
+    here = grey(layout, depth_mm / 1000.0)
+    assert here >= grey(layout, max(1, depth_mm - 500) / 1000.0)
+    if depth_mm / 1000.0 <= range_m:
+        assert here == pytest.approx(255.0 * depth_mm / 1000.0 / range_m, abs=0.5 + 1e-9)
+    else:
+        assert here == 255
+
+
+# --- pooling
+
+
+@given(
+    depth=arrays.arrays(
+        np.uint16,
+        st.tuples(
+            st.integers(1, 3), st.sampled_from([4, 8, 12]), st.sampled_from([8, 16, 24])
+        ).filter(lambda shape: shape[2] == 2 * shape[1]),
+        elements=st.sampled_from([0, 1, 2, 500, 19_999, 20_000, 20_001, 65_534, FAR_MM]),
+    )
+)
+def test_the_nearest_return_of_each_block_wins(depth: np.ndarray) -> None:
+    """Against a reduction over reshaped blocks in floating point, no return being infinite."""
+    layout = spec(height=4, width=8)
+    n, height, width = depth.shape
+    metres = np.where(depth == 0, np.inf, depth / 1000.0)
+    blocks = metres.reshape(n, 4, height // 4, 8, width // 8).min(axis=(2, 4))
+    wanted = np.rint(255.0 * np.minimum(blocks, 20.0) / 20.0)
+    np.testing.assert_array_equal(encode_layout(layout, seen(depth))["depth"][:, 0], wanted)
+
+
+def test_one_near_pixel_fills_its_block_and_no_other() -> None:
+    depth = np.zeros((1, 48, 64), np.uint16)
+    depth[0, 13, 47] = 5000
+    image = encode_layout(spec(), seen(depth))["depth"][0, 0]
+    assert image[6, 23] == 64
+    image[6, 23] = 255
+    assert (image == 255).all()
+
+
+def test_the_camera_of_the_networks_own_size_is_taken_as_it_is() -> None:
+    depth = np.arange(1, 24 * 32 + 1, dtype=np.uint16).reshape(1, 24, 32) * 25
+    wanted = np.rint(np.minimum(depth / 1000.0 / 20.0, 1.0) * 255.0)
+    np.testing.assert_array_equal(encode_layout(spec(), seen(depth))["depth"][0], wanted)
+
+
+def test_what_was_seen_is_left_alone() -> None:
+    depth = np.random.default_rng(1).integers(0, 65_536, (2, 48, 64), np.uint16)
+    before = depth.copy()
+    depth.setflags(write=False)
+    for layout in (spec(), spec("paper", 34)):
+        encode_layout(layout, seen(depth))
+    np.testing.assert_array_equal(depth, before)
+
+
+# --- vectors
+
+
+poses = st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(
+    lambda q: math.hypot(*q) > 0.1
+)
+metres = st.floats(-100.0, 100.0)
+
+
+@given(
+    quaternion=poses,
+    position=st.tuples(metres, metres, metres),
+    velocity=st.tuples(metres, metres, metres),
+    goal=st.tuples(metres, metres),
+)
+def test_vectors_against_scipy(
+    quaternion: list[float],
+    position: tuple[float, ...],
+    velocity: tuple[float, ...],
+    goal: tuple[float, ...],
+) -> None:
+    q = np.array(quaternion) / np.linalg.norm(quaternion)
+    turned = Rotation.from_quat(q, scalar_first=True)
+    nose = turned.apply([1.0, 0.0, 0.0])
+    if math.hypot(nose[0], nose[1]) < 1e-3:
+        return  # straight up or down: there is no heading
+    level = Rotation.from_euler("z", math.atan2(nose[1], nose[0]))
+    state = Kinematics(np.array([position]), np.array([velocity]), q[None])
+    image = np.zeros((1, 24, 32), np.uint16)
+    looked = observe(image, lens(32, 24), state, np.array([goal]))
+    away = np.array([goal[0] - position[0], goal[1] - position[1], 0.0])
+    distance = float(np.hypot(away[0], away[1]))
+
+    body = encode_layout(spec(), looked)
+    assert body["velocity"][0] == pytest.approx(level.inv().apply(velocity) / 5.0, abs=1e-4)
+    if distance > 1e-3:
+        ahead = level.inv().apply(away) / distance
+        assert body["goal"][0, :2] == pytest.approx(ahead[:2], abs=1e-4)
+    assert body["goal"][0, 2] == pytest.approx(distance / 20.0, abs=1e-5)
+
+    # World frame: what was put in comes out, whatever the attitude.
+    paper = encode_layout(spec("paper", 34), looked)
+    assert paper["velocity"][0] == pytest.approx(velocity, abs=1e-3)
+    assert paper["goal"][0] == pytest.approx([away[0], away[1], distance], abs=1e-3)
+
+
+def test_at_the_goal_there_is_no_direction_but_a_distance_of_zero() -> None:
+    here = encode_layout(spec(), seen(np.zeros((1, 24, 32)), goal=np.zeros((1, 2))))["goal"]
+    np.testing.assert_array_equal(here, [[0.0, 0.0, 0.0]])
+
+
+def test_the_goal_to_the_right_has_a_positive_sine() -> None:
+    right = encode_layout(spec(), seen(np.zeros((1, 24, 32)), goal=np.array([[0.0, 5.0]])))["goal"]
+    np.testing.assert_allclose(right, [[0.0, 1.0, 0.25]])
+
+
+# --- the strip of the paper
+
+
+@pytest.mark.parametrize(
+    ("bearing_deg", "bar"),
+    [
+        # (bearing + 180) / 360 * 256, the bar a column wider to each side, whole at the edges.
+        (0.0, (127, 129)),
+        (90.0, (191, 193)),
+        (-90.0, (63, 65)),
+        (179.99, (253, 255)),
+        (180.0, (253, 255)),
+        (-179.99, (0, 2)),
+        (-178.0, (0, 2)),  # column 1.4
+        (-177.0, (1, 3)),  # 2.1
+    ],
+)
+def test_the_strip_draws_the_bearing(bearing_deg: float, bar: tuple[int, int]) -> None:
+    layout = spec("paper", 154, 256)
+    angle = math.radians(bearing_deg)
+    goal = 7.0 * np.array([[math.cos(angle), math.sin(angle)]])
+    image = encode_layout(layout, seen(np.zeros((1, 144, 256)), goal=goal))["depth"][0, 0]
+    assert image.shape == (154, 256)
+    wanted = np.full((STRIP_ROWS, 256), 255)
+    wanted[:, bar[0] : bar[1] + 1] = 0
+    wanted[-1] = 0
+    np.testing.assert_array_equal(image[:STRIP_ROWS], wanted)
+    assert (image[STRIP_ROWS:] == 255).all()
+
+
+# --- many vehicles, shapes, ablation
+
+
+def random_state(n: int) -> tuple[np.ndarray, Kinematics, np.ndarray]:
+    rng = np.random.default_rng(n)
+    quaternions = rng.normal(size=(n, 4))
+    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    depth = rng.integers(0, 65_536, (n, 48, 64), np.uint16)
+    depth[rng.random(depth.shape) < 0.3] = 0
+    state = Kinematics(rng.normal(0, 20, (n, 3)), rng.normal(0, 3, (n, 3)), quaternions)
+    return depth, state, rng.normal(0, 20, (n, 2))
+
+
+@pytest.mark.parametrize("layout", [spec(), spec("paper", 34)], ids=["body", "paper"])
+def test_n_vehicles_are_encoded_as_each_by_itself(layout: ObservationSpec) -> None:
+    depth, state, goal = random_state(9)
+    camera = lens(64, 48)
+    together = encode_layout(layout, observe(depth, camera, state, goal))
+    for i in range(9):
+        one = slice(i, i + 1)
+        alone = Kinematics(state.position[one], state.velocity[one], state.quaternion[one])
+        single = encode_layout(layout, observe(depth[one], camera, alone, goal[one]))
+        for key, values in single.items():
+            np.testing.assert_array_equal(values[0], together[key][i])
+
+
+@pytest.mark.parametrize("layout", [spec(), spec("paper", 34)], ids=["body", "paper"])
+@pytest.mark.parametrize("n", [0, 1, 4])
+def test_the_arrays_are_those_of_the_boxes(layout: ObservationSpec, n: int) -> None:
+    depth, state, goal = random_state(n)
+    encoded: Encoded = encode_layout(layout, observe(depth, lens(64, 48), state, goal))
+    assert list(encoded) == list(boxes(layout))
+    for key, box in boxes(layout).items():
+        assert encoded[key].shape == (n, *box.shape)
+        assert encoded[key].dtype == box.dtype
+
+
+@pytest.mark.parametrize("key", ["depth", "velocity", "goal"])
+def test_an_ablated_input_is_zero_and_the_others_are_as_they_were(key: str) -> None:
+    depth, state, goal = random_state(3)
+    encoded = encode_layout(spec(), observe(depth, lens(64, 48), state, goal))
+    blind = ablated(encoded, key)
+    assert not blind[key].any()
+    assert encoded[key].any()
+    for other in encoded.keys() - {key}:
+        np.testing.assert_array_equal(blind[other], encoded[other])
+    assert {k: (v.shape, v.dtype) for k, v in blind.items()} == {
+        k: (v.shape, v.dtype) for k, v in encoded.items()
+    }
+
+
+# --- cameras
+
+
+@pytest.mark.parametrize(
+    ("layout", "camera"),
+    [
+        (spec(), lens(32, 24)),
+        (spec(), lens(64, 48)),
+        (spec(), lens(320, 240)),
+        (spec("paper", 34), lens(32, 24)),
+        (spec("paper", 154, 256), lens(256, 144)),
+        (spec(horizontal_fov_deg=86.95), lens(64, 48, 87.0)),
+    ],
+)
+def test_cameras_that_serve(layout: ObservationSpec, camera: Intrinsics) -> None:
+    assert camera_mismatch(layout, camera) is None
+
+
+@pytest.mark.parametrize(
+    ("layout", "camera", "words"),
+    [
+        (spec(), lens(48, 36), ["48x36", "32x24 px or a whole multiple"]),
+        (spec(), lens(64, 24), ["64x24"]),
+        (spec(), lens(32, 48), ["32x48"]),
+        (spec(), lens(16, 12), ["16x12"]),
+        (spec("paper", 34), lens(32, 34), ["32x34", "32x24"]),
+        (spec(), lens(64, 48, 89.8), ["89.8 deg", "accepted: 90.0 deg"]),
+        (spec(), lens(64, 48, 69.0), ["69.0 deg"]),
+    ],
+)
+def test_cameras_that_do_not(layout: ObservationSpec, camera: Intrinsics, words: list[str]) -> None:
+    reason = camera_mismatch(layout, camera)
+    assert reason is not None
+    for word in words:
+        assert word in reason
+
+
+@pytest.mark.parametrize("height", [4, 10])
+def test_the_strip_leaves_room_for_the_camera(height: int) -> None:
+    with pytest.raises(ValidationError, match=f"height_px = {height}"):
+        spec("paper", height)
+    assert spec("paper", 11).camera_rows == 1
+    assert spec("body", height).camera_rows == height
