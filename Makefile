@@ -51,9 +51,10 @@ test: lint  ## Everything CI checks
 	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 .PHONY: bench
-bench: $(ALL)  ## Measure: ray caster, real-time factor of the stack
+bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")
 	$(BIN)/python benchmarks/bench_depth.py
 	$(BIN)/python benchmarks/bench_stack.py
+	$(BIN)/python benchmarks/bench_envs.py $(RIVALS)
 
 .PHONY: clean
 clean:  ## Remove the environment and everything generated

@@ -20,11 +20,29 @@ def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
 
     PX4's ControlMath::bodyzToAttitude.
     """
+    return attitude_towards(thrust, math.cos(yaw), math.sin(yaw))
+
+
+@kernel
+def heading_of(q: Quat) -> tuple[float, float]:
+    """Return cosine and sine of the heading of q."""
+    north = 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3])
+    east = 2.0 * (q[0] * q[3] + q[1] * q[2])
+    square = north * north + east * east
+    if square < 1e-18:
+        return 1.0, 0.0  # nose straight up or down
+    n = 1.0 / math.sqrt(square)
+    return north * n, east * n
+
+
+@kernel
+def attitude_towards(thrust: Vec, cy: float, sy: float) -> Quat:
+    """Return `attitude_setpoint` for a heading given by its cosine and sine."""
     norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if norm < 1e-9:
-        return (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+        half = 0.5 * math.atan2(sy, cy)
+        return (math.cos(half), 0.0, 0.0, math.sin(half))
     zx, zy, zz = -thrust[0] / norm, -thrust[1] / norm, -thrust[2] / norm
-    cy, sy = math.cos(yaw), math.sin(yaw)
     # x = y_c x z with y_c = (-sin, cos, 0)
     xx, xy, xz = cy * zz, sy * zz, -sy * zy - cy * zx
     if zz < 0.0:
@@ -82,8 +100,8 @@ def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
     mix = multiply(conjugate(reduced), q_sp)
     sign = 1.0 if mix[0] >= 0.0 else -1.0
     w = gains.yaw_weight
-    turn_w = math.cos(w * math.acos(clamp(sign * mix[0], -1.0, 1.0)))
     turn_z = math.sin(w * math.asin(clamp(sign * mix[3], -1.0, 1.0)))
+    turn_w = math.sqrt(1.0 - turn_z * turn_z)
     wanted = multiply(reduced, (turn_w, 0.0, 0.0, turn_z))
     error = multiply(conjugate(q), wanted)
     two = 2.0 if error[0] >= 0.0 else -2.0

@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
+from airl_mav.control.attitude import attitude_towards, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors, mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import velocity_control, velocity_setpoint
 from airl_mav.kernels import kernel
-from airl_mav.vehicle.rotation import Quat, Vec, yaw_of
+from airl_mav.vehicle.rotation import Quat, Vec
 
 Memory = NDArray[np.float64]
 
@@ -70,11 +70,31 @@ def reset_integrals(memory: Memory) -> None:
 
 
 @kernel
-def _smoothing(cutoff_hz: float, dt: float) -> float:
+def _weight(cutoff_hz: float, dt: float) -> float:
     """Return the weight of a new sample in a first-order low-pass; cut-off 0 = no filter."""
     if cutoff_hz <= 0.0:
         return 1.0
     return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * dt)
+
+
+class Filters(NamedTuple):
+    """Weight of a new sample in each low-pass of the cascade, for a fixed tick."""
+
+    velocity: float
+    gyro: float
+    angular_acceleration: float
+    yaw_torque: float
+
+
+@kernel
+def filters(gains: Gains, dt: float) -> Filters:
+    """Return the weights for a tick of dt [s]."""
+    return Filters(
+        _weight(gains.vel_d_cutoff_hz, dt),
+        _weight(gains.gyro_cutoff_hz, dt),
+        _weight(gains.dgyro_cutoff_hz, dt),
+        _weight(gains.yaw_torque_cutoff_hz, dt),
+    )
 
 
 @kernel
@@ -88,7 +108,23 @@ def cascade(
     gains: Gains,
     dt: float,
 ) -> Output:
-    """Run one tick of the cascade; updates `memory` in place.
+    """Run one tick of the cascade; updates `memory` in place. Arguments as of `cascade_tick`."""
+    return cascade_tick(position, velocity, q, omega, demand, memory, gains, filters(gains, dt), dt)
+
+
+@kernel
+def cascade_tick(
+    position: Vec,
+    velocity: Vec,
+    q: Quat,
+    omega: Vec,
+    demand: Demand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Output:
+    """Run one tick of the cascade with filters computed before; updates `memory` in place.
 
     Args:
         position: NED [m].
@@ -98,6 +134,7 @@ def cascade(
         demand: What to fly.
         memory: Row of this vehicle.
         gains: Gains and limits.
+        weights: `filters(gains, dt)`: the same at every tick.
         dt: Tick [s].
     """
     velocities = (velocity[0], velocity[1], velocity[2])
@@ -107,17 +144,14 @@ def cascade(
         for i in range(3):
             memory[_VEL_LP + i] = velocities[i]
             memory[_GYRO + i] = rates_now[i]
-    k_vel = _smoothing(gains.vel_d_cutoff_hz, dt)
-    k_gyro = _smoothing(gains.gyro_cutoff_hz, dt)
-    k_dgyro = _smoothing(gains.dgyro_cutoff_hz, dt)
     for i in range(3):
         before = memory[_VEL_LP + i]
-        memory[_VEL_LP + i] = before + k_vel * (velocities[i] - before)
+        memory[_VEL_LP + i] = before + weights.velocity * (velocities[i] - before)
         memory[_VEL_DOT + i] = (memory[_VEL_LP + i] - before) / dt
         before = memory[_GYRO + i]
-        memory[_GYRO + i] = before + k_gyro * (rates_now[i] - before)
+        memory[_GYRO + i] = before + weights.gyro * (rates_now[i] - before)
         slope = (memory[_GYRO + i] - before) / dt
-        memory[_DGYRO + i] += k_dgyro * (slope - memory[_DGYRO + i])
+        memory[_DGYRO + i] += weights.angular_acceleration * (slope - memory[_DGYRO + i])
 
     velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
     thrust, integral = velocity_control(
@@ -128,9 +162,12 @@ def cascade(
         gains,
         dt,
     )
-    yaw = yaw_of(q) if math.isnan(demand.yaw) else demand.yaw
+    if math.isnan(demand.yaw):
+        cos_yaw, sin_yaw = heading_of(q)
+    else:
+        cos_yaw, sin_yaw = math.cos(demand.yaw), math.sin(demand.yaw)
     yaw_rate = 0.0 if math.isnan(demand.yaw_rate) else demand.yaw_rate
-    q_sp = attitude_setpoint(thrust, yaw)
+    q_sp = attitude_towards(thrust, cos_yaw, sin_yaw)
     rates_sp = rate_setpoint(q, q_sp, yaw_rate, gains)
     torque, rate_integral = rate_control(
         (memory[_GYRO], memory[_GYRO + 1], memory[_GYRO + 2]),
@@ -141,8 +178,7 @@ def cascade(
         gains,
         dt,
     )
-    k_yaw = _smoothing(gains.yaw_torque_cutoff_hz, dt)
-    memory[_YAW_TORQUE] += k_yaw * (torque[2] - memory[_YAW_TORQUE])
+    memory[_YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[_YAW_TORQUE])
     collective = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     motors, missing = mix(collective, (torque[0], torque[1], memory[_YAW_TORQUE]))
     for i in range(3):

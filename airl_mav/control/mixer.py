@@ -62,6 +62,12 @@ def _desaturate(m: Motors, direction: Motors, high: float, lower_only: bool) -> 
 
 
 @kernel
+def _in_range(m: Motors) -> bool:
+    low = min(min(m[0], m[1]), min(m[2], m[3]))
+    return low >= 0.0 and max(max(m[0], m[1]), max(m[2], m[3])) <= 1.0
+
+
+@kernel
 def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
     """Return motor commands 0..1 and the torque that could not be delivered, per axis.
 
@@ -70,6 +76,9 @@ def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
         torque: Normalised roll, pitch, yaw torque, -1..1.
     """
     m = _add(_add(_add((0.0, 0.0, 0.0, 0.0), THRUST, thrust), ROLL, torque[0]), PITCH, torque[1])
+    turning = _add(m, YAW, torque[2])
+    if _in_range(m) and _in_range(turning):
+        return turning, (0.0, 0.0, 0.0)  # nothing is saturated, which is the rule
     m = _desaturate(m, THRUST, 1.0, True)
     m = _desaturate(m, ROLL, 1.0, False)
     m = _desaturate(m, PITCH, 1.0, False)

@@ -34,17 +34,17 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     fy = 0.0 if math.isnan(velocity_ff[1]) else velocity_ff[1]
     fz = 0.0 if math.isnan(velocity_ff[2]) else velocity_ff[2]
     limit = gains.vel_max_xy
-    norm_p = math.hypot(px, py)
-    if norm_p >= limit:
-        vx, vy = px / norm_p * limit, py / norm_p * limit
-    elif math.hypot(px + fx, py + fy) > limit:
+    square_p = px * px + py * py
+    vx, vy = px + fx, py + fy
+    if square_p >= limit * limit:
+        scale = limit / math.sqrt(square_p)
+        vx, vy = px * scale, py * scale
+    elif vx * vx + vy * vy > limit * limit:
         # Largest share s of the feed-forward with |p + s f| = limit.
         a = fx * fx + fy * fy
         b = px * fx + py * fy
-        s = (-b + math.sqrt(b * b + a * (limit * limit - norm_p * norm_p))) / a
+        s = (-b + math.sqrt(b * b + a * (limit * limit - square_p))) / a
         vx, vy = px + s * fx, py + s * fy
-    else:
-        vx, vy = px + fx, py + fy
     return vx, vy, clamp(pz + fz, -gains.vel_max_up, gains.vel_max_down)
 
 
@@ -55,15 +55,17 @@ def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1): the tilt follows
     from the horizontal part alone, limited to tilt_max.
     """
-    horizontal = math.hypot(acc[0], acc[1])
-    tilt = min(math.atan2(horizontal, GRAVITY_M_S2), gains.tilt_max)
-    s, c = math.sin(tilt), math.cos(tilt)
-    # body_z (down) points against the horizontal acceleration
-    bx = -acc[0] / horizontal * s if horizontal > 1e-9 else 0.0
-    by = -acc[1] / horizontal * s if horizontal > 1e-9 else 0.0
+    # body_z (down) points against the horizontal acceleration: (-ax, -ay, g), normalised
+    square = acc[0] * acc[0] + acc[1] * acc[1]
+    lean = 1.0 / math.sqrt(square + GRAVITY_M_S2 * GRAVITY_M_S2)
+    c = GRAVITY_M_S2 * lean
+    # A tilt's tangent is greater than the tilt: mostly there is no need for the limit's cosine.
+    if square > (GRAVITY_M_S2 * gains.tilt_max) ** 2 and c < math.cos(gains.tilt_max):
+        lean = math.sin(gains.tilt_max) / math.sqrt(square)
+        c = math.cos(gains.tilt_max)
     vertical = acc[2] * gains.hover_thrust / GRAVITY_M_S2 - gains.hover_thrust
     collective = min(vertical / c, -gains.thrust_min)
-    return bx * collective, by * collective, c * collective
+    return -acc[0] * lean * collective, -acc[1] * lean * collective, c * collective
 
 
 @kernel
@@ -90,7 +92,7 @@ def velocity_control(
     if (tz >= -gains.thrust_min and ez >= 0.0) or (tz <= -gains.thrust_max and ez <= 0.0):
         ez = 0.0
     # Vertical thrust first, but a horizontal margin always stays.
-    norm = math.hypot(tx, ty)
+    norm = math.sqrt(tx * tx + ty * ty)
     reserved = min(norm, gains.thrust_xy_margin)
     tz = max(tz, -math.sqrt(max(0.0, gains.thrust_max**2 - reserved**2)))
     room = math.sqrt(max(0.0, gains.thrust_max**2 - tz * tz))

@@ -26,6 +26,7 @@ class ArenaBatch(NamedTuple):
     tour_times_s: NDArray[np.float64]  # (n, movers, k) padded with infinity
     tour_points: NDArray[np.float64]  # (n, movers, k, 2)
     tour_period_s: NDArray[np.float64]  # (n, movers)
+    tour_speed: NDArray[np.float64]  # (n,) greatest speed of any mover [m/s]
     goal: NDArray[np.float64]  # (n, 2) north, east [m]
 
 
@@ -42,6 +43,7 @@ def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
         tour_times_s=np.full((n, movers, points), np.inf),
         tour_points=np.zeros((n, movers, points, 2)),
         tour_period_s=np.ones((n, movers)),
+        tour_speed=np.zeros(n),
         goal=np.zeros((n, 2)),
     )
 
@@ -76,11 +78,14 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     batch.yaw[i, :count] = o.yaw
     batch.goal[i] = arena.goal
     batch.tour_times_s[i] = np.inf
+    batch.tour_speed[i] = 0.0
     for j, tour in enumerate(arena.tours):
         k = len(tour.times_s)
         batch.tour_times_s[i, j, :k] = tour.times_s
         batch.tour_points[i, j, :k] = tour.points
         batch.tour_period_s[i, j] = tour.times_s[-1]
+        legs = np.linalg.norm(np.diff(tour.points, axis=0), axis=1) / np.diff(tour.times_s)
+        batch.tour_speed[i] = max(batch.tour_speed[i], legs.max())
 
 
 @kernel

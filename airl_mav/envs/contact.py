@@ -24,6 +24,33 @@ _SPHERE = int(Shape.SPHERE)
 
 
 @kernel
+def clearance(
+    position: Vec,
+    radius: float,
+    half_height: float,
+    bounds: NDArray[np.float64],
+    count: int,
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+) -> float:
+    """Return a distance [m] that the vehicle may move without touching anything; below 0 = unsure.
+
+    A lower bound: obstacles count as upright cylinders around their bounding boxes. Arguments as
+    of `touches`.
+    """
+    x, y, z = position
+    low = z + half_height
+    beside = min(min(x - bounds[0], bounds[1] - x), min(y - bounds[2], bounds[3] - y)) - radius
+    room: float = min(-low, max(beside, -bounds[4] - low))
+    for i in range(count):
+        dx, dy, dz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
+        hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        beside = math.sqrt(dx * dx + dy * dy) - math.sqrt(hx * hx + hy * hy) - radius
+        room = min(room, max(beside, abs(dz) - half_height - hz))
+    return room
+
+
+@kernel
 def touches(
     position: Vec,
     radius: float,

@@ -16,21 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, TICK_US
-from airl_mav.control.cascade import Demand, cascade, new_memory
+from airl_mav.control.attitude import heading_of
+from airl_mav.control.cascade import Demand, Filters, cascade_tick, filters, new_memory
 from airl_mav.control.gains import Gains
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
-from airl_mav.envs.contact import NOTHING, touches
+from airl_mav.envs.contact import NOTHING, clearance, touches
 from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import Coefficients, coefficients, power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
-from airl_mav.vehicle.rotation import Vec, rotate, yaw_of
-from airl_mav.vehicle.rotor import spin, wrench
+from airl_mav.vehicle.rotation import Vec, rotate
+from airl_mav.vehicle.rotor import lag, settle, wrench
 
 REPEAT_US = 50_000
 """MAVSDK repeats the newest setpoint at 20 Hz [µs]."""
+
+_ROUNDING_M = 1e-6
+"""Distances are this exact, and far more."""
 
 NAN3: Vec = (math.nan, math.nan, math.nan)
 
@@ -200,9 +204,10 @@ def advance(
         vehicle: What all vehicles share.
         rules: What ends a flight.
     """
+    weights = filters(vehicle.gains, TICK_S)
     for i in range(len(fleet.time_us)):
         if fleet.verdict[i] == _FLYING:
-            _fly(fleet, arenas, i, ticks[i], vehicle, rules)
+            _fly(fleet, arenas, i, ticks[i], vehicle, rules, weights)
 
 
 @kernel
@@ -226,11 +231,35 @@ def _airframe(row: NDArray[np.float64]) -> Airframe:
 
 
 @kernel
+def _contact(
+    arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: Vehicle
+) -> tuple[float, int]:
+    """Return how far [m] vehicle i surely is from everything, and what it touches."""
+    move_obstacles(arenas, i, time_us)
+    bounds, count = arenas.bounds[i], arenas.n_obstacles[i]
+    shape, center = arenas.shape[i], arenas.center[i]
+    half_size, yaw = arenas.half_size[i], arenas.yaw[i]
+    radius, half_height = vehicle.radius, vehicle.half_height
+    room = clearance(position, radius, half_height, bounds, count, center, half_size)
+    if room > _ROUNDING_M:
+        return room, NOTHING
+    return room, touches(
+        position, radius, half_height, bounds, count, shape, center, half_size, yaw
+    )
+
+
+@kernel
 def _fly(
-    fleet: Fleet, arenas: ArenaBatch, i: int, ticks: int, vehicle: Vehicle, rules: Rules
+    fleet: Fleet,
+    arenas: ArenaBatch,
+    i: int,
+    ticks: int,
+    vehicle: Vehicle,
+    rules: Rules,
+    weights: Filters,
 ) -> None:
     airframe, gains, pack = _airframe(fleet.airframe[i]), vehicle.gains, vehicle.pack
-    goal, radius = arenas.goal[i], rules.goal_radius
+    goal_north, goal_east = arenas.goal[i, 0], arenas.goal[i, 1]
     battery = fleet.battery[i]
     p = (fleet.position[i, 0], fleet.position[i, 1], fleet.position[i, 2])
     v = (fleet.velocity[i, 0], fleet.velocity[i, 1], fleet.velocity[i, 2])
@@ -245,12 +274,13 @@ def _fly(
     time_us = fleet.time_us[i]
     memory = fleet.memory[i]
     distance, energy = 0.0, 0.0
-    moving = arenas.n_obstacles[i] > arenas.n_static[i]
+    obstacles_move = TICK_S * arenas.tour_speed[i]
+    room = 0.0
     calm = (0.0, 0.0, 0.0)
+    left = lag(airframe, TICK_S)
     for _ in range(ticks):
         if time_us >= fleet.repeat_us[i]:
-            yaw = yaw_of(q)
-            c, s = math.cos(yaw), math.sin(yaw)
+            c, s = heading_of(q)
             forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
             fleet.velocity_ned[i, 0] = c * forward - s * right
             fleet.velocity_ned[i, 1] = s * forward + c * right
@@ -258,11 +288,11 @@ def _fly(
             fleet.repeat_us[i] += REPEAT_US
         wanted = (fleet.velocity_ned[i, 0], fleet.velocity_ned[i, 1], fleet.velocity_ned[i, 2])
         demand = Demand(NAN3, wanted, math.nan, fleet.setpoint[i, 3])
-        motors = cascade(p, v, q, w, demand, memory, gains, TICK_S).motors
-        s0 = spin(s0, motors[0], airframe, TICK_S)
-        s1 = spin(s1, motors[1], airframe, TICK_S)
-        s2 = spin(s2, motors[2], airframe, TICK_S)
-        s3 = spin(s3, motors[3], airframe, TICK_S)
+        motors = cascade_tick(p, v, q, w, demand, memory, gains, weights, TICK_S).motors
+        s0 = settle(s0, motors[0], airframe, left)
+        s1 = settle(s1, motors[1], airframe, left)
+        s2 = settle(s2, motors[2], airframe, left)
+        s3 = settle(s3, motors[3], airframe, left)
         thrust, torque = wrench(s0, s1, s2, s3, airframe)
         lift = rotate(q, (0.0, 0.0, -thrust))
         drag = drag_force(v, calm, airframe)
@@ -281,25 +311,18 @@ def _fly(
         rest_v = open_circuit(battery, pack.empty_v, pack.full_v)
         current = power / terminal_voltage(rest_v, pack.resistance_ohm, power)
         battery = drain(battery, current, pack.capacity_mah, TICK_S)
-        distance += math.sqrt(
+        moved = math.sqrt(
             (p[0] - moved_from[0]) ** 2 + (p[1] - moved_from[1]) ** 2 + (p[2] - moved_from[2]) ** 2
         )
+        distance += moved
         time_us += TICK_US
-        if moving:
-            move_obstacles(arenas, i, time_us)
-        hit = touches(
-            p,
-            vehicle.radius,
-            vehicle.half_height,
-            arenas.bounds[i],
-            arenas.n_obstacles[i],
-            arenas.shape[i],
-            arenas.center[i],
-            arenas.half_size[i],
-            arenas.yaw[i],
-        )
+        # Nothing is touched before vehicle and obstacles have moved as far as they were apart.
+        room -= moved + obstacles_move
+        hit = NOTHING
+        if room < _ROUNDING_M:
+            room, hit = _contact(arenas, i, p, time_us, vehicle)
         fleet.touched[i] = hit
-        if (p[0] - goal[0]) ** 2 + (p[1] - goal[1]) ** 2 < radius * radius:
+        if (p[0] - goal_north) ** 2 + (p[1] - goal_east) ** 2 < rules.goal_radius**2:
             fleet.verdict[i] = _SUCCESS
         elif hit != NOTHING:
             fleet.verdict[i] = _COLLISION
@@ -310,6 +333,7 @@ def _fly(
         else:
             continue
         break
+    move_obstacles(arenas, i, time_us)
     for axis in range(3):
         fleet.position[i, axis] = p[axis]
         fleet.velocity[i, axis] = v[axis]

@@ -157,6 +157,27 @@ class Sensors(ProfileModel):
     gps: Gps
 
 
+class Estimation(ProfileModel):
+    """The flight controller's estimation error in flight, as environments imitate it.
+
+    Each axis is a first-order Gauss-Markov process: standard deviation and correlation time.
+    Fitted by `scripts/fit-estimation-error`, which prints this table.
+    """
+
+    position_horizontal_m: float = quantity("sd of north and east", "m", ge=0, le=100)
+    position_horizontal_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+    position_vertical_m: float = quantity("sd of down", "m", ge=0, le=100)
+    position_vertical_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+    velocity_horizontal_m_s: float = quantity("sd of north and east", "m/s", ge=0, le=10)
+    velocity_horizontal_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+    velocity_vertical_m_s: float = quantity("sd of down", "m/s", ge=0, le=10)
+    velocity_vertical_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+    tilt_rad: float = quantity("sd of the turn about north and about east", "rad", ge=0, le=1)
+    tilt_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+    heading_rad: float = quantity("sd of the turn about down", "rad", ge=0, le=1)
+    heading_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
+
+
 class VehicleProfile(ProfileModel):
     """Everything about the aircraft that is not its companion computer."""
 
@@ -169,6 +190,9 @@ class VehicleProfile(ProfileModel):
     power: Power
     camera: Camera
     sensors: Sensors
+    estimation: Estimation | None = Field(
+        default=None, description="error of the estimator on these sensors; absent = not known"
+    )
     # Strict, or true and "0.5" would pass; a whole number passes for a float.
     parameters: dict[str, Annotated[float, Strict()]] = Field(
         default_factory=dict, description="PX4-named parameters that differ from the defaults"

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from airl_mav.errors import UsageError
@@ -144,13 +145,17 @@ def _arguments(spec: AlgorithmSpec, learner: Any, vehicles: int) -> dict[str, An
         known = [*SHARED_FIELDS, *DQN_OPTIONS]
     fields = {name: name for name in SHARED_FIELDS if name in known}
     fields |= DQN_FIELDS if learner is DoubleDQN else {}
-    for name in spec.model_fields_set - {"name", "options"}:
+    for name in spec.model_fields_set - {"name", "options", "learning_rate_final"}:
         if name not in fields:
             raise UsageError(
                 f"algorithm.{name}: {spec.name!r} has no such field; fields: {', '.join(fields)}"
             )
     arguments = {argument: getattr(spec, name) for name, argument in fields.items()}
     on_policy = spec.name in OPTION_DEFAULTS
+    if spec.learning_rate_final is not None:
+        arguments["learning_rate"] = LinearSchedule(
+            spec.learning_rate, spec.learning_rate_final, end_fraction=1.0
+        )
     if spec.batch_size is None and "batch_size" in arguments:
         arguments["batch_size"] = ON_POLICY_BATCH if on_policy else BATCH
     if on_policy:

@@ -65,6 +65,13 @@ class AlgorithmSpec(ProfileModel):
 
     name: str = Field(default="dqn", description="dqn, ppo or another by its class name")
     learning_rate: float = quantity("step of the optimiser", "1", gt=0, le=1, default=3e-4)
+    learning_rate_final: float | None = quantity(
+        "its last value, reached in a straight line; left out: it stays",
+        "1",
+        gt=0,
+        le=1,
+        default=None,
+    )
     gamma: float = quantity("discount of a decision", "1", gt=0, le=1, default=0.98)
     batch_size: int | None = quantity(
         "samples an update; left out: 128 (ppo: 256)", "1", ge=2, le=65536, default=None

@@ -42,8 +42,8 @@ def power_w(
         payload_g: Payload [g].
         b: b1..b9.
     """
-    vxy = math.hypot(velocity[0], velocity[1])
-    axy = math.hypot(acceleration[0], acceleration[1])
+    vxy = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
+    axy = math.sqrt(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1])
     vz = abs(velocity[2])
     az = abs(acceleration[2])
     tail = velocity[0] * wind[0] + velocity[1] * wind[1]

@@ -29,10 +29,22 @@ def steady_speed(command: float, thrust_curve: float) -> float:
 
 
 @kernel
+def lag(airframe: Airframe, dt: float) -> float:
+    """Return the share of a speed error that is left after dt [s]: a first-order lag, exact."""
+    return math.exp(-dt / airframe.rotor_time_constant)
+
+
+@kernel
+def settle(speed: float, command: float, airframe: Airframe, left: float) -> float:
+    """Return the speed fraction after the time in which the share `left` of an error is left."""
+    target = steady_speed(command, airframe.thrust_curve)
+    return target + (speed - target) * left
+
+
+@kernel
 def spin(speed: float, command: float, airframe: Airframe, dt: float) -> float:
     """Return the speed fraction after dt [s]: exact step response of a first-order lag."""
-    target = steady_speed(command, airframe.thrust_curve)
-    return target + (speed - target) * math.exp(-dt / airframe.rotor_time_constant)
+    return settle(speed, command, airframe, lag(airframe, dt))
 
 
 @kernel
