@@ -7,9 +7,9 @@ from stable_baselines3 import PPO
 from toy_fleet import ToyFleet
 
 from airl_mav.errors import UsageError
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from airl_mav.training.algorithms import CLASSES, CONTINUOUS_ONLY, ROLLOUT, make_model
 from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 SHORT = {
     "ppo": {"options": {"n_steps": 16, "n_epochs": 1}, "batch_size": 32},

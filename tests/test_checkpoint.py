@@ -19,9 +19,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from toy_fleet import ToyFleet
 
 from airl_mav.errors import UsageError
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from airl_mav.training.algorithms import CONTINUOUS_ONLY, make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 ROOT = Path(__file__).resolve().parents[1]
 VEHICLES = 4

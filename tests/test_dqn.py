@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.logger import configure
 from toy_fleet import ToyFleet
 
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.replay import NStepReplay
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 SHAPES = {"depth": ((1, 2, 2), np.dtype(np.uint8)), "goal": ((3,), np.dtype(np.float32))}
 ON, DEAD, LATE = 0, 1, 2

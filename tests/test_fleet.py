@@ -11,7 +11,7 @@ import pytest
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, TICK_US
-from airl_mav.control.cascade import Demand, cascade, new_memory
+from airl_mav.control.cascade import Demand, cascade, new_memory, trim_for_hover
 from airl_mav.envs.arenas import ArenaBatch, batch_of, empty_batch, move_obstacles, put_arena
 from airl_mav.envs.contact import FLOOR, NOTHING, WALL, clearance, touches
 from airl_mav.envs.fleet import (
@@ -74,6 +74,7 @@ class PlantPilot:
         a = VEHICLE.airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()
+        trim_for_hover(self.memory, a.mass * 9.80665 / (4 * a.thrust_max), VEHICLE.gains)
         self.time_us, self.repeat_us = 0, 0
         self.velocity = np.zeros(3)
 
@@ -390,3 +391,18 @@ def test_nothing_is_touched_within_the_clearance() -> None:
 def test_vehicle_radius_covers_the_collision_box_s_width() -> None:
     assert isinstance(VEHICLE, Vehicle)
     assert pytest.approx(0.5 * QUAD.body.width_m) == VEHICLE.radius
+
+
+@pytest.mark.parametrize("thrust_curve", [0.0, 0.4, 1.0])
+def test_a_heavy_vehicle_begins_in_a_steady_hover(thrust_curve: float) -> None:
+    """However far the vehicle is from what the controller counts on, nothing sags."""
+    fleet, arenas = new_fleet(1), batch_of([OPEN])
+    nominal = VEHICLE.airframe
+    heavy = nominal._replace(
+        mass=1.2 * nominal.mass, thrust_max=0.9 * nominal.thrust_max, thrust_curve=thrust_curve
+    )
+    hover(fleet, 0, 30.0, VEHICLE, heavy)
+    for _ in range(20):
+        advance(fleet, arenas, np.array([25]), VEHICLE, ENDLESS)
+        assert abs(fleet.position[0, 2] + 30.0) < 1e-3
+        assert abs(fleet.velocity[0, 2]) < 1e-3

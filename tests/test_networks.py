@@ -13,7 +13,6 @@ from torch.nn import functional
 from toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
 
 from airl_mav.errors import UsageError
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import (
@@ -22,6 +21,7 @@ from airl_mav.training.networks import (
     flat_size,
     to_channels_last,
 )
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 
 @pytest.mark.parametrize(

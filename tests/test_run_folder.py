@@ -16,8 +16,8 @@ from run_demo import demo_arena, demo_episode, demo_setup, write_demo_run
 from airl_mav.atomic import add_arrays, replace_file
 from airl_mav.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.provenance import git_state
 from airl_mav.harness.run_folder import EPISODES_FILE, LATENCY_FILE, RunFolder, load
+from airl_mav.provenance import git_state
 
 
 def same_path(a: Trajectory, b: Trajectory) -> bool:

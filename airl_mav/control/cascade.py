@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.control.attitude import attitude_towards, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors, mix
@@ -58,6 +59,18 @@ class Output(NamedTuple):
 def new_memory(n: int | None = None) -> Memory:
     """Return the memory of one vehicle (MEMORY_SIZE,), or of n (n, MEMORY_SIZE), at rest."""
     return np.zeros(MEMORY_SIZE if n is None else (n, MEMORY_SIZE))
+
+
+def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
+    """Set the vertical integral to what it settles at in a hover.
+
+    Args:
+        memory: Of one vehicle (MEMORY_SIZE,), updated.
+        command: Collective command 0..1 that the vehicle hovers at.
+        gains: Holds the hover thrust that the controller counts on.
+    """
+    # thrust_from_acceleration, solved for the acceleration that gives the command.
+    memory[_VEL_INT + 2] = (gains.hover_thrust - command) * GRAVITY_M_S2 / gains.hover_thrust
 
 
 @kernel

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,27 @@ from numpy.typing import NDArray
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.errors import UsageError
+from airl_mav.flight.judge import Outcome
 from airl_mav.policy.action_sets import commands
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.actions import Policy, limited
+from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.observation import Observation
 
 Decide = Callable[[Encoded], NDArray[Any]]
 """From the observations of n vehicles to their n actions; must treat each one for itself."""
 
 SLOTS = 256
 """Flights at a time."""
+
+OUTCOMES = {
+    Verdict.SUCCESS: Outcome.SUCCESS,
+    Verdict.COLLISION: Outcome.COLLISION,
+    Verdict.BATTERY: Outcome.BATTERY,
+    Verdict.TIMEOUT: Outcome.TIMEOUT,
+}
+"""How a record calls the end of a flight of the batch twin."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +45,109 @@ class Flown:
     distance_m: float
     energy_j: float
     decisions: int
+
+
+class Pilots(Protocol):
+    """Whoever decides for n vehicles, for each as if it were alone."""
+
+    def begin(self, slot: int, seed: int) -> None:
+        """An episode begins in a slot."""
+        ...
+
+    def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the velocity commands (n, 3) as `action_sets.commands` does.
+
+        Args:
+            seen: Of n vehicles.
+            flying: (n,) whose command will be flown.
+        """
+        ...
+
+
+class LearnedPilots:
+    """A network that decides for all at once."""
+
+    def __init__(self, policy: LearnedPolicy, chance: Callable[[int], np.random.Generator]) -> None:
+        """Take the policy; `chance` gives the source of random actions of an episode's seed."""
+        self._policy = policy
+        self._chance = chance
+        self._rngs: dict[int, np.random.Generator] = {}
+
+    def begin(self, slot: int, seed: int) -> None:
+        """Give the episode its own random actions."""
+        self._rngs[slot] = self._chance(seed)
+
+    def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the commands; see `Pilots`.
+
+        Raises:
+            UsageError: The network gives no numbers.
+        """
+        card = self._policy.card
+        encoded = encode_layout(card.observation, seen)
+        try:
+            if not card.epsilon:
+                return commands(card.actions, self._policy.act_batch(encoded))
+            chosen = np.zeros((len(flying), 3))
+            for i in np.flatnonzero(flying):
+                # One by one: what chance draws must not depend on the neighbours.
+                row = {key: array[i : i + 1] for key, array in encoded.items()}
+                action = self._policy.act_batch(row, self._rngs[int(i)])
+                chosen[i] = commands(card.actions, action)[0]
+        except ValueError as error:
+            raise UsageError(f"policy {card.name}: {error}") from None
+        return chosen
+
+
+class SinglePilots:
+    """A policy object for each vehicle, new with each episode: for those with a memory."""
+
+    def __init__(self, make: Callable[[], Policy], max_speed_m_s: float) -> None:
+        """Take what makes a policy, and the speed that its actions are limited to [m/s]."""
+        self._make = make
+        self._max_speed_m_s = max_speed_m_s
+        self._policies: dict[int, Policy] = {}
+
+    def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
+        """Make the episode's policy."""
+        self._policies[slot] = self._make()
+
+    def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the commands; see `Pilots`."""
+        chosen = np.zeros((len(flying), 3))
+        for i in np.flatnonzero(flying):
+            action = limited(self._policies[int(i)].act(_one(seen, int(i))), self._max_speed_m_s)
+            chosen[i] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
+        return chosen
+
+
+def _one(seen: Observation, i: int) -> Observation:
+    """Return what vehicle i of n sees."""
+    return replace(
+        seen,
+        depth_mm=seen.depth_mm[i],
+        goal=seen.goal[i],
+        velocity=seen.velocity[i],
+        roll=float(np.asarray(seen.roll)[i]),
+        pitch=float(np.asarray(seen.pitch)[i]),
+        yaw=float(np.asarray(seen.yaw)[i]),
+    )
+
+
+class _EncodedPilots:
+    """A bare function of the environment's own encoding."""
+
+    def __init__(self, navigation: Navigation, decide: Decide) -> None:
+        self._navigation = navigation
+        self._decide = decide
+
+    def begin(self, slot: int, seed: int) -> None:
+        """Nothing is remembered."""
+
+    def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:  # noqa: ARG002
+        """Return the commands; see `Pilots`."""
+        encoded = encode_layout(self._navigation.observation, seen)
+        return commands(self._navigation.spec.action_spec, self._decide(encoded))
 
 
 def fly_episodes(
@@ -53,33 +169,66 @@ def fly_episodes(
         slots: Flights at a time.
         zone: Curriculum zone that bounds the goals; None is the largest.
     """
-    waiting = list(seeds)
-    n = min(slots, len(waiting))
-    if n == 0:
+    if not seeds:
         return
-    navigation = Navigation(spec, n)
-    navigation.begin(range(n), waiting[:n], zone)
-    del waiting[:n]
+    navigation = Navigation(spec, min(slots, len(seeds)))
+    for _, flown in fly_seeds(navigation, _EncodedPilots(navigation, decide), seeds, zone=zone):
+        yield flown
+
+
+def fly_seeds(
+    navigation: Navigation,
+    pilots: Pilots,
+    seeds: Sequence[int],
+    *,
+    zone: int | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[tuple[int, Flown]]:
+    """Fly one episode a seed and yield slot and result of each as it ends.
+
+    The slot shows the flight's end until the next item is asked for.
+
+    Args:
+        navigation: No more slots than seeds.
+        pilots: Who decides.
+        seeds: Of the episodes.
+        zone: Curriculum zone that bounds the goals; None is the largest.
+        stop: Asked before each decision; True leaves the flights in the air unfinished.
+    """
+    n = navigation.n
+    waiting = list(reversed(seeds))
     decisions = np.zeros(n, np.int64)
-    busy = np.ones(n, np.bool_)
-    while busy.any():
-        actions = decide(navigation.observe())
-        navigation.fly(commands(spec.action_spec, actions))
+    busy = np.zeros(n, np.bool_)
+
+    def begin(slots: Sequence[int]) -> None:
+        taken = [waiting.pop() for _ in slots]
+        navigation.begin(slots, taken, zone)
+        for slot, seed in zip(slots, taken, strict=True):
+            pilots.begin(slot, seed)
+        decisions[slots] = 0
+        busy[slots] = True
+
+    begin(range(n))
+    while busy.any() and not stop():
+        navigation.fly(pilots.decide(navigation.see(), busy))
         decisions += 1
         now = navigation.flights()
-        for i in np.flatnonzero(busy & (now.verdict != Verdict.FLYING)):
-            yield Flown(
-                seed=int(navigation.seeds[i]),
-                verdict=Verdict(int(now.verdict[i])),
-                flight_time_s=float(now.time_s[i]),
-                distance_m=float(now.distance_m[i]),
-                energy_j=float(now.energy_j[i]),
-                decisions=int(decisions[i]),
+        ended = np.flatnonzero(busy & (now.verdict != Verdict.FLYING)).tolist()
+        for i in ended:
+            busy[i] = False
+            yield (
+                i,
+                Flown(
+                    seed=int(navigation.seeds[i]),
+                    verdict=Verdict(int(now.verdict[i])),
+                    flight_time_s=float(now.time_s[i]),
+                    distance_m=float(now.distance_m[i]),
+                    energy_j=float(now.energy_j[i]),
+                    decisions=int(decisions[i]),
+                ),
             )
-            busy[i] = bool(waiting)
-            if waiting:
-                navigation.begin([int(i)], [waiting.pop(0)], zone)
-                decisions[i] = 0
+        if ended and waiting:
+            begin(ended[: len(waiting)])
 
 
 def success_rate(flown: Sequence[Flown]) -> float:

@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 
 from airl_mav.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.control.attitude import heading_of
-from airl_mav.control.cascade import Demand, Filters, cascade_tick, filters, new_memory
+from airl_mav.control.cascade import (
+    Demand,
+    Filters,
+    cascade_tick,
+    filters,
+    new_memory,
+    trim_for_hover,
+)
 from airl_mav.control.gains import Gains
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.contact import NOTHING, clearance, touches
@@ -28,7 +35,7 @@ from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import Coefficients, coefficients, power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
-from airl_mav.vehicle.rotor import lag, settle, wrench
+from airl_mav.vehicle.rotor import command_for, lag, settle, wrench
 
 REPEAT_US = 50_000
 """MAVSDK repeats the newest setpoint at 20 Hz [µs]."""
@@ -179,7 +186,9 @@ def hover(
     fleet.airframe[i] = a
     fleet.position[i, 2] = -altitude_m
     fleet.quaternion[i, 0] = 1.0
-    fleet.rotor[i] = math.sqrt(a.mass * GRAVITY_M_S2 / (4.0 * a.thrust_max))
+    share = a.mass * GRAVITY_M_S2 / (4.0 * a.thrust_max)
+    fleet.rotor[i] = math.sqrt(share)
+    trim_for_hover(fleet.memory[i], command_for(share, a.thrust_curve), vehicle.gains)
     fleet.battery[i] = battery
     fleet.touched[i] = NOTHING
     fleet.verdict[i] = _FLYING
@@ -273,7 +282,7 @@ def _fly(
     s0, s1, s2, s3 = fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3]
     time_us = fleet.time_us[i]
     memory = fleet.memory[i]
-    distance, energy = 0.0, 0.0
+    distance, energy = fleet.distance[i], fleet.energy[i]
     obstacles_move = TICK_S * arenas.tour_speed[i]
     room = 0.0
     calm = (0.0, 0.0, 0.0)
@@ -342,6 +351,6 @@ def _fly(
         fleet.quaternion[i, axis] = q[axis]
     fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3] = s0, s1, s2, s3
     fleet.time_us[i] = time_us
-    fleet.distance[i] += distance
-    fleet.energy[i] += energy
+    fleet.distance[i] = distance
+    fleet.energy[i] = energy
     fleet.battery[i] = battery

@@ -1,8 +1,9 @@
 """N flights at a time: the companion's decision loop around the batch twin.
 
 A decision, as `companion.pilot` flies it: the frame was taken a moment ago, the state is that of
-now; while the network computes, and until its setpoint arrives, the last one keeps flying; then
-the action is held. Everything is in ticks of simulated time, so nothing depends on the machine.
+now; while the network computes, and until its setpoint arrives, the last one keeps flying. The
+hold counts from when the setpoint is sent, so that a decision takes t2 and the hold, not the link
+as well. Everything is in ticks of simulated time, so nothing depends on the machine.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +20,16 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Mount
 from airl_mav.constants import TICK_US, US_PER_S
 from airl_mav.envs.arenas import batch_of, put_arena
-from airl_mav.envs.camera import lens_of, look
-from airl_mav.envs.draws import DelayDraws, NormalDraws, Stream, stream
-from airl_mav.envs.fleet import Rules, Verdict, advance, hover, new_fleet, vehicle_of
-from airl_mav.envs.randomise import draw_airframe, noisy_depth
+from airl_mav.envs.cameras import Cameras
+from airl_mav.envs.draws import DelayDraws, Stream, stream
+from airl_mav.envs.fleet import Rules, advance, hover, new_fleet, vehicle_of
+from airl_mav.envs.randomise import draw_airframe
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.state import State, join, part_of, restore, take
+from airl_mav.envs.telemetry import Telemetry
+from airl_mav.envs.trace import Trace
 from airl_mav.errors import UsageError
 from airl_mav.latency.injection import Injection, choose_injection
 from airl_mav.policy.actions import vertical_speeds
@@ -35,7 +39,7 @@ from airl_mav.policy.layouts import (
     camera_mismatch,
     encode_layout,
 )
-from airl_mav.policy.observation import Kinematics, observe
+from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
@@ -59,13 +63,30 @@ class Flights:
     """Horizontal, true."""
     speed_m_s: NDArray[np.float64]
     """Three-dimensional, true."""
+    battery: NDArray[np.float64]
+    """Charge left, 1 to 0."""
+    touched: NDArray[np.int64]
+    """Index of the obstacle that is touched, or `contact.FLOOR`, `WALL`, `NOTHING`."""
 
 
 class Navigation:
     """N vehicles, each flying to its goal. Slots are begun and flown; nothing resets by itself."""
 
-    def __init__(self, spec: EnvironmentSpec, n: int) -> None:
+    def __init__(
+        self,
+        spec: EnvironmentSpec,
+        n: int,
+        *,
+        injection: Injection | None = None,
+        trace: Trace | None = None,
+    ) -> None:
         """Load what the environment is made of.
+
+        Args:
+            spec: The environment.
+            n: Number of vehicles.
+            injection: Where t2 comes from; None: what `spec.delay` says.
+            trace: Records the flights; None records nothing, and changes nothing.
 
         Raises:
             UsageError: A profile cannot be used, or the camera does not serve the layout.
@@ -87,20 +108,20 @@ class Navigation:
         self.intrinsics: Intrinsics = self.camera.intrinsics
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
-        self.injection: Injection = choose_injection(
-            load_computer(spec.delay.computer), spec.delay.workload
-        )
+        if injection is None:
+            injection = choose_injection(load_computer(spec.delay.computer), spec.delay.workload)
+        self.injection = injection
+        self._trace = trace
         parameters = parameter_values(self.vehicle.parameters)
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__)
-        self._mount = Mount(
-            (self.camera.forward_m, 0.0, -self.camera.up_m), np.deg2rad(self.camera.pitch_up_deg)
-        )
-        self._lens = lens_of(self.intrinsics, self.camera.range_m)
         rules = spec.episode
         self._rules = Rules(rules.goal_radius_m, round(rules.time_limit_s * US_PER_S))
         self._hold_us = round(rules.hold_s * US_PER_S)
         self._transport_us = round(spec.delay.transport_ms * US_PER_MS)
         self._link_us = round(spec.delay.link_ms * US_PER_MS)
+        hover_s = rules.hover_after_s
+        self._hover_us = None if hover_s is None else round(hover_s * US_PER_S)
+        self._check_hold()
 
         self.arenas: list[Arena | None] = [None] * n
         self.seeds = np.zeros(n, np.int64)
@@ -108,12 +129,12 @@ class Navigation:
         self._fleet = new_fleet(n)
         self._batch = batch_of([])
         self._decision = np.zeros(n, np.int64)
-        self._frame_us = np.zeros(n, np.int64)
         self._extra_us = np.zeros(n, np.int64)
         self._delays = DelayDraws(n, self.injection, round(spec.delay.native_ms * US_PER_MS))
-        self._normals = NormalDraws(n)
-        self._depth_rngs: list[np.random.Generator | None] = [None] * n
-        self._image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
+        randomisation = spec.randomisation
+        table = self.vehicle.estimation if randomisation.estimation else None
+        self._telemetry = Telemetry(n, table)
+        self._cameras = Cameras(n, self.camera, self._transport_us, randomisation)
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
         """Start episodes: each in a hover above its start, the first frame taken.
@@ -134,13 +155,7 @@ class Navigation:
         self._look(who)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
-        arena = generate(
-            self.arena_spec,
-            seed,
-            name=Path(self.spec.arena).stem,
-            vehicle_width_m=self.vehicle.body.width_m,
-            zone=zone,
-        )
+        arena = self._arena(seed, zone)
         self.arenas[i], self.seeds[i], self.zones[i] = arena, seed, -1 if zone is None else zone
         try:
             put_arena(self._batch, i, arena)
@@ -152,26 +167,27 @@ class Navigation:
             self._vehicle.airframe, randomisation, stream(seed, Stream.AIRFRAME)
         )
         hover(self._fleet, i, self.spec.episode.altitude_m, self._vehicle, airframe)
+        if self._trace is not None:
+            self._trace.begin(i, self._fleet)
         self._decision[i] = 0
-        # Frames come at the camera's rate, at any phase of the decisions.
-        phase = stream(seed, Stream.CAMERA).random()
-        self._frame_us[i] = -int(phase * self.camera.period_us)
         low, high = randomisation.extra_delay_ms
         delay_rng = stream(seed, Stream.DELAY)
         self._extra_us[i] = round(delay_rng.uniform(low, high) * US_PER_MS)
         self._delays.begin(i, seed)
-        self._normals.begin(i, seed)
-        self._depth_rngs[i] = stream(seed, Stream.DEPTH)
+        self._telemetry.begin(i, seed)
+        self._cameras.begin(i, seed)
+
+    def see(self) -> Observation:
+        """Return what all n vehicles sense now, with a leading axis (n,)."""
+        return observe(self._cameras.image, self.intrinsics, self.kinematics(), self._batch.goal)
 
     def observe(self) -> Encoded:
         """Return what all n policies see now, in the environment's layout."""
-        seen = observe(self._image, self.intrinsics, self.kinematics(), self._batch.goal)
-        return encode_layout(self.observation, seen)
+        return encode_layout(self.observation, self.see())
 
     def kinematics(self) -> Kinematics:
-        """Return the state of all n as telemetry reports it."""
-        fleet = self._fleet
-        return Kinematics(fleet.position, fleet.velocity, fleet.quaternion)
+        """Return the state of all n as telemetry reports it: with the estimator's error."""
+        return self._telemetry.tell(self.truth())
 
     def flights(self) -> Flights:
         """Return how all n flights stand."""
@@ -184,71 +200,149 @@ class Navigation:
             energy_j=fleet.energy.copy(),
             goal_distance_m=np.hypot(to_goal[:, 0], to_goal[:, 1]),
             speed_m_s=np.linalg.norm(fleet.velocity, axis=1),
+            battery=fleet.battery.copy(),
+            touched=fleet.touched.copy(),
         )
+
+    def truth(self) -> Kinematics:
+        """Return the true state of all n; a copy."""
+        fleet = self._fleet
+        return Kinematics(fleet.position.copy(), fleet.velocity.copy(), fleet.quaternion.copy())
 
     def fly(self, commands: NDArray[np.float64]) -> None:
         """Fly one decision of every flight that goes on.
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s].
+
+        Raises:
+            ValueError: Not n commands.
         """
-        delay_us = self._delays.take(self._decision) + self._extra_us + self._link_us
-        self._compute(_ticks(delay_us))
-        self._command(commands)
-        # What is left of the hold once the delays are rounded to ticks stays with the hold.
-        end_us = self._fleet.time_us + self._hold_us
-        age = np.minimum(_ticks(self._age_us(end_us)), self._hold_us // TICK_US)
-        self._advance(self._hold_us // TICK_US - age)
+        if commands.shape != (self.n, 3):
+            raise ValueError(f"commands of shape {commands.shape}: accepted: ({self.n}, 3)")
+        if self._trace is not None:
+            self._trace.deciding(self._fleet)
+        began_us = self._fleet.time_us.copy()
+        # Ticks are counted from the observation that is being decided on.
+        t2_us = self._delays.take(self._decision) + self._extra_us
+        sent, accepted = _ticks(t2_us), _ticks(t2_us + self._link_us)
+        self._wait(np.zeros_like(sent), sent)
+        down = vertical_speeds(self.spec.episode.altitude_m, self.kinematics().position[:, 2])
+        self._wait(sent, accepted)
+        self._command(commands, down)
+        left = sent + self._hold_us // TICK_US - accepted
+        age = np.minimum(_ticks(self._cameras.age_us(self._fleet.time_us + left * TICK_US)), left)
+        self._advance(left - age)
         self._look(self._fleet.verdict >= 0)
         self._advance(age)
         self._decision += 1
+        self._telemetry.step(self._decision, (self._fleet.time_us - began_us) / US_PER_S)
+        if self._trace is not None:
+            self._trace.decided(self._fleet, t2_us, self._transport_us, self._link_us)
 
-    def _compute(self, ticks: NDArray[np.int64]) -> None:
-        """Fly on the last setpoint, or stop after a while, while the next one is computed."""
-        hover_s = self.spec.episode.hover_after_s
-        if hover_s is None:
-            self._advance(ticks)
+    def get_state(self) -> State:
+        """Return all that the future depends on, as copies."""
+        own = {key: array.copy() for key, array in self._arrays().items()}
+        own["begun"] = np.array([arena is not None for arena in self.arenas])
+        fleet = {key: array.copy() for key, array in self._fleet._asdict().items()}
+        return join(
+            {
+                "navigation": own,
+                "fleet": fleet,
+                "delays": self._delays.get_state(),
+                "telemetry": self._telemetry.get_state(),
+                "cameras": self._cameras.get_state(),
+            }
+        )
+
+    def set_state(self, state: State) -> None:
+        """Go on from a saved state; arenas are made anew from their seeds.
+
+        Raises:
+            UsageError: It is not one of this environment.
+        """
+        own, fleet = part_of(state, "navigation"), part_of(state, "fleet")
+        for key, array in self._arrays().items():
+            restore(array, own, key)
+        for key, array in self._fleet._asdict().items():
+            restore(array, fleet, key)
+        self._delays.set_state(part_of(state, "delays"))
+        self._telemetry.set_state(part_of(state, "telemetry"))
+        self._cameras.set_state(part_of(state, "cameras"))
+        self.arenas = [
+            self._arena(int(seed), None if zone < 0 else int(zone)) if begun else None
+            for seed, zone, begun in zip(self.seeds, self.zones, take(own, "begun"), strict=True)
+        ]
+        spare = next((arena for arena in self.arenas if arena is not None), None)
+        room = [spare if arena is None else arena for arena in self.arenas]
+        self._batch = batch_of([arena for arena in room if arena is not None])
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that change in flight, besides the fleet's."""
+        return {
+            "seeds": self.seeds,
+            "zones": self.zones,
+            "decision": self._decision,
+            "extra_us": self._extra_us,
+        }
+
+    def _arena(self, seed: int, zone: int | None) -> Arena:
+        return generate(
+            self.arena_spec,
+            seed,
+            name=Path(self.spec.arena).stem,
+            vehicle_width_m=self.vehicle.body.width_m,
+            zone=zone,
+        )
+
+    def _wait(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+        """Fly on the last setpoint from one tick to another; it may run out on the way."""
+        if self._hover_us is None:
+            self._advance(end - start)
             return
-        first = np.minimum(ticks, round(hover_s * US_PER_S) // TICK_US)
-        self._advance(first)
-        late = ticks > first
-        self._fleet.setpoint[late] = 0.0
-        self._fleet.repeat_us[late] = self._fleet.time_us[late]
-        self._advance(ticks - first)
+        # The stop takes as long to arrive as any setpoint.
+        stop = _ticks(np.full(self.n, self._hover_us + self._link_us))
+        reached = np.clip(stop, start, end)
+        self._advance(reached - start)
+        over = (stop >= start) & (stop < end)
+        self._fleet.setpoint[over] = 0.0
+        self._fleet.repeat_us[over] = self._fleet.time_us[over]
+        self._advance(end - reached)
 
-    def _command(self, commands: NDArray[np.float64]) -> None:
+    def _command(self, commands: NDArray[np.float64], down: NDArray[np.float64]) -> None:
         fleet = self._fleet
-        down = vertical_speeds(self.spec.episode.altitude_m, self.kinematics().position[:, 2])
         fleet.setpoint[:, :2] = commands[:, :2]
         fleet.setpoint[:, 2] = down
         fleet.setpoint[:, 3] = commands[:, 2]
         fleet.repeat_us[:] = fleet.time_us
 
-    def _age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how old the newest decoded frame is at a time (n,) [µs]."""
-        age: NDArray[np.int64] = self._transport_us + (
-            (time_us - self._transport_us - self._frame_us) % self.camera.period_us
-        )
-        return age
+    def _check_hold(self) -> None:
+        """Refuse a hold so short that a decision would have to wait for its frame."""
+        least_us = self._link_us + self._transport_us + self.camera.period_us
+        if self._hold_us < least_us:
+            raise UsageError(
+                f"episode.hold_s = {self.spec.episode.hold_s:g}: accepted: value >= "
+                f"{least_us / US_PER_S:g} s (delay.link_ms, delay.transport_ms and "
+                f"{self.camera.period_us / US_PER_MS:g} ms between two frames)"
+            )
 
     def _advance(self, ticks: NDArray[np.int64]) -> None:
+        """Let time pass: the only place where it does."""
+        if self._trace is not None:
+            self._trace.advance(self._fleet, ticks, self._fly)
+        else:
+            self._fly(ticks)
+
+    def _fly(self, ticks: NDArray[np.int64]) -> None:
         advance(self._fleet, self._batch, ticks, self._vehicle, self._rules)
 
     def _look(self, who: NDArray[np.bool_]) -> None:
-        look(self._fleet, self._batch, who, self._mount, self._lens, self._image)
-        if self.spec.randomisation.depth_noise or self.spec.randomisation.depth_dropout:
-            for i in np.flatnonzero(who):
-                rng = self._depth_rngs[i]
-                if rng is not None:
-                    self._image[i] = noisy_depth(self._image[i], self.spec.randomisation, rng)
+        if self._trace is not None:
+            self._trace.looked(self._fleet, who)
+        self._cameras.look(self._fleet, self._batch, who)
 
 
 def _ticks(time_us: NDArray[np.int64]) -> NDArray[np.int64]:
     """Round times [µs] to whole ticks."""
     ticks: NDArray[np.int64] = (time_us + TICK_US // 2) // TICK_US
     return ticks
-
-
-def outcome_counts(verdict: NDArray[np.int64]) -> dict[str, int]:
-    """Return how many flights ended how, by the verdict's name in lower case."""
-    return {v.name.lower(): int(np.count_nonzero(verdict == v)) for v in Verdict}

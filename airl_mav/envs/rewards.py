@@ -61,6 +61,10 @@ def _paper(h: Happened) -> NDArray[np.float64]:
 
     a: goal reached, b: collision, D_g: distance to the goal, D_c = (V_max - V_now) t_max with
     t_max the time an action is held, g: 1 when closer to the goal than before.
+
+    As printed, D_c is added, and only on the way to the goal: it pays slowness there, although
+    the text calls it a penalty on speeding away. V_max is 5 m/s whatever the action set; who is
+    faster pays. Running out of time costs nothing, and every decision costs its distance.
     """
     ended = PAPER_BONUS * (h.success.astype(np.float64) - h.failure)
     closer = h.distance_m < h.distance_before_m

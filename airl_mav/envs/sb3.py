@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
+from airl_mav.envs.state import State, join, part_of, restore
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.layouts import Encoded
 
@@ -17,21 +19,24 @@ QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "see
 
 
 class NavigationVecEnv(VecEnv):
-    """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`."""
+    """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
+
+    The info of a step is empty but for the episodes that end in it. `episode` is what SB3's Monitor
+    writes, so there is no need of one; its time `t` is that of the flight [s].
+    """
 
     def __init__(self, env: NavigationVectorEnv) -> None:
         """Wrap a vectorised environment."""
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.env = env
-        self.render_mode = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: NDArray[Any] = np.zeros(0)
         self._return = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, np.int64)
 
     def reset(self) -> Encoded:
-        """Begin n episodes; `seed()` before it seeds them."""
+        """Begin n episodes; `seed()` and `set_options()` before it say which."""
         seed = next((s for s in self._seeds if s is not None), None)
-        observation, _ = self.env.reset(seed=seed)
+        observation, _ = self.env.reset(seed=seed, options=self._options[0])
         self._reset_seeds()
         self._reset_options()
         self._return[:] = 0.0
@@ -50,17 +55,38 @@ class NavigationVecEnv(VecEnv):
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done):
-            episode = {key: info[key][i].item() for key in QUALITY}
-            episode |= {"r": float(self._return[i]), "l": int(self._length[i]), "t": 0.0}
+            final = info["final_info"]
+            episode = {key: _plain(final[key][i]) for key in QUALITY}
+            episode |= {"r": float(self._return[i]), "l": int(self._length[i])}
             infos[i] = {
                 "terminal_observation": info["final_obs"][i],
                 "TimeLimit.truncated": bool(truncated[i]),
                 "is_success": episode["success"],
-                "episode": episode,
+                "episode": episode | {"t": episode["flight_time_s"]},
             }
         self._return[done] = 0.0
         self._length[done] = 0
         return seen, reward.astype(np.float32), done, infos
+
+    def observe(self) -> Encoded:
+        """Return what all see now, as the last step or reset did: to go on after `set_state`."""
+        return self.env.navigation.observe()
+
+    def get_state(self) -> State:
+        """Return everything that the future depends on: arrays for a checkpoint."""
+        own = {"return": self._return.copy(), "length": self._length.copy()}
+        return join({"vector": self.env.get_state(), "adapter": own})
+
+    def set_state(self, state: State) -> None:
+        """Go on from a saved state: the next step is as it would have been.
+
+        Raises:
+            UsageError: It is of another environment.
+        """
+        self.env.set_state(part_of(state, "vector"))
+        own = part_of(state, "adapter")
+        restore(self._return, own, "return")
+        restore(self._length, own, "length")
 
     def close(self) -> None:
         """Nothing to release."""
@@ -82,14 +108,15 @@ class NavigationVecEnv(VecEnv):
         result = getattr(self.env, method_name)(*arguments, **keywords)
         return [result] * len(list(self._get_indices(indices)))
 
-    def env_is_wrapped(
-        self,
-        wrapper_class: type[Any],
-        indices: VecEnvIndices = None,  # noqa: ARG002
-    ) -> list[bool]:
-        """Return False: there are no wrappers inside."""
-        return [False] * len(list(self._get_indices(indices)))
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """Return whether a wrapper's work is done: that of Monitor is, there are no others."""
+        return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return nothing to see: render the single environment instead."""
         return [None] * self.num_envs
+
+
+def _plain(value: Any) -> Any:
+    """Return a number of numpy as one of Python."""
+    return value.item() if isinstance(value, np.generic) else value

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from airl_mav.envs.rewards import RewardName
+from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import LayoutName
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.profiles.loading import explain
 
 
 class EpisodeRules(ProfileModel):
@@ -92,7 +95,8 @@ class Randomisation(ProfileModel):
         "rotor time constant, +- this share", "1", ge=0, le=0.9, default=0.0
     )
     estimation: bool = Field(
-        default=True, description="telemetry carries the estimator's error, not the truth"
+        default=True,
+        description="telemetry carries the estimator's error, where the vehicle's profile has it",
     )
     depth_noise: float = quantity(
         "sd of the depth noise at 10 m, as a share; grows with the square of the depth as of a"
@@ -153,3 +157,19 @@ class EnvironmentSpec(ProfileModel):
     def action_spec(self) -> ActionSpec:
         """The action set with its fastest speed."""
         return ActionSpec(set=self.actions, max_speed_m_s=self.max_speed_m_s)
+
+
+def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:
+    """Return the specification, or make it of knobs: its fields, nested tables as dicts.
+
+    Raises:
+        UsageError: A knob is unknown, of the wrong type or out of range, or both are given.
+    """
+    if spec is not None:
+        if knobs:
+            raise UsageError(f"spec and {', '.join(knobs)}: accepted: one or the other")
+        return spec
+    try:
+        return EnvironmentSpec.model_validate(dict(knobs))
+    except ValidationError as error:
+        raise UsageError(explain(error, EnvironmentSpec)) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +16,18 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import Happened, rewards
 from airl_mav.envs.spaces import action_space, observation_space
-from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.state import (
+    State,
+    join,
+    pack,
+    pack_generators,
+    part_of,
+    take,
+    unpack,
+    unpack_generators,
+)
+from airl_mav.errors import UsageError
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.layouts import Encoded
 
@@ -29,60 +40,86 @@ LAST_TRAINING_SEED = 2**31
 class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
     """N flights that begin anew in the very step they end in (Gymnasium's SAME_STEP).
 
-    `info` of a step carries, where `_episode` is set, the quality of flight of the episode that
-    ended: `success`, `outcome`, `flight_time_s`, `distance_m`, `energy_j`, `seed`, `zone`, and
-    `final_obs`, the observation that it ended with.
+    `info` is what Gymnasium's SyncVectorEnv makes of n `NavigationEnv`: `seed`, `zone`,
+    `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m` of the episodes that go on; in
+    `final_info` those of the ones that ended, with `success` and `outcome`, and in `final_obs` the
+    observation each ended with; a mask `_key` beside every key.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
 
-    def __init__(self, num_envs: int, spec: EnvironmentSpec | None = None, **knobs: Any) -> None:
+    def __init__(
+        self,
+        num_envs: int,
+        spec: EnvironmentSpec | None = None,
+        *,
+        render_mode: str | None = None,
+        **knobs: Any,
+    ) -> None:
         """Make n environments.
 
         Args:
             num_envs: N.
             spec: What they are made of; or
+            render_mode: None. A single environment is what can be looked at.
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
-            UsageError: A profile cannot be used.
+            UsageError: A knob or a profile cannot be used.
         """
-        self.environment = EnvironmentSpec(**knobs) if spec is None else spec
+        if num_envs < 1:
+            raise UsageError(f"num_envs = {num_envs}: accepted: value >= 1")
+        if render_mode is not None:
+            raise UsageError(
+                f"render_mode = {render_mode!r}: n at a time draw no picture; accepted: None, or "
+                "make a single environment"
+            )
+        self.environment = spec_of(spec, knobs)
         self.navigation = Navigation(self.environment, num_envs)
         self.num_envs = num_envs
         self.single_observation_space = observation_space(self.navigation.observation)
         self.single_action_space = action_space(self.environment.action_spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.curriculum: CurriculumState | None = None
-        if self.environment.curriculum is not None:
-            zones = len(self.navigation.arena_spec.zones_m)
-            self.curriculum = CurriculumState(self.environment.curriculum, zones)
+        self.curriculum = curriculum_of(self.navigation)
+        self._zone: int | None = None
         self._before: Flights | None = None
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | NDArray[np.int64] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Encoded, dict[str, Any]]:
         """Begin n episodes.
 
         Args:
             seed: One number seeds the generator that all episodes' seeds are drawn from. A list
-                gives the first episodes' own seeds, as in `Navigation-v0.reset(seed)`.
-            options: `seeds`: (n,) the same as a list for `seed`; `zone`: curriculum zone.
+                gives the first episodes' own seeds, as in `NavigationEnv.reset(seed)`; None in it
+                draws one.
+            options: `zone`: curriculum zone that bounds the goals, of the episodes that follow too,
+                until a reset with a seed or options; left out: that of the curriculum, or the
+                whole arena.
+
+        Raises:
+            UsageError: A wrong option, or not n seeds.
         """
-        options = options or {}
-        seeds: Sequence[int] | None = options.get("seeds")
-        if isinstance(seed, Sequence):
-            seeds = seed
-            self._np_random = np.random.default_rng(np.random.SeedSequence(list(seed)))
+        if seed is not None or options:
+            self._zone = zone_option(options)
+        own: list[int | None] = [None] * self.num_envs
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
         else:
-            super().reset(seed=seed)
-        if seeds is None:
-            seeds = self._draw_seeds(self.num_envs)
-        self._zone = options.get("zone")
+            own = [None if each is None else int(each) for each in seed]
+            if len(own) != self.num_envs:
+                raise UsageError(f"seed: {len(own)} numbers; accepted: {self.num_envs}")
+            if given := [each for each in own if each is not None]:
+                self.np_random = np.random.default_rng(np.random.SeedSequence(given))
+        drawn = iter(draw_seeds(self.np_random, own.count(None)))
+        seeds = [next(drawn) if each is None else each for each in own]
         self.navigation.begin(range(self.num_envs), seeds, self._open_zone())
         self._before = self.navigation.flights()
-        return self.navigation.observe(), {"seed": self.navigation.seeds.copy()}
+        return self.navigation.observe(), _masked(quality(self.navigation, self._before))
 
     def step(
         self, actions: NDArray[Any]
@@ -95,18 +132,15 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
         now = navigation.flights()
         reward = rewards(self.environment.reward, happened(self._before, now, self.environment))
         seen = navigation.observe()
-        truncated = now.verdict == Verdict.TIMEOUT
-        terminated = (now.verdict != Verdict.FLYING) & ~truncated
+        terminated, truncated = endings(now)
         ended = terminated | truncated
-        info: dict[str, Any] = {}
+        final: dict[str, Any] = {}
         if ended.any():
-            info = episode_info(navigation, now, ended)
-            info["final_obs"] = _final(seen, ended)
-            info["_final_obs"] = ended
+            final = _final(seen, navigation, now, ended)
             seen = self._begin_anew(np.flatnonzero(ended), now)
             now = navigation.flights()
         self._before = now
-        return seen, reward, terminated, truncated, info
+        return seen, reward, terminated, truncated, _masked(quality(navigation, now)) | final
 
     def _begin_anew(self, slots: NDArray[np.int64], ended: Flights) -> Encoded:
         """Begin the next episodes of `slots`; return what all see now."""
@@ -114,19 +148,82 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
             for i in slots:
                 success = bool(ended.verdict[i] == Verdict.SUCCESS)
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
-        self.navigation.begin(slots.tolist(), self._draw_seeds(len(slots)), self._open_zone())
+        seeds = draw_seeds(self.np_random, len(slots))
+        self.navigation.begin(slots.tolist(), seeds, self._open_zone())
         return self.navigation.observe()
 
     def _open_zone(self) -> int | None:
-        if self.curriculum is not None:
-            return self.curriculum.zone
-        return self._zone
+        return open_zone(self._zone, self.curriculum)
 
-    def _draw_seeds(self, n: int) -> list[int]:
-        drawn: list[int] = self.np_random.integers(
-            FIRST_TRAINING_SEED, LAST_TRAINING_SEED, n
-        ).tolist()
-        return drawn
+    def get_state(self) -> State:
+        """Return everything that the future depends on: arrays for a checkpoint."""
+        curriculum = None if self.curriculum is None else self.curriculum.state()
+        own = {
+            "spec": pack(self.environment.model_dump(mode="json")),
+            "started": np.array(self._before is not None),
+            "zone": pack(self._zone),
+            "curriculum": pack(curriculum),
+            "generator": pack_generators([self._np_random]),
+        }
+        return join({"env": own, "flights": self.navigation.get_state()})
+
+    def set_state(self, state: State) -> None:
+        """Go on from a saved state: the next step is as it would have been.
+
+        Raises:
+            UsageError: It is of another environment.
+        """
+        own = part_of(state, "env")
+        self._check_same(unpack(take(own, "spec")))
+        self.navigation.set_state(part_of(state, "flights"))
+        self._zone = unpack(take(own, "zone"))
+        (self._np_random,) = unpack_generators(take(own, "generator"))
+        curriculum = unpack(take(own, "curriculum"))
+        if self.curriculum is not None:
+            self.curriculum.restore(curriculum[0], tuple(curriculum[1]))
+        self._before = self.navigation.flights() if take(own, "started") else None
+
+    def _check_same(self, theirs: dict[str, Any]) -> None:
+        ours = self.environment.model_dump(mode="json")
+        changed = [key for key in ours if theirs.get(key) != ours[key]]
+        if changed:
+            raise UsageError(f"state: of an environment with another {', '.join(changed)}")
+
+
+def curriculum_of(navigation: Navigation) -> CurriculumState | None:
+    """Return the curriculum at its start; None when there is none."""
+    settings = navigation.spec.curriculum
+    if settings is None:
+        return None
+    return CurriculumState(settings, len(navigation.arena_spec.zones_m))
+
+
+def open_zone(asked: int | None, curriculum: CurriculumState | None) -> int | None:
+    """Return the zone of the next episode: the one asked for, that of the curriculum, the whole."""
+    return curriculum.zone if asked is None and curriculum is not None else asked
+
+
+def zone_option(options: Mapping[str, Any] | None) -> int | None:
+    """Return the zone that `reset` is asked for. Raises UsageError for anything else."""
+    options = options or {}
+    if unknown := [key for key in options if key != "zone"]:
+        raise UsageError(f"options: {', '.join(map(str, unknown))}; accepted: zone")
+    zone = options.get("zone")
+    if zone is not None and (isinstance(zone, bool) or not isinstance(zone, int | np.integer)):
+        raise UsageError(f"options: zone = {zone!r}: accepted: a whole number")
+    return None if zone is None else int(zone)
+
+
+def draw_seeds(rng: np.random.Generator, n: int) -> list[int]:
+    """Return the seeds of n episodes of training."""
+    drawn: list[int] = rng.integers(FIRST_TRAINING_SEED, LAST_TRAINING_SEED, n).tolist()
+    return drawn
+
+
+def endings(now: Flights) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which flights are terminated and which truncated: those that ran out of time."""
+    truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
+    return (now.verdict != Verdict.FLYING) & ~truncated, truncated
 
 
 def happened(before: Flights, now: Flights, spec: EnvironmentSpec) -> Happened:
@@ -141,31 +238,48 @@ def happened(before: Flights, now: Flights, spec: EnvironmentSpec) -> Happened:
     )
 
 
-def episode_info(
-    navigation: Navigation, flights: Flights, ended: NDArray[np.bool_]
-) -> dict[str, Any]:
-    """Return the quality of flight of the episodes that ended, Gymnasium's way of vector infos."""
-    names = np.array([v.name.lower() for v in Verdict])
-    values = {
-        "success": flights.verdict == Verdict.SUCCESS,
-        "outcome": names[flights.verdict],
-        "flight_time_s": flights.time_s,
-        "distance_m": flights.distance_m,
-        "energy_j": flights.energy_j,
-        "goal_distance_m": flights.goal_distance_m,
+def quality(navigation: Navigation, flights: Flights) -> dict[str, NDArray[Any]]:
+    """Return what `info` says of every flight: which episode it is, and its quality so far."""
+    return {
         "seed": navigation.seeds.copy(),
         "zone": navigation.zones.copy(),
+        "flight_time_s": flights.time_s.copy(),
+        "distance_m": flights.distance_m.copy(),
+        "energy_j": flights.energy_j.copy(),
+        "goal_distance_m": flights.goal_distance_m.copy(),
     }
-    info: dict[str, Any] = {}
-    for key, value in values.items():
-        info[key] = value
-        info[f"_{key}"] = ended
-    return info
 
 
-def _final(seen: Encoded, ended: NDArray[np.bool_]) -> NDArray[np.object_]:
-    """Return the last observations of the episodes that ended, as an array of dicts."""
-    final = np.full(len(ended), None, dtype=object)
-    for i in np.flatnonzero(ended):
-        final[i] = {key: value[i] for key, value in seen.items()}
-    return final
+def outcome(flights: Flights, i: int) -> dict[str, Any]:
+    """Return what `info` says in addition of a flight that has ended."""
+    verdict = Verdict(int(flights.verdict[i]))
+    return {"success": verdict == Verdict.SUCCESS, "outcome": verdict.name.lower()}
+
+
+def _masked(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    """Add masks that are all true."""
+    masks = {f"_{key}": np.ones(len(value), np.bool_) for key, value in values.items()}
+    return values | masks
+
+
+def _final(
+    seen: Encoded, navigation: Navigation, flights: Flights, ended: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Return `final_obs` and `final_info` of the episodes that ended, and their masks."""
+    n, who = len(ended), np.flatnonzero(ended)
+    info: dict[str, NDArray[Any]] = {
+        key: np.where(ended, value, np.zeros_like(value))
+        for key, value in quality(navigation, flights).items()
+    }
+    info["success"] = flights.verdict == Verdict.SUCCESS
+    info["outcome"] = np.full(n, None, dtype=object)
+    observation = np.full(n, None, dtype=object)
+    for i in who:
+        info["outcome"][i] = outcome(flights, int(i))["outcome"]
+        observation[i] = {key: value[i] for key, value in seen.items()}
+    return {
+        "final_obs": observation,
+        "_final_obs": ended.copy(),
+        "final_info": info | {f"_{key}": ended.copy() for key in info},
+        "_final_info": ended.copy(),
+    }

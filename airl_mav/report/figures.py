@@ -128,7 +128,7 @@ def _draw_latency(
     else:
         bottom.xaxis.set_major_locator(MaxNLocator(5))
     for ax in (top, bottom):
-        _quiet(ax)
+        quiet(ax)
 
 
 def _long_tail(values: NDArray[np.float64]) -> bool:
@@ -175,7 +175,7 @@ def map_figure(
         _draw_goal(ax, episode)
     if trajectory is not None and len(trajectory) > 1:
         _draw_path(figure, ax, episode, trajectory, top_speed)
-    _quiet(ax, grid=False)
+    quiet(ax, grid=False)
     ax.xaxis.label.set(color=MUTED, fontsize=8.5)
     ax.yaxis.label.set(color=MUTED, fontsize=8.5)
     handles, labels = ax.get_legend_handles_labels()
@@ -271,7 +271,7 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
         ax.set_ylim(bottom=min(0.0, float(values.min())))
         if t[0] < 0.0:
             ax.axvspan(t[0], 0.0, color=RULE, alpha=0.45, lw=0)
-        _quiet(ax)
+        quiet(ax)
         ax.set_xlim(t[0], t[-1])
     if t[0] < 0.0:
         rows[0][0].annotate(
@@ -289,7 +289,7 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
     return render(figure, f"flight-{episode.index:03d}-time", alt)
 
 
-def _quiet(ax: Axes, *, grid: bool = True) -> None:
+def quiet(ax: Axes, *, grid: bool = True) -> None:
     """Style an axes: thin rules, small ticks, no box."""
     ax.set_facecolor("none")
     ax.tick_params(colors=MUTED, labelsize=8, length=0, which="both")

@@ -11,22 +11,23 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.atomic import replace_file
-from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.run_folder import LoadedRun
-from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.report.figures import latency_figure, latency_overview, map_figure, time_figure
+from airl_mav.report.overview import overview_figure
 from airl_mav.report.summary import RunSummary, summarize_run
 from airl_mav.report.tables import (
     NONE,
     ORIGIN_WORDS,
     OUTCOME_WORDS,
     episodes_table,
+    failures_first,
     latency_table,
     ms,
     quality_table,
+    rate_digits,
     real_time_table,
     setup_rows,
 )
@@ -34,8 +35,11 @@ from airl_mav.report.theme import Picture
 
 REPORT_FILE = "report.html"
 
-MAX_PICTURED = 24
-"""Flights with pictures: those that failed first. Every flight is in the tables."""
+MAX_PICTURED = 12
+"""Flights with pictures: those that failed first."""
+
+MAX_LISTED = 200
+"""Flights in the table: those that failed first."""
 
 
 @dataclass(frozen=True)
@@ -77,20 +81,22 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
     summary = summarize_run(run)
     measured = [
         (stage, summary.samples[stage.key], summary.stages[stage.key])
-        for stage in SHOWN_STAGES
+        for stage in summary.shown_stages
         if summary.stages[stage.key].n
     ]
     latency_pictures = [latency_figure(*part) for part in measured]
     if measured:
         replace_file(folder / "latency.png", latency_overview(measured))
+    overview = overview_figure(run, arenas) if needs_overview(run) else None
     flights = _flights(run, arenas)
-    for flight in flights:
-        for picture in flight.pictures:
-            replace_file(folder / f"{picture.name}.png", picture.png)
+    pictures = [picture for flight in flights for picture in flight.pictures]
+    for picture in [*pictures, *([overview] if overview else [])]:
+        replace_file(folder / f"{picture.name}.png", picture.png)
     page = (
         _environment()
         .get_template("report.html.j2")
         .render(
+            kind="Evaluation" if summary.modelled else "Rehearsal",
             run=run.info,
             folder=run.path.name,
             badges=[
@@ -103,10 +109,12 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
             setup=setup_rows(run),
             latency=latency_table(summary),
             quality=quality_table(summary),
-            episodes=episodes_table(run),
-            real_time=real_time_table(run, summary),
+            episodes=episodes_table(run, MAX_LISTED),
+            real_time=None if summary.modelled else real_time_table(run, summary),
             latency_pictures=latency_pictures,
+            overview=overview,
             flights=flights,
+            flown=len(run.episodes),
             outcome_keys={words: outcome.value for outcome, words in OUTCOME_WORDS.items()},
             configuration=json.dumps(run.info.config, indent=2, ensure_ascii=False),
             provenance=_provenance(run),
@@ -115,6 +123,17 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
     path = folder / REPORT_FILE
     replace_file(path, page.encode())
     return path
+
+
+def pictured(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the episodes that get pictures, in the order they were flown."""
+    return failures_first(run.episodes, MAX_PICTURED)
+
+
+def needs_overview(run: LoadedRun) -> bool:
+    """Return whether there are too many flights to be looked at one by one."""
+    many = len(run.episodes) > MAX_PICTURED or run.info.setup.level == "gym"
+    return many and bool(run.episodes)
 
 
 def _environment() -> Environment:
@@ -130,12 +149,11 @@ def _environment() -> Environment:
 
 def _flights(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[Flight]:
     """Draw the flights that get pictures, in the order they were flown."""
-    ranked = sorted(run.episodes, key=lambda e: (e.outcome is Outcome.SUCCESS, e.index))
-    chosen = sorted(ranked[:MAX_PICTURED], key=lambda e: e.index)
+    chosen = pictured(run)
     # Up to the verdict: what is recorded after it is the landing.
     paths = {
         episode.index: path.between(int(path.time_us[0]), episode.ended_us)
-        for episode in run.episodes
+        for episode in chosen
         if (path := run.trajectories.get(episode.index)) is not None and len(path)
     }
     top_speed = max((float(path.speed().max(initial=0.0)) for path in paths.values()), default=0.0)
@@ -168,9 +186,9 @@ def _headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
     q = summary.quality
     end_to_end = summary.stages["end_to_end"]
     t2 = summary.stages["t2"]
-    origin = run.info.setup.injection.origin
+    origin = "modelled" if summary.modelled else run.info.setup.injection.origin
     return [
-        _headline("success rate", q.success_rate, 100.0, 0, "%"),
+        _headline("success rate", q.success_rate, 100.0, rate_digits(q.success_rate), "%"),
         _headline("flight time", q.flight_time_s, 1.0, 1, "s"),
         _headline("distance", q.distance_m, 1.0, 1, "m"),
         _headline("energy", q.energy_j, 1e-3, 1, "kJ"),

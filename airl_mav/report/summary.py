@@ -12,8 +12,23 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.harness.run_folder import TICK_LATENESS, LoadedRun
 from airl_mav.latency.percentiles import Summary, summarize
-from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
+from airl_mav.latency.stages import (
+    ALL_STAGES,
+    SETPOINT_TO_MOTOR,
+    SHOWN_STAGES,
+    Samples,
+    Stage,
+    pool,
+    stage_samples,
+)
 from airl_mav.latency.stamps import NO_STAMP
+
+MODELLED_STAGES = tuple(
+    SETPOINT_TO_MOTOR if stage.key == "link" else stage
+    for stage in SHOWN_STAGES
+    if stage.key not in ("send", "control")
+)
+"""Level gym sends in no time, and has link and control in one."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +58,28 @@ class RunSummary:
     """Raw durations behind them [µs]."""
     quality: Aggregate
     real_time: RealTime
+    modelled: bool
+    """Times come from a model and were not measured: level gym."""
+
+    @property
+    def shown_stages(self) -> tuple[Stage, ...]:
+        """The stages of the latency table: at level gym those that its model has."""
+        if not self.modelled:
+            return SHOWN_STAGES
+        return tuple(stage for stage in MODELLED_STAGES if self.stages[stage.key].n)
 
 
 def summarize_run(run: LoadedRun) -> RunSummary:
     """Work out the figures of a run."""
     samples = pool(stage_samples(stamps) for stamps in run.latency.values())
     stages = {stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES}
-    return RunSummary(stages, samples, aggregate(run.episodes), _real_time(run, stages))
+    return RunSummary(
+        stages=stages,
+        samples=samples,
+        quality=aggregate(run.episodes),
+        real_time=_real_time(run, stages),
+        modelled=run.info.setup.level == "gym",
+    )
 
 
 def _real_time(run: LoadedRun, stages: dict[str, Summary]) -> RealTime:

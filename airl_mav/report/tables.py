@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Part
 from airl_mav.flight.statistics import Estimate
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.harness.run_folder import EPISODES_FILE, LoadedRun
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
-from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.report.summary import RealTime, RunSummary
 
 US_PER_MS = 1_000.0
@@ -18,6 +18,8 @@ NONE = "–"
 TOO_FEW_CELL = "too few"
 FEW_FLIGHTS = 10
 """Below this a bootstrap interval covers clearly less than its 95 %."""
+MANY_FLIGHTS = 100
+"""From here on rates have a decimal."""
 
 OUTCOME_WORDS = {
     Outcome.SUCCESS: "goal reached",
@@ -102,13 +104,18 @@ def latency_table(summary: RunSummary) -> TableView:
         Column("from → to", number=False, page_only=True),
     )
     rows, short = [], False
-    for stage in SHOWN_STAGES:
+    for stage in summary.shown_stages:
         s = summary.stages[stage.key]
         tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
         short = short or TOO_FEW_CELL in tail
         cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
         rows.append((stage.title, *cells, stage.meaning))
     notes = ["Milliseconds of simulated time."]
+    if summary.modelled:
+        notes.append(
+            "Level gym measures no time: transport and link are constants of its model, t2 is "
+            "drawn from the distribution named above."
+        )
     if short:
         notes.append(
             f"{TOO_FEW_CELL}: a p90 needs {MIN_SAMPLES[90.0]} samples, a p99 {MIN_SAMPLES[99.0]}."
@@ -116,8 +123,14 @@ def latency_table(summary: RunSummary) -> TableView:
     return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
 
 
-def episodes_table(run: LoadedRun) -> TableView:
-    """Return the quality of each flight."""
+def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[EpisodeRecord]:
+    """Return at most so many episodes, those that failed before all others, in flown order."""
+    ranked = sorted(episodes, key=lambda e: (e.outcome is Outcome.SUCCESS, e.index))
+    return sorted(ranked[:most], key=lambda e: e.index)
+
+
+def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
+    """Return the quality of each flight, or of at most so many, those that failed first."""
     columns = (
         Column("#"),
         Column("seed"),
@@ -132,9 +145,15 @@ def episodes_table(run: LoadedRun) -> TableView:
         Column("battery", "%", page_only=True),
         Column("why", number=False, page_only=True),
     )
-    rows = tuple(_episode_row(episode) for episode in run.episodes)
-    notes = ("From the start of navigation; the take-off apart. Energy without the computer's.",)
-    return TableView("episodes", "Flights", columns, rows, notes)
+    total = len(run.episodes)
+    shown = run.episodes if most is None else failures_first(run.episodes, most)
+    rows = tuple(_episode_row(episode) for episode in shown)
+    notes = ["From the start of navigation; the take-off apart. Energy without the computer's."]
+    if len(shown) < total:
+        notes.append(
+            f"{len(shown)} of {total:,} flights, those that failed first; all: {EPISODES_FILE}."
+        )
+    return TableView("episodes", "Flights", columns, rows, tuple(notes))
 
 
 def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
@@ -170,7 +189,7 @@ def quality_table(summary: RunSummary) -> TableView:
     )
     q = summary.quality
     rows = (
-        _estimate_row("success rate", "%", q.success_rate, 100.0, 0),
+        _estimate_row("success rate", "%", q.success_rate, 100.0, rate_digits(q.success_rate)),
         _estimate_row("flight time", "s", q.flight_time_s, 1.0, 2),
         _estimate_row("distance", "m", q.distance_m, 1.0, 2),
         _estimate_row("energy, vehicle", "kJ", q.energy_j, 1e-3, 2),
@@ -184,6 +203,17 @@ def quality_table(summary: RunSummary) -> TableView:
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
     return TableView("quality", "Quality of flight", columns, rows, tuple(notes))
+
+
+def rate_digits(rate: Estimate) -> int:
+    """Return the decimals of a rate in percent: one flight more or less shows."""
+    return 1 if rate.n >= MANY_FLIGHTS else 0
+
+
+def outcomes_in_words(summary: RunSummary) -> str:
+    """Return how many flights ended how."""
+    counts = summary.quality.outcomes.items()
+    return ", ".join(f"{count:,} {OUTCOME_WORDS[outcome]}" for outcome, count in counts if count)
 
 
 def _estimate_row(

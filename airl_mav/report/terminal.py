@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from rich import box
 from rich.console import Console
@@ -19,10 +20,14 @@ from airl_mav.report.tables import (
     TableView,
     episodes_table,
     latency_table,
+    outcomes_in_words,
     quality_table,
     real_time_table,
     setup_rows,
 )
+
+MAX_LISTED = 25
+"""Flights with a line of their own."""
 
 STYLES = {
     OUTCOME_WORDS[Outcome.SUCCESS]: "green",
@@ -49,25 +54,28 @@ def print_report(run: LoadedRun, console: Console, report: Path | None = None) -
     facts.add_column(overflow="fold")
     for term, text in setup_rows(run):
         facts.add_row(term, Text(text))
+    facts.add_row("flights", Text(outcomes_in_words(summary)))
     console.print()
     console.print(facts)
-    views = (
-        latency_table(summary),
-        episodes_table(run),
-        quality_table(summary),
-        real_time_table(run, summary),
-    )
+    views = [latency_table(summary), episodes_table(run, MAX_LISTED), quality_table(summary)]
+    if not summary.modelled:
+        views.append(real_time_table(run, summary))
     for view in views:
         console.print()
-        console.print(rich_table(view))
-        for note in view.notes:
-            console.print(Text(note, style="dim"))
+        print_table(view, console)
     if report is not None:
         console.print()
         console.print(Text.assemble(("report  ", "dim"), str(report)), soft_wrap=True)
 
 
-def rich_table(view: TableView) -> Table:
+def print_table(view: TableView, console: Console, *, wrap: bool = False) -> None:
+    """Print a table and its notes; its cells are broken into lines or kept whole."""
+    console.print(rich_table(view, wrap=wrap))
+    for note in view.notes:
+        console.print(Text(note, style="dim"))
+
+
+def rich_table(view: TableView, *, wrap: bool = False) -> Table:
     """Return a table for the terminal, without the columns meant for a page."""
     table = Table(
         title=view.title,
@@ -81,7 +89,8 @@ def rich_table(view: TableView) -> Table:
     for i in shown:
         column = view.columns[i]
         title = f"{column.title} [{column.unit}]" if column.unit else column.title
-        table.add_column(Text(title), justify="right" if column.number else "left", no_wrap=True)
+        side: Literal["left", "right"] = "right" if column.number else "left"
+        table.add_column(Text(title), justify=side, no_wrap=not wrap)
     for row in view.rows:
         table.add_row(*(Text(row[i], style=STYLES.get(row[i], "")) for i in shown))
     return table

@@ -42,6 +42,16 @@ def settle(speed: float, command: float, airframe: Airframe, left: float) -> flo
 
 
 @kernel
+def command_for(thrust: float, thrust_curve: float) -> float:
+    """Return the command 0..1 that gives a share 0..1 of the greatest thrust in steady state."""
+    c = thrust_curve
+    if c == 0.0:
+        return thrust
+    b = 1.0 - c
+    return (math.sqrt(b * b + 4.0 * c * thrust) - b) / (2.0 * c)
+
+
+@kernel
 def spin(speed: float, command: float, airframe: Airframe, dt: float) -> float:
     """Return the speed fraction after dt [s]: exact step response of a first-order lag."""
     return settle(speed, command, airframe, lag(airframe, dt))

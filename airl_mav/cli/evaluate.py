@@ -1,0 +1,240 @@
+"""`airl evaluate`: fly policies through seeded episodes and say how well, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from airl_mav.cli import report
+from airl_mav.cli.common import GREATEST_SEED, check_range
+from airl_mav.clock import utc_now
+from airl_mav.errors import UsageError
+from airl_mav.flight.statistics import aggregate
+from airl_mav.harness.run_folder import RUN_FILE
+from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.ports import Ports
+from airl_mav.report.matrix import (
+    MATRIX_FILE,
+    MATRIX_TABLE_FILE,
+    Cell,
+    matrix_tables,
+    write_matrix,
+)
+
+if TYPE_CHECKING:
+    from airl_mav.cli.evaluation import Result, Task
+
+SHARED = ("level", "vehicle", "computer", "workload", "ablate", "episodes", "seed")
+"""Options that head a table: the same for all of it."""
+
+DEFAULT_ARENA = "static-obstacles"
+"""For policies that were not trained in any."""
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Fly policies through seeded episodes: success, time, distance and energy with intervals.
+
+    Several policies or arenas give a table of policies x arenas. The same --out goes on with what
+    was interrupted; a finished evaluation shows its tables again.
+    """
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY ...")]
+    """Names, or paths to folders with policy.onnx and card.json."""
+
+    arena: tuple[str, ...] = ()
+    """Arena profiles: shipped names, or paths to .toml files. None given: those that the policies
+    were trained in, or static-obstacles."""
+
+    episodes: int = 100
+    """Number of episodes in each arena, >= 1."""
+
+    seed: int = 1
+    """Seed; episode i uses seed + i, with every policy and arena."""
+
+    level: Literal["gym", "sitl"] = "gym"
+    """gym: the batch twin, some hundred episodes a second. sitl: as airl-sitl flies, in real time
+    times --speed."""
+
+    ablate: Literal["depth", "velocity", "goal"] | None = None
+    """Input of the network that is made zero, at level gym. None: none."""
+
+    vehicle: str = "quad"
+    """Vehicle profile: a shipped name, or a path to a .toml."""
+
+    computer: str = "workstation"
+    """Computer profile to fly as: a shipped name, or a path to a .toml."""
+
+    workload: str | None = None
+    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
+    policy. None: what was measured for this very policy, or else 1 ms (gym), or what this machine
+    takes (sitl)."""
+
+    goal_radius: float | None = None
+    """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
+    or 3."""
+
+    time_limit: float | None = None
+    """Longest flight from the start of navigation, s. None: 120."""
+
+    hold: float | None = None
+    """t3: how long an action is held before the next observation, s. None: that of the policy's
+    card, or 0.5."""
+
+    hover_after: float | None = None
+    """Zero the velocity so long after the hold when no new action has come, s. None: as the
+    policy's card says, or never."""
+
+    altitude: float | None = None
+    """Height above the start that is flown, m. None: that of the policy's card, or 2.5."""
+
+    slots: int = 128
+    """Flights at a time at level gym, >= 1. Decides the pace, not the results."""
+
+    speed: float = 1.0
+    """Level sitl: simulated seconds per wall second, 0.5 to 10."""
+
+    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
+    """Ports of level sitl."""
+
+    out: Path | None = None
+    """Run folder, or with several policies or arenas the folder of their run folders. None:
+    runs/<UTC time>-evaluate-..."""
+
+
+def run(command: EvaluateCommand, console: Console | None = None) -> int:
+    """Evaluate.
+
+    Args:
+        command: What was asked for.
+        console: Where to print; None means standard output.
+
+    Returns:
+        Exit status: 0 all episodes flown, 1 a process died (sitl), 130 Ctrl-C.
+
+    Raises:
+        UsageError: The input cannot be used.
+    """
+    console = console or Console()
+    arenas = _check(command)
+    # Imported late: the kernels take a second to load, and a typo must not wait for them.
+    from airl_mav.cli.evaluation import prepare
+
+    tasks = [prepare(command, policy, arena) for policy in command.policies for arena in arenas]
+    for policy in {task.policy.name: task.policy for task in tasks}.values():
+        _warn_of_known_seeds(command, policy, console)
+    if len(tasks) == 1:
+        return _fly_one(command, tasks[0], console)
+    return _fly_matrix(command, tasks, console)
+
+
+def _check(command: EvaluateCommand) -> list[str]:
+    """Check what all tasks share; return the arenas. Raises UsageError."""
+    if not command.policies:
+        raise UsageError("no policy; accepted: one or more names or folders")
+    check_range("--episodes", command.episodes, 1, 100_000)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    if command.level == "sitl" and command.ablate is not None:
+        raise UsageError(f"--ablate {command.ablate}: accepted: with --level gym")
+    found = [find_policy(name) for name in command.policies]
+    _check_names("policies", [policy.name for policy in found])
+    if command.arena:
+        _check_names("--arena", [Path(arena).stem for arena in command.arena])
+        return list(command.arena)
+    trained = [None if policy.card is None else policy.card.training.arena for policy in found]
+    return list(dict.fromkeys(arena or DEFAULT_ARENA for arena in trained))
+
+
+def _check_names(option: str, names: Sequence[str]) -> None:
+    """Raise UsageError when two of them would share a row, a column and a folder."""
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"{option}: {name} twice; accepted: each name once")
+
+
+def _warn_of_known_seeds(command: EvaluateCommand, policy: PolicyInfo, console: Console) -> None:
+    """Say so when a policy may know the episodes from its training."""
+    training = None if policy.card is None else policy.card.training
+    if training is None or training.first_arena_seed is None:
+        return
+    first, last = training.first_arena_seed, training.last_arena_seed
+    if command.seed + command.episodes > first and (last is None or command.seed <= last):
+        console.print(
+            f"{policy.name} was trained on seeds from {first} on: not all episodes are new to it",
+            style="yellow",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
+
+
+def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
+    """Evaluate one policy in one arena and show the run."""
+    if command.out is not None and (command.out / MATRIX_FILE).exists():
+        raise UsageError(f"--out {command.out}: holds a table of policies x arenas")
+    result = task.fly(command.out, console)
+    if not result.episodes:
+        console.print(f"no episode was finished; {result.path}", soft_wrap=True)
+    elif command.level == "gym":
+        report.run(report.ReportCommand(result.path), console)
+    return result.code
+
+
+def _fly_matrix(command: EvaluateCommand, tasks: Sequence[Task], console: Console) -> int:
+    """Evaluate every policy in every arena and show the tables."""
+    from airl_mav.report.html import REPORT_FILE
+    from airl_mav.report.rebuild import rebuild
+    from airl_mav.report.terminal import print_table
+
+    root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-evaluate"
+    if (root / RUN_FILE).exists():
+        raise UsageError(f"--out {root}: holds a single run; accepted: another folder")
+    facts = {key: getattr(command, key) for key in SHARED}
+    cells: list[Cell] = []
+    code = 0
+    for task in tasks:
+        result = task.fly(root / f"{task.policy.name}-{task.arena_name}", console)
+        if result.episodes:
+            if command.level == "gym" and (result.new or not (result.path / REPORT_FILE).exists()):
+                rebuild(result.path)
+            cells.append(_cell(task, result))
+            write_matrix(root, facts, cells)
+            _say_how_it_went(cells[-1], console)
+        if code := result.code:
+            break
+    for view in matrix_tables(cells):
+        console.print()
+        print_table(view, console, wrap=True)
+    if cells:
+        console.print(
+            f"\ntables  {root / MATRIX_TABLE_FILE}", soft_wrap=True, markup=False, highlight=False
+        )
+    return code
+
+
+def _say_how_it_went(cell: Cell, console: Console) -> None:
+    """Print one line; a table of many flights takes a while."""
+    counts = cell.quality.outcomes.items()
+    told = ", ".join(f"{count} {outcome.value}" for outcome, count in counts if count)
+    console.print(
+        f"{cell.policy} in {cell.arena}: {told}", soft_wrap=True, markup=False, highlight=False
+    )
+
+
+def _cell(task: Task, result: Result) -> Cell:
+    """Return a task's row and column of the table."""
+    card = task.policy.card
+    trained_in = None if card is None else card.training.arena
+    return Cell(
+        policy=task.policy.name,
+        arena=task.arena_name,
+        folder=result.path.name,
+        trained_in=None if trained_in is None else Path(trained_in).stem,
+        rules=task.rules,
+        quality=aggregate(result.episodes),
+    )

@@ -1,0 +1,215 @@
+"""Pictures of an environment: the arena from above, what the network sees, and the figures.
+
+What stays the same over an episode is drawn once; a frame is that, and a few things on top.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from airl_mav.arena.draw import (
+    GRID_COLOUR,
+    MOVING_COLOURS,
+    START_COLOUR,
+    TEXT_COLOUR,
+    draw_arena,
+)
+from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.constants import US_PER_S
+from airl_mav.errors import UsageError
+
+WIDTH_PX, HEIGHT_PX = 960, 540
+DPI = 100
+VEHICLE_M = 1.4
+"""Length of the drawn vehicle: to be seen, it is larger than any that flies here [m]."""
+
+TRAIL_COLOUR = "#c0392b"
+CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
+
+
+@dataclass(frozen=True)
+class View:
+    """What a picture shows besides the arena."""
+
+    time_us: int
+    """Since the start of the episode [µs]."""
+    position: NDArray[np.float64]
+    """(3,) NED [m]."""
+    yaw: float
+    """[rad]"""
+    speed_m_s: float
+    goal_distance_m: float
+    energy_j: float
+    trail: Sequence[NDArray[np.float64]]
+    """Where it has been: north, east [m]."""
+    depth: NDArray[np.uint8]
+    """(h, w) as the network sees it."""
+    outcome: str
+    """How the episode ended, "flying" before that."""
+
+
+class Picture:
+    """Draws one environment; pictures are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+
+    def __init__(self, goal_radius_m: float, image_px: tuple[int, int]) -> None:
+        """Take the radius of the goal's disc [m], and rows and columns of the depth image."""
+        self._goal_radius_m = goal_radius_m
+        self._image_px = image_px
+        self._figure = Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._background: Any = None
+        self._outlines: list[NDArray[np.float64]] = []
+
+    def begin(self, arena: Arena) -> None:
+        """Start an episode: draw what will not change."""
+        self._arena = arena
+        self._figure.clear()
+        self._map = self._figure.add_axes((0.06, 0.1, 0.5, 0.84))
+        draw_arena(_standing(arena), self._map, goal_radius_m=self._goal_radius_m)
+        self._map.set_title(f"{arena.name}, seed {arena.seed}", fontsize=11, color=TEXT_COLOUR)
+        self._eye = self._figure.add_axes((0.62, 0.4, 0.35, 0.54))
+        self._eye.set_anchor("N")
+        self._eye.set(xticks=[], yticks=[])
+        self._eye.spines[:].set_color(GRID_COLOUR)
+        self._eye.set_title("depth that the network sees", fontsize=11, color=TEXT_COLOUR)
+        self._outlines = [_outline(arena.obstacles, i) for i in _movers(arena)]
+        face, edge = MOVING_COLOURS
+        moving: dict[str, Any] = {"animated": True, "facecolor": face, "edgecolor": edge}
+        self._moving: Any = self._map.add_collection(PolyCollection([], zorder=2.1, **moving))
+        (self._trail,) = self._map.plot(
+            [], [], color=TRAIL_COLOUR, lw=1.4, alpha=0.8, zorder=2.5, animated=True
+        )
+        (self._vehicle,) = self._map.fill(
+            [0.0], [0.0], color=START_COLOUR, ec="white", lw=0.8, zorder=3.5, animated=True
+        )
+        self._image = self._eye.imshow(
+            np.zeros(self._image_px, np.uint8),
+            cmap="gray",
+            vmin=0,
+            vmax=255,
+            interpolation="nearest",
+            animated=True,
+        )
+        self._text = self._figure.text(
+            *(0.62, 0.33, ""),
+            va="top",
+            family="monospace",
+            fontsize=11,
+            linespacing=1.5,
+            color=TEXT_COLOUR,
+            animated=True,
+        )
+        self._background = None
+
+    def draw(self, view: View) -> NDArray[np.uint8]:
+        """Return the picture of a moment of the episode that was begun."""
+        if self._background is None:
+            self._canvas.draw()
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._canvas.restore_region(self._background)
+        self._update(view)
+        for artist in (self._moving, self._trail, self._vehicle):
+            self._map.draw_artist(artist)
+        self._eye.draw_artist(self._image)
+        self._figure.draw_artist(self._text)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def _update(self, view: View) -> None:
+        centers = self._arena.centers_at(view.time_us)[self._arena.n_static :, 1::-1]
+        self._moving.set_verts(
+            [outline + at for outline, at in zip(self._outlines, centers, strict=True)]
+        )
+        trail = np.array(view.trail)
+        self._trail.set_data(trail[:, 1], trail[:, 0])
+        self._vehicle.set_xy(_arrow(view.yaw) + view.position[1::-1])
+        self._image.set_data(view.depth)
+        self._text.set_text(
+            f"time   {view.time_us / US_PER_S:7.2f} s     {view.outcome}\n"
+            f"goal   {view.goal_distance_m:7.2f} m\n"
+            f"speed  {view.speed_m_s:7.2f} m/s\n"
+            f"height {-view.position[2]:7.2f} m\n"
+            f"energy {view.energy_j / 1000.0:7.2f} kJ"
+        )
+
+
+class Window:
+    """Shows pictures on a display."""
+
+    def __init__(self, fps: float) -> None:
+        """Open it; every picture stays for 1 / fps [s]. Raises UsageError without a display."""
+        from matplotlib import pyplot
+
+        self._pyplot = pyplot
+        self._seconds = 1.0 / fps
+        try:
+            self._figure = pyplot.figure(
+                figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI, num="airl/Navigation-v0"
+            )
+        except ImportError as error:  # a backend that was asked for and cannot be had
+            raise _no_display(str(error)) from None
+        if type(self._figure.canvas).required_interactive_framework is None:
+            pyplot.close(self._figure)
+            raise _no_display(f"matplotlib's backend is {pyplot.get_backend()}")
+        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        self._axes.set_axis_off()
+        self._image: Any = None
+
+    def show(self, picture: NDArray[np.uint8]) -> None:
+        """Show a picture; events of the window are handled while it stays."""
+        if self._image is None:
+            self._image = self._axes.imshow(picture)
+        self._image.set_data(picture)
+        self._pyplot.pause(self._seconds)
+
+    def close(self) -> None:
+        """Close it."""
+        self._pyplot.close(self._figure)
+
+
+def _no_display(why: str) -> UsageError:
+    return UsageError(
+        f"render_mode = 'human': no display for a window ({why}); accepted here: 'rgb_array'"
+    )
+
+
+def _movers(arena: Arena) -> range:
+    return range(arena.n_static, len(arena.obstacles))
+
+
+def _standing(arena: Arena) -> Arena:
+    """Return the arena without what moves."""
+    o, n = arena.obstacles, arena.n_static
+    standing = Obstacles(o.shape[:n], o.center[:n], o.half_size[:n], o.yaw[:n])
+    return replace(arena, obstacles=standing, tours=())
+
+
+def _outline(obstacles: Obstacles, i: int) -> NDArray[np.float64]:
+    """Return the footprint (k, 2) east, north [m] of an obstacle around its centre."""
+    along, across = obstacles.half_size[i, :2]
+    if obstacles.shape[i] != Shape.BOX:
+        circle: NDArray[np.float64] = along * np.stack([np.sin(CIRCLE), np.cos(CIRCLE)], axis=1)
+        return circle
+    corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (along, across)
+    return _turned(corners, float(obstacles.yaw[i]))
+
+
+def _arrow(yaw: float) -> NDArray[np.float64]:
+    """Return the outline (4, 2) east, north [m] of a vehicle in the origin."""
+    tip, tail, wing = 0.6 * VEHICLE_M, -0.4 * VEHICLE_M, 0.4 * VEHICLE_M
+    return _turned(np.array([[tip, 0.0], [tail, wing], [0.5 * tail, 0.0], [tail, -wing]]), yaw)
+
+
+def _turned(points: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    """Turn points (k, 2) forward, right by a heading; return them as east, north."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    north, east = c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]
+    return np.stack([east, north], axis=1)

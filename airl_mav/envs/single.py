@@ -1,0 +1,176 @@
+"""`airl/Navigation-v0`: one flight at a time, in Gymnasium's API."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.constants import US_PER_S
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.picture import Picture, View, Window
+from airl_mav.envs.rewards import rewards
+from airl_mav.envs.spaces import action_space, observation_space
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.vector import (
+    curriculum_of,
+    draw_seeds,
+    endings,
+    happened,
+    open_zone,
+    outcome,
+    quality,
+    zone_option,
+)
+from airl_mav.errors import UsageError
+from airl_mav.frames import quat_yaw
+from airl_mav.policy.action_sets import commands
+from airl_mav.policy.layouts import DEPTH, Encoded
+
+
+class NavigationEnv(gym.Env[Encoded, Any]):
+    """One vehicle that flies to its goal; a step is a decision and its hold.
+
+    Observation: a Dict of `depth`, `velocity` and `goal` (`airl_mav.policy.layouts`). `info`
+    carries `seed`, `zone` (-1: the whole arena), `flight_time_s`, `distance_m`, `energy_j` and
+    `goal_distance_m`; at the end also `success` and `outcome` (success, collision, battery,
+    timeout). Only a timeout is a truncation.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 2}  # noqa: RUF012
+
+    def __init__(
+        self,
+        spec: EnvironmentSpec | None = None,
+        *,
+        render_mode: str | None = None,
+        **knobs: Any,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            spec: What it is made of; or
+            render_mode: None, `rgb_array` or `human` (a window, which needs a display).
+            knobs: the fields of an EnvironmentSpec.
+
+        Raises:
+            UsageError: A knob or a profile cannot be used, or there is no display.
+        """
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise UsageError(f"render_mode = {render_mode!r}: accepted: None, {', '.join(modes)}")
+        self.environment = spec_of(spec, knobs)
+        self.navigation = Navigation(self.environment, 1)
+        self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
+        self.action_space = action_space(self.environment.action_spec)
+        self.curriculum = curriculum_of(self.navigation)
+        self.render_mode = render_mode
+        # A picture a decision: shown so often, a video of them runs in the time of the flight.
+        fps = 1.0 / self.environment.episode.hold_s
+        self.metadata = self.metadata | {"render_fps": fps}
+        self._zone: int | None = None
+        self._before: Flights | None = None
+        self._depth = np.zeros((0, 0), np.uint8)
+        self._trail: list[NDArray[np.float64]] = []
+        self._picture: Picture | None = None
+        self._window = Window(fps) if render_mode == "human" else None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Encoded, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: That of the episode itself: the arena, the goal and all that chance decides in
+                it. Left out: drawn, as `NavigationVectorEnv` draws it.
+            options: `zone`: curriculum zone that bounds the goal, of the episodes that follow too,
+                until a reset with a seed or options; left out: that of the curriculum, or the
+                whole arena.
+
+        Raises:
+            UsageError: A wrong option, or no arena can be made of the seed.
+        """
+        if seed is not None or options:
+            self._zone = zone_option(options)
+        super().reset(seed=seed)
+        episode = draw_seeds(self.np_random, 1)[0] if seed is None else seed
+        self.navigation.begin([0], [episode], open_zone(self._zone, self.curriculum))
+        self._before = self.navigation.flights()
+        self._trail = []
+        if self._picture is not None:
+            self._picture.begin(self._arena())
+        return self._observe(), self._info(self._before)
+
+    def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
+        """Fly one decision; see Gymnasium's Env.step."""
+        if self._before is None:
+            raise gym.error.ResetNeeded("step() before reset()")
+        if self._before.verdict[0] != Verdict.FLYING:
+            raise gym.error.ResetNeeded("step() after the end of the episode")
+        spec, navigation = self.environment, self.navigation
+        navigation.fly(commands(spec.action_spec, np.asarray(action)[None]))
+        now = navigation.flights()
+        reward = rewards(spec.reward, happened(self._before, now, spec))
+        terminated, truncated = endings(now)
+        self._before = now
+        info = self._info(now)
+        if terminated[0] or truncated[0]:
+            info |= outcome(now, 0)
+            if self.curriculum is not None:
+                self.curriculum.record(info["zone"], success=info["success"])
+        return self._observe(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
+        if self.render_mode != "rgb_array":
+            return None
+        return self._frame()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()
+
+    def _observe(self) -> Encoded:
+        seen = {key: value[0] for key, value in self.navigation.observe().items()}
+        if self.render_mode is not None:
+            self._depth = seen[DEPTH][0].copy()
+            self._trail.append(self.navigation.truth().position[0, :2])
+        if self._window is not None:
+            self._window.show(self._frame())
+        return seen
+
+    def _info(self, now: Flights) -> dict[str, Any]:
+        return {key: value[0].item() for key, value in quality(self.navigation, now).items()}
+
+    def _frame(self) -> NDArray[np.uint8]:
+        now, truth = self.navigation.flights(), self.navigation.truth()
+        if self._picture is None:
+            spec = self.environment
+            self._picture = Picture(
+                spec.episode.goal_radius_m, (spec.image_height_px, spec.image_width_px)
+            )
+            self._picture.begin(self._arena())
+        return self._picture.draw(
+            View(
+                time_us=round(now.time_s[0] * US_PER_S),
+                position=truth.position[0],
+                yaw=float(quat_yaw(truth.quaternion[0])),
+                speed_m_s=float(now.speed_m_s[0]),
+                goal_distance_m=float(now.goal_distance_m[0]),
+                energy_j=float(now.energy_j[0]),
+                trail=self._trail,
+                depth=self._depth,
+                outcome=Verdict(int(now.verdict[0])).name.lower(),
+            )
+        )
+
+    def _arena(self) -> Arena:
+        arena = self.navigation.arenas[0]
+        if arena is None:
+            raise gym.error.ResetNeeded("render() before reset()")
+        return arena

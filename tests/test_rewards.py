@@ -1,0 +1,96 @@
+"""Rewards by hand: the numbers are worked out in the comments."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.rewards import Happened, RewardName, rewards
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.vector import NavigationVectorEnv, happened
+
+NEARER, AWAY, GOAL, CRASH, FAST, STILL = range(6)
+HAPPENED = Happened(
+    success=np.array([False, False, True, False, False, False]),
+    failure=np.array([False, False, False, True, False, False]),
+    distance_before_m=np.array([20.0, 20.0, 4.0, 20.0, 20.0, 20.0]),
+    distance_m=np.array([18.0, 21.0, 2.5, 18.0, 16.0, 20.0]),
+    speed_m_s=np.array([4.0, 2.0, 3.0, 4.0, 7.0, 0.0]),
+    hold_s=0.5,
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "expected"),
+    [
+        # +-1 at the end, 0.02 a metre of progress, -0.005 a decision.
+        ("shaped", NEARER, 0.02 * 2.0 - 0.005),
+        ("shaped", AWAY, -0.02 * 1.0 - 0.005),
+        ("shaped", GOAL, 1.0 + 0.02 * 1.5 - 0.005),
+        ("shaped", CRASH, -1.0 + 0.02 * 2.0 - 0.005),
+        ("shaped", FAST, 0.02 * 4.0 - 0.005),
+        ("shaped", STILL, -0.005),
+        # 1000 a - 1000 b - D_g + g (5 m/s - V) 0.5 s, with g = 1 only when nearer than before.
+        ("paper", NEARER, -18.0 + 0.5 * 1.0),
+        ("paper", AWAY, -21.0),
+        ("paper", GOAL, 1000.0 - 2.5 + 0.5 * 2.0),
+        ("paper", CRASH, -1000.0 - 18.0 + 0.5 * 1.0),
+        ("paper", FAST, -16.0 - 0.5 * 2.0),
+        ("paper", STILL, -20.0),
+        ("paper-scaled", NEARER, -0.0175),
+        ("paper-scaled", GOAL, 0.9985),
+        ("paper-scaled", CRASH, -1.0175),
+    ],
+)
+def test_by_hand(name: RewardName, case: int, expected: float) -> None:
+    assert rewards(name, HAPPENED)[case] == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_paper_s_correction_rewards_slowness_on_the_way_to_the_goal() -> None:
+    """Its text calls D_c a penalty; its formula adds it when nearer, less of it when faster."""
+    slow, fast = rewards("paper", HAPPENED)[[NEARER, FAST]] + HAPPENED.distance_m[[NEARER, FAST]]
+    assert slow > 0 > fast
+
+
+def test_shaped_pays_progress_once_whatever_the_steps() -> None:
+    """The progress terms of a flight telescope: no reward for flying to and fro."""
+    way = np.array([30.0, 25.0, 27.0, 22.0, 10.0, 12.0, 2.0])
+    none = np.zeros(6, np.bool_)
+    h = Happened(none, none, way[:-1], way[1:], np.zeros(6), 0.5)
+    assert rewards("shaped", h).sum() == pytest.approx(0.02 * 28.0 - 6 * 0.005)
+
+
+def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
+    spec = EnvironmentSpec(arena="no-obstacles")
+    navigation = Navigation(spec, 5)
+    navigation.begin(range(5), range(5))
+    before = navigation.flights()
+    navigation._fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
+    found = happened(before, navigation.flights(), spec)
+    assert found.success.tolist() == [False, True, False, False, False]
+    assert found.failure.tolist() == [False, False, True, True, False]
+    assert rewards("shaped", found).round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["shaped", "paper", "paper-scaled"])
+def test_the_environment_pays_what_the_formula_says(name: RewardName) -> None:
+    """Distances and speeds from telemetry that anybody can read in the observation."""
+    env = NavigationVectorEnv(
+        3, reward=name, arena="no-obstacles", randomisation={"estimation": False}
+    )
+    _, info = env.reset(seed=[1, 2, 3])
+    distance = info["goal_distance_m"]
+    for _ in range(6):
+        seen, reward, terminated, truncated, info = env.step(np.array([22, 20, 7]))
+        assert not (terminated | truncated).any()
+        speed = 5.0 * np.linalg.norm(seen["velocity"].astype(np.float64), axis=1)
+        now = info["goal_distance_m"]
+        expected = {
+            "shaped": 0.02 * (distance - now) - 0.005,
+            "paper": -now + (now < distance) * (5.0 - speed) * 0.5,
+            "paper-scaled": (-now + (now < distance) * (5.0 - speed) * 0.5) / 1000.0,
+        }[name]
+        assert reward == pytest.approx(expected, abs=1e-5)
+        assert seen["goal"][:, 2] * 20.0 == pytest.approx(now, abs=1e-4)
+        distance = now
