@@ -104,6 +104,23 @@ def measure_ours() -> list[Result]:
 
         return result(name, step_s, 1.0 / TICK_S, *fastest(stretch))
 
+    def measure_whole(arena: str) -> Result:
+        """The vector environment as a learner sees it: delays, images, rewards, new arenas."""
+        from airl_mav.envs.vector import NavigationVectorEnv
+
+        env = NavigationVectorEnv(N, arena=arena, episode={"hold_s": CAMERA_STEP_S})
+        env.reset(seed=1)
+        rng = np.random.default_rng(0)
+
+        def stretch() -> tuple[float, float]:
+            start = time.process_time()
+            for _ in range(20):
+                env.step(rng.integers(0, 25, N))
+            return 20.0 * N, time.process_time() - start
+
+        name = "airl-mav, the same as a Gymnasium VectorEnv"
+        return result(name, CAMERA_STEP_S, 1.0 / TICK_S, *fastest(stretch))
+
     return [
         measure("airl-mav, empty room", "no-obstacles", STEP_S, False),
         measure(
@@ -112,6 +129,7 @@ def measure_ours() -> list[Result]:
         measure(
             f"airl-mav, {OBSTACLES} obstacles, depth", "dynamic-obstacles", CAMERA_STEP_S, True
         ),
+        measure_whole("dynamic-obstacles"),
     ]
 
 

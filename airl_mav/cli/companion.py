@@ -8,7 +8,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -175,6 +175,19 @@ def pilot_settings(options: PilotOptions, policy: PolicyInfo) -> PilotSettings:
     return PilotSettings(**(known | asked))
 
 
+def watchdog_settings(command: CompanionCommand) -> WatchdogSettings:
+    """Return the bounds on silence: as asked, with what the policy's card says of hovering."""
+    hover_s = hover_after_s(command.watchdog, find_policy(command.policy))
+    return replace(command.watchdog, hover_after_s=hover_s)
+
+
+def hover_after_s(asked: WatchdogSettings, policy: PolicyInfo) -> float | None:
+    """Return when an action that nothing has followed is stopped: as asked, else as on the card."""
+    if asked.hover_after_s is not None or policy.card is None:
+        return asked.hover_after_s
+    return policy.card.hover_after_s
+
+
 def check_holding(option: str, hold_s: float, watchdog: WatchdogSettings) -> None:
     """Check the hold time and the watchdog's bounds against each other. Raises UsageError."""
     check_range(option, hold_s, 0.0, 10.0)
@@ -262,6 +275,7 @@ def stand_alone(command: CompanionCommand) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     policy = load(command, pilot)
+    bounds = watchdog_settings(command)
     latency = sampler(command, command.seed)
     try:
         with opened(command, clock, abandon) as (link, frames):
@@ -278,7 +292,7 @@ def stand_alone(command: CompanionCommand) -> int:
                 abandon,
                 lambda phase: console.print(f"{clock.time_us() / 1e6:8.2f} s  {phase}"),
                 pilot_settings=pilot,
-                watchdog_settings=command.watchdog,
+                watchdog_settings=bounds,
                 latency=latency,
             )
     except LinkError as error:
@@ -326,6 +340,7 @@ def serve(command: CompanionCommand) -> int:
     channel.listen(handle, lambda: os._exit(EXIT_BROKEN))
     try:
         policy, t2 = load(command, pilot), injection(command)
+        bounds = watchdog_settings(command)
         with opened(command, clock, abandon) as (link, frames):
             channel.send(Ready())
             while not isinstance(request := requests.get(), Shutdown):
@@ -342,7 +357,7 @@ def serve(command: CompanionCommand) -> int:
                     abandon,
                     _announce(channel, clock),
                     pilot_settings=pilot,
-                    watchdog_settings=command.watchdog,
+                    watchdog_settings=bounds,
                     latency=t2.sampler(np.random.default_rng(request.latency_seed)),
                 )
                 channel.send(_ended(result, request))

@@ -16,6 +16,8 @@ from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.statistics import aggregate
 from airl_mav.harness.run_folder import RUN_FILE
+from airl_mav.policy.card import Result as CardResult
+from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.ports import Ports
 from airl_mav.report.matrix import (
@@ -27,7 +29,8 @@ from airl_mav.report.matrix import (
 )
 
 if TYPE_CHECKING:
-    from airl_mav.cli.evaluation import Result, Task
+    from airl_mav.cli.evaluation import Result as EvaluationResult
+    from airl_mav.cli.evaluation import Task
 
 SHARED = ("level", "vehicle", "computer", "workload", "ablate", "episodes", "seed")
 """Options that head a table: the same for all of it."""
@@ -102,6 +105,10 @@ class EvaluateCommand:
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports of level sitl."""
 
+    on_card: bool = False
+    """Write the results onto the policies' cards, in place of earlier ones of the same arena and
+    level."""
+
     out: Path | None = None
     """Run folder, or with several policies or arenas the folder of their run folders. None:
     runs/<UTC time>-evaluate-..."""
@@ -142,12 +149,46 @@ def _check(command: EvaluateCommand) -> list[str]:
     if command.level == "sitl" and command.ablate is not None:
         raise UsageError(f"--ablate {command.ablate}: accepted: with --level gym")
     found = [find_policy(name) for name in command.policies]
+    if command.on_card:
+        _check_plain(command, found)
     _check_names("policies", [policy.name for policy in found])
     if command.arena:
         _check_names("--arena", [Path(arena).stem for arena in command.arena])
         return list(command.arena)
     trained = [None if policy.card is None else policy.card.training.arena for policy in found]
     return list(dict.fromkeys(arena or DEFAULT_ARENA for arena in trained))
+
+
+def _check_plain(command: EvaluateCommand, policies: Sequence[PolicyInfo]) -> None:
+    """Raise UsageError for results that are not the policies' own."""
+    for option in ("ablate", "workload", "goal_radius", "time_limit", "hold", "hover_after"):
+        if (value := getattr(command, option)) is not None:
+            raise UsageError(
+                f"--on-card with --{option.replace('_', '-')} {value}: accepted: without it"
+            )
+    for policy in policies:
+        if policy.folder is None:
+            raise UsageError(f"--on-card: {policy.name} has no card")
+
+
+def _write_on_card(command: EvaluateCommand, task: Task, result: EvaluationResult) -> None:
+    """Write what a finished evaluation found onto the policy's card."""
+    if not command.on_card or result.code or task.policy.folder is None:
+        return
+    quality = aggregate(result.episodes)
+    add_result(
+        task.policy.folder,
+        CardResult(
+            arena=task.arena_name,
+            level=command.level,
+            episodes=len(result.episodes),
+            seed=command.seed,
+            success_rate=quality.success_rate.value or 0.0,
+            flight_time_s=quality.flight_time_s.value,
+            distance_m=quality.distance_m.value,
+            energy_j=quality.energy_j.value,
+        ),
+    )
 
 
 def _check_names(option: str, names: Sequence[str]) -> None:
@@ -178,6 +219,7 @@ def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
     if command.out is not None and (command.out / MATRIX_FILE).exists():
         raise UsageError(f"--out {command.out}: holds a table of policies x arenas")
     result = task.fly(command.out, console)
+    _write_on_card(command, task, result)
     if not result.episodes:
         console.print(f"no episode was finished; {result.path}", soft_wrap=True)
     elif command.level == "gym":
@@ -199,6 +241,7 @@ def _fly_matrix(command: EvaluateCommand, tasks: Sequence[Task], console: Consol
     code = 0
     for task in tasks:
         result = task.fly(root / f"{task.policy.name}-{task.arena_name}", console)
+        _write_on_card(command, task, result)
         if result.episodes:
             if command.level == "gym" and (result.new or not (result.path / REPORT_FILE).exists()):
                 rebuild(result.path)
@@ -226,7 +269,7 @@ def _say_how_it_went(cell: Cell, console: Console) -> None:
     )
 
 
-def _cell(task: Task, result: Result) -> Cell:
+def _cell(task: Task, result: EvaluationResult) -> Cell:
     """Return a task's row and column of the table."""
     card = task.policy.card
     trained_in = None if card is None else card.training.arena

@@ -20,7 +20,13 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
-from airl_mav.cli.companion import GREATEST_THREADS, PilotOptions, check_holding, pilot_settings
+from airl_mav.cli.companion import (
+    GREATEST_THREADS,
+    PilotOptions,
+    check_holding,
+    hover_after_s,
+    pilot_settings,
+)
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
@@ -206,7 +212,7 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     injection = choose_injection(
         computer, command.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
-    hover_s = command.watchdog.hover_after_s
+    hover_s = hover_after_s(command.watchdog, policy)
     setup = Setup(
         level="sitl",
         vehicle=Part(command.vehicle, vehicle.description),

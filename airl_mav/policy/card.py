@@ -185,6 +185,20 @@ def write_card(folder: Path, card: PolicyCard) -> None:
     replace_file(folder / CARD_FILE, text.encode())
 
 
+def add_result(folder: Path, result: Result) -> PolicyCard:
+    """Write a result onto a card, in place of an earlier one of the same arena and level.
+
+    Raises:
+        UsageError: See `read_card`.
+    """
+    card = read_card(folder)
+    others = [r for r in card.results if (r.arena, r.level) != (result.arena, result.level)]
+    results = tuple(sorted([*others, result], key=lambda r: (r.level, r.arena)))
+    card = card.model_copy(update={"results": results})
+    write_card(folder, card)
+    return card
+
+
 def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
     """Return why a vehicle's camera cannot serve a policy, or None when it can."""
     if (reason := camera_mismatch(card.observation, camera.intrinsics)) is not None:

@@ -16,7 +16,7 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
 
-DEFAULT_POLICY = "greedy"
+DEFAULT_POLICY = "static-obstacles"
 """What flies when nobody says what."""
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
@@ -37,6 +37,8 @@ class PolicyInfo:
     description: str
     card: PolicyCard | None = None
     """None: not a learned one."""
+    folder: Path | None = None
+    """Where a learned one lies."""
 
     @property
     def sha256(self) -> str | None:
@@ -64,7 +66,7 @@ def find_policy(name: str) -> PolicyInfo:
     if folder is None:
         return PolicyInfo(name, POLICIES[name][0])
     card = load_card(folder)
-    return PolicyInfo(card.name, card.description, card)
+    return PolicyInfo(card.name, card.description, card, folder)
 
 
 def policy_description(name: str) -> str:
