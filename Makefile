@@ -54,6 +54,7 @@ test: lint  ## Everything CI checks
 bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")
 	$(BIN)/python benchmarks/bench_depth.py
 	$(BIN)/python benchmarks/bench_stack.py
+	$(BIN)/python benchmarks/bench_policy.py
 	$(BIN)/python benchmarks/bench_envs.py $(RIVALS)
 
 .PHONY: clean

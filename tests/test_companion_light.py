@@ -49,7 +49,7 @@ for name in names:
 
 COMMAND = """
 import companion.mission, airl_mav.cli.companion as cli
-command = cli.CompanionCommand(computer="ras-pi-4", workload="template-5x32")
+command = cli.CompanionCommand(policy="greedy", computer="ras-pi-4", workload="template-5x32")
 cli.check(command)
 assert cli.sampler(command, 1).sample_us() > 300_000
 from airl_mav.policy.registry import load_policy
