@@ -65,7 +65,8 @@ def measure_ours() -> list[Result]:
     from airl_mav.constants import TICK_S, TICK_US
     from airl_mav.envs.arenas import batch_of
     from airl_mav.envs.camera import lens_of, look
-    from airl_mav.envs.fleet import Rules, Verdict, advance, hover, new_fleet, vehicle_of
+    from airl_mav.envs.fleet import Rules, Verdict, hover, new_fleet, vehicle_of
+    from airl_mav.envs.flight import advance
     from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.loading import load_profile
     from airl_mav.profiles.vehicle import VehicleProfile

@@ -27,9 +27,10 @@ from processes import ROOT, wait_until
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
-from airl_mav.cli import evaluation
-from airl_mav.cli.evaluate import EvaluateCommand, run
-from airl_mav.cli.evaluation import sitl_command
+from airl_mav.cli import evaluate_task
+from airl_mav.cli.evaluate import run
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import sitl_command
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
 from airl_mav.errors import UsageError
@@ -644,16 +645,16 @@ def test_a_table_goes_on_where_it_was_left(
     out = tmp_path / "matrix"
     options = {"arena": ("no-obstacles", "static-obstacles"), "episodes": 5, "out": out}
     flights = []
-    real = evaluation.EpisodeBar.finished
+    real = evaluate_task.EpisodeBar.finished
 
-    def interrupted(bar: evaluation.EpisodeBar, record: Any) -> None:
+    def interrupted(bar: evaluate_task.EpisodeBar, record: Any) -> None:
         real(bar, record)
         flights.append(record)
         if len(flights) == 8:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patched:
-        patched.setattr(evaluation.EpisodeBar, "finished", interrupted)
+        patched.setattr(evaluate_task.EpisodeBar, "finished", interrupted)
         code, text = evaluate("greedy", linear, slots=2, **options)
     assert code == 130
     assert "interrupted" in text
@@ -699,7 +700,7 @@ def test_level_sitl_is_a_rehearsal_by_the_rules_of_the_card(tmp_path: Path) -> N
     assert rehearsal.goal_radius is rehearsal.hold is rehearsal.altitude is None
     assert (
         "goal radius 2.5 m, hold 0.4 s"
-        in evaluation.prepare(command, str(folder), "no-obstacles").rules
+        in evaluate_task.prepare(command, str(folder), "no-obstacles").rules
     )
 
 

@@ -16,7 +16,8 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.clock import SimClock
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.draws import BLOCK, DelayDraws
-from airl_mav.envs.fleet import Fleet, Rules, Verdict, advance, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.errors import UsageError
@@ -295,7 +296,9 @@ def test_the_image_is_that_of_the_newest_decoded_frame(transport_ms: float, link
     def expected(tick: int) -> np.ndarray:
         position, quaternion = camera_pose(*hand.poses[tick], mount)
         centers = hand.arena.centers_at(tick * TICK_US)
-        depth = render(hand.arena, centers, camera.intrinsics, camera.range_m, position, quaternion)
+        depth = render(
+            hand.arena, centers, Intrinsics.of(camera), camera.range_m, position, quaternion
+        )
         return depth_to_z16(depth)
 
     phase = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(11,))).random()

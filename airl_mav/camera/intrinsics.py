@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from airl_mav.profiles.vehicle import Camera
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -26,3 +28,10 @@ class Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad] in (0, pi)."""
         focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
         return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+
+    @classmethod
+    def of(cls, camera: Camera) -> Intrinsics:
+        """Return the intrinsics of a vehicle profile's camera."""
+        return cls.from_fov(
+            camera.width_px, camera.height_px, math.radians(camera.horizontal_fov_deg)
+        )

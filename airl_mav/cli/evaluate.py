@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
-import tyro
 from rich.console import Console
 
 from airl_mav.cli import report
 from airl_mav.cli.common import GREATEST_SEED, check_range
+from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.statistics import aggregate
@@ -19,7 +18,6 @@ from airl_mav.harness.run_folder import RUN_FILE
 from airl_mav.policy.card import Result as CardResult
 from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
-from airl_mav.ports import Ports
 from airl_mav.report.matrix import (
     MATRIX_FILE,
     MATRIX_TABLE_FILE,
@@ -29,89 +27,14 @@ from airl_mav.report.matrix import (
 )
 
 if TYPE_CHECKING:
-    from airl_mav.cli.evaluation import Result as EvaluationResult
-    from airl_mav.cli.evaluation import Task
+    from airl_mav.cli.evaluate_task import Result as EvaluationResult
+    from airl_mav.cli.evaluate_task import Task
 
 SHARED = ("level", "vehicle", "computer", "workload", "ablate", "episodes", "seed")
 """Options that head a table: the same for all of it."""
 
 DEFAULT_ARENA = "static-obstacles"
 """For policies that were not trained in any."""
-
-
-@dataclass(frozen=True)
-class EvaluateCommand:
-    """Fly policies through seeded episodes: success, time, distance and energy with intervals.
-
-    Several policies or arenas give a table of policies x arenas. The same --out goes on with what
-    was interrupted; a finished evaluation shows its tables again.
-    """
-
-    policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="POLICY ...")]
-    """Names, or paths to folders with policy.onnx and card.json."""
-
-    arena: tuple[str, ...] = ()
-    """Arena profiles: shipped names, or paths to .toml files. None given: those that the policies
-    were trained in, or static-obstacles."""
-
-    episodes: int = 100
-    """Number of episodes in each arena, >= 1."""
-
-    seed: int = 1
-    """Seed; episode i uses seed + i, with every policy and arena."""
-
-    level: Literal["gym", "sitl"] = "gym"
-    """gym: the batch twin, some hundred episodes a second. sitl: as airl-sitl flies, in real time
-    times --speed."""
-
-    ablate: Literal["depth", "velocity", "goal"] | None = None
-    """Input of the network that is made zero, at level gym. None: none."""
-
-    vehicle: str = "quad"
-    """Vehicle profile: a shipped name, or a path to a .toml."""
-
-    computer: str = "workstation"
-    """Computer profile to fly as: a shipped name, or a path to a .toml."""
-
-    workload: str | None = None
-    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
-    policy. None: what was measured for this very policy, or else 1 ms (gym), or what this machine
-    takes (sitl)."""
-
-    goal_radius: float | None = None
-    """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
-    or 3."""
-
-    time_limit: float | None = None
-    """Longest flight from the start of navigation, s. None: 120."""
-
-    hold: float | None = None
-    """t3: how long an action is held before the next observation, s. None: that of the policy's
-    card, or 0.5."""
-
-    hover_after: float | None = None
-    """Zero the velocity so long after the hold when no new action has come, s. None: as the
-    policy's card says, or never."""
-
-    altitude: float | None = None
-    """Height above the start that is flown, m. None: that of the policy's card, or 2.5."""
-
-    slots: int = 128
-    """Flights at a time at level gym, >= 1. Decides the pace, not the results."""
-
-    speed: float = 1.0
-    """Level sitl: simulated seconds per wall second, 0.5 to 10."""
-
-    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
-    """Ports of level sitl."""
-
-    on_card: bool = False
-    """Write the results onto the policies' cards, in place of earlier ones of the same arena and
-    level."""
-
-    out: Path | None = None
-    """Run folder, or with several policies or arenas the folder of their run folders. None:
-    runs/<UTC time>-evaluate-..."""
 
 
 def run(command: EvaluateCommand, console: Console | None = None) -> int:
@@ -130,7 +53,7 @@ def run(command: EvaluateCommand, console: Console | None = None) -> int:
     console = console or Console()
     arenas = _check(command)
     # Imported late: the kernels take a second to load, and a typo must not wait for them.
-    from airl_mav.cli.evaluation import prepare
+    from airl_mav.cli.evaluate_task import prepare
 
     tasks = [prepare(command, policy, arena) for policy in command.policies for arena in arenas]
     for policy in {task.policy.name: task.policy for task in tasks}.values():

@@ -22,9 +22,10 @@ from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.constants import TICK_US, US_PER_S
 from airl_mav.envs.arenas import batch_of, put_arena
-from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.draws import DelayDraws, Stream, stream
-from airl_mav.envs.fleet import Rules, advance, hover, new_fleet, vehicle_of
+from airl_mav.envs.exposure import Cameras
+from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
+from airl_mav.envs.flight import advance
 from airl_mav.envs.randomise import draw_airframe
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.state import State, join, part_of, restore, take
@@ -105,7 +106,7 @@ class Navigation:
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
             range_m=self.camera.range_m,
         )
-        self.intrinsics: Intrinsics = self.camera.intrinsics
+        self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
         if injection is None:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 from pydantic import Field, Strict, ValidationError, model_validator
 
 from airl_mav.atomic import replace_file
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.errors import UsageError
 from airl_mav.flight.setup import Level
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
@@ -201,7 +202,7 @@ def add_result(folder: Path, result: Result) -> PolicyCard:
 
 def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
     """Return why a vehicle's camera cannot serve a policy, or None when it can."""
-    if (reason := camera_mismatch(card.observation, camera.intrinsics)) is not None:
+    if (reason := camera_mismatch(card.observation, Intrinsics.of(camera))) is not None:
         return reason
     # What lies between the two would look free, and was not so in training.
     if camera.range_m < card.observation.range_m:

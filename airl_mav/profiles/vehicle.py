@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated
 
 from pydantic import Field, Strict
 
-from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
 from airl_mav.profiles.fields import ProfileModel, quantity
@@ -97,13 +95,6 @@ class Camera(ProfileModel):
     forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """The pinhole model."""
-        return Intrinsics.from_fov(
-            self.width_px, self.height_px, math.radians(self.horizontal_fov_deg)
-        )
 
     @property
     def period_us(self) -> int:

@@ -47,7 +47,7 @@ class DepthCamera:
     @classmethod
     def from_profile(cls, camera: Camera, arena: Arena) -> DepthCamera:
         """Make the camera of a vehicle profile."""
-        k = camera.intrinsics
+        k = Intrinsics.of(camera)
         mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
         return cls(k, mount, camera.rate_hz, camera.range_m, arena)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount
 from airl_mav.envs.arenas import ArenaBatch
 from airl_mav.envs.camera import lens_of, look
@@ -23,7 +24,7 @@ class Cameras:
         self, n: int, camera: Camera, transport_us: int, randomisation: Randomisation
     ) -> None:
         """Take n cameras, the time from capture to decoded [µs], and the noise."""
-        self.intrinsics = camera.intrinsics
+        self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
         """(n, h, w) newest frames, Z16 [mm]."""
         self._period_us = camera.period_us

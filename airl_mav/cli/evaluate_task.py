@@ -9,14 +9,14 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from airl_mav.cli import report, sitl
 from airl_mav.cli.common import EXIT_INTERRUPTED
-from airl_mav.cli.gym_plan import plan_evaluation
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_gym import plan_evaluation
 from airl_mav.clock import utc_now
 from airl_mav.envs.evaluation import Pilots
 from airl_mav.errors import UsageError
@@ -28,9 +28,6 @@ from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
 from companion.watchdog import WatchdogSettings
-
-if TYPE_CHECKING:
-    from airl_mav.cli.evaluate import EvaluateCommand
 
 SAME_IN_SITL = ("policy", "arena", "vehicle", "computer", "workload", "episodes", "seed")
 """Settings by which a finished run of level sitl is known again."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from airl_mav.cli.common import check_range
 from airl_mav.cli.companion import CHANCE_STREAM, PilotOptions, pilot_settings
+from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.envs.evaluation import LearnedPilots, Pilots, SinglePilots
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
@@ -24,9 +25,6 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, find_policy, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import Camera, load_vehicle
-
-if TYPE_CHECKING:
-    from airl_mav.cli.evaluate import EvaluateCommand
 
 GREATEST_SLOTS = 4096
 """Flights at a time: more would fill gigabytes with paths."""
