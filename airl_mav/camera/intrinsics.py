@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from airl_mav.profiles.vehicle import Camera
+if TYPE_CHECKING:  # A frame source needs no profiles.
+    from airl_mav.profiles.vehicle import Camera
 
 
 @dataclass(frozen=True)
