@@ -397,3 +397,40 @@ def test_a_wrong_override_is_refused_in_one_line(overrides: dict[str, float], me
     with pytest.raises(UsageError) as error:
         Parameters(overrides)
     assert str(error.value) == message
+
+
+def test_a_profile_says_only_what_differs_from_its_base(tmp_path: Path) -> None:
+    quad = load_profile("vehicles", "quad", VehicleProfile)
+    path = tmp_path / "heavy.toml"
+    path.write_text('base = "quad"\n[body]\nmass_kg = 1.8\n', encoding="utf-8")
+    heavy = load_profile("vehicles", str(path), VehicleProfile)
+    assert heavy.body.mass_kg == 1.8
+    assert heavy.body.width_m == quad.body.width_m
+    assert heavy.model_copy(update={"body": quad.body}) == quad
+    second = tmp_path / "second.toml"
+    second.write_text(f'base = "{path}"\n[camera]\nrange_m = 15\n', encoding="utf-8")
+    both = load_profile("vehicles", str(second), VehicleProfile)
+    assert (both.body.mass_kg, both.camera.range_m) == (1.8, 15.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('base = "nothing"', "no vehicle profile 'nothing'"),
+        ("base = 3", "base = 3: accepted"),
+        ('base = "quad"\n[body]\nmass = 1', "body.mass: unknown field"),
+    ],
+)
+def test_a_wrong_base_gets_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "wrong.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(UsageError, match=re.escape(message)):
+        load_profile("vehicles", str(path), VehicleProfile)
+
+
+def test_a_base_that_leads_in_a_circle_is_refused(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
+    one.write_text(f'base = "{two}"', encoding="utf-8")
+    two.write_text(f'base = "{one}"', encoding="utf-8")
+    with pytest.raises(UsageError, match="leads back to"):
+        load_profile("vehicles", str(one), VehicleProfile)

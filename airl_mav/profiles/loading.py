@@ -44,24 +44,57 @@ def list_profiles(kind: Kind) -> list[str]:
 def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """Load a shipped profile by name, or any file by path (recognised by its .toml suffix).
 
+    A file with `base = "NAME"` is that profile, or that path, with what the file says put over it.
+
     Raises:
         UsageError: The profile does not exist (lists those that do), is no TOML, or has a field
             that is missing, unknown, of the wrong type or out of range.
     """
+    path = _path(kind, name)
+    data = _read(kind, path, ())
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise UsageError(f"{path}: {explain(error, model)}") from None
+
+
+def _path(kind: Kind, name: str) -> Path:
+    """Return the file of a profile. Raises UsageError when there is none."""
     path = Path(name) if name.endswith(".toml") else profiles_dir() / kind / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(list_profiles(kind))
         raise UsageError(
             f"no {_SINGULAR[kind]} profile {name!r}; shipped: {known} (or a path to a .toml)"
         )
+    return path
+
+
+def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    """Return what a file says, on top of its bases. `above`: the files that led here."""
+    if path in above:
+        raise UsageError(f"{above[0]}: base: leads back to {path}")
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: not valid TOML: {error}") from None
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise UsageError(f"{path}: {explain(error, model)}") from None
+    base = data.pop("base", None)
+    if base is None:
+        return data
+    if not isinstance(base, str):
+        raise UsageError(f"{path}: base = {base!r}: accepted: the name of a profile, or a path")
+    return _overlaid(_read(kind, _path(kind, base), (*above, path)), data)
+
+
+def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return one table put over another, table by table."""
+    merged = dict(below)
+    for key, value in above.items():
+        under = merged.get(key)
+        if isinstance(under, dict) and isinstance(value, dict):
+            merged[key] = _overlaid(under, value)
+        else:
+            merged[key] = value
+    return merged
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
