@@ -579,7 +579,7 @@ def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["nope"], "no arena profile 'nope'; shipped: dynamic-obstacles, no-obstacles"),
+        (["nope"], "no arena profile 'nope'; shipped: crowded, dense-obstacles, dynamic-obs"),
         (["no-obstacles", "--zone", "5"], "zone = 5: accepted: 0 <= value <= 2"),
         (
             ["no-obstacles", "--png", "a.jpg"],
