@@ -179,6 +179,16 @@ def test_a_folder_without_a_run_is_said_to_be_none(tmp_path: Path) -> None:
         TrainingFolder.open(tmp_path, config)
 
 
+def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    config = TrainingConfig(description="one")
+    one = TrainingFolder.create(tmp_path / "run", config, "airl train")
+    two = TrainingFolder.open(tmp_path / "run", config)
+    with one.locked(), pytest.raises(UsageError, match="another process"), two.locked():
+        pass
+    with two.locked():
+        pass
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(400)

@@ -108,10 +108,13 @@ def run(command: ExportCommand, console: Console | None = None) -> int:
         raise UsageError(f"{command.model}: {error}") from error
     except OSError as error:
         raise UsageError(f"--out {command.out}: {error.strerror}") from None
-    console.print(f"{command.out / ONNX_FILE}  {card.network}", markup=False, highlight=False)
+    console.print(
+        f"{command.out / ONNX_FILE}  {card.network}", soft_wrap=True, markup=False, highlight=False
+    )
     console.print(
         f"{command.out / CARD_FILE}  {card.parameters:,} parameters, "
         f"{card.macs:,} multiply-accumulates, SHA-256 {card.sha256[:12]}...",
+        soft_wrap=True,
         markup=False,
         highlight=False,
     )

@@ -78,7 +78,7 @@ def run(command: TrainCommand, console: Console | None = None) -> int:
     console.print(f"folder     {path}", soft_wrap=True, highlight=False)
     console.print(f"curves     tensorboard --logdir {folder.tensorboard}", soft_wrap=True)
     try:
-        with TrainingProgress(console, config.steps) as progress:
+        with folder.locked(), TrainingProgress(console, config.steps) as progress:
             best = train(config, folder, progress)
     except KeyboardInterrupt:
         console.print(

@@ -10,8 +10,11 @@ policy/             the result: policy.onnx and card.json
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +28,8 @@ from airl_mav.training.config import TrainingConfig
 SCHEMA = 1
 CONFIG_FILE = "train.json"
 EVALUATIONS_FILE = "evaluations.jsonl"
+LOCK_FILE = ".lock"
+"""Held while a process trains; the system lets go of it however the process ends."""
 BEST_FILE = "best.json"
 BEST_MODEL = "model.zip"
 
@@ -114,6 +119,16 @@ class TrainingFolder:
         if not isinstance(about, dict) or about.get("schema") != SCHEMA:
             raise UsageError(f"{self.path / CONFIG_FILE}: schema: accepted: {SCHEMA}")
         return about
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep the folder to this process. Raises UsageError when another one trains in it."""
+        with (self.path / LOCK_FILE).open("wb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise UsageError(f"{self.path}: another process trains here") from None
+            yield
 
     @property
     def checkpoints(self) -> Path:
