@@ -230,7 +230,7 @@ def test_report_again_says_the_same(done: Done) -> None:
 def test_injected_latency(tmp_path: Path) -> None:
     """Flown as if the paper's Raspberry Pi decided: 396 ms a decision, and labelled so."""
     arena = write_arena(tmp_path, 24.0)
-    pi = ("--computer", "ras-pi-4", "--workload", "template-5x32")
+    pi = ("--policy", "greedy", "--computer", "ras-pi-4", "--workload", "template-5x32")
     run = sitl(tmp_path, *pi, "--episodes", "1", "--arena", str(arena), "--speed", "3")
     archive = run.arrays("latency.npz")
     t2_us = archive["000/action_ready_us"] - archive["000/infer_start_us"]
