@@ -350,7 +350,7 @@ def serve(command: CompanionCommand) -> int:
                 result = fly_mission(
                     link,
                     frames,
-                    _seeded(policy, request.latency_seed),
+                    _fresh(policy, command, pilot, request.latency_seed),
                     request.goal,
                     clock,
                     stop,
@@ -367,9 +367,11 @@ def serve(command: CompanionCommand) -> int:
     return 0
 
 
-def _seeded(policy: Policy, seed: int) -> Policy:
-    """Return the policy with random actions, if it takes any, that depend on nothing but a seed."""
-    return policy.with_generator(_chance(seed)) if isinstance(policy, LearnedPolicy) else policy
+def _fresh(policy: Policy, command: CompanionCommand, pilot: PilotSettings, seed: int) -> Policy:
+    """Return the policy as it begins a flight: nothing remembered, chance by the seed alone."""
+    if isinstance(policy, LearnedPolicy):
+        return policy.with_generator(_chance(seed))
+    return load(command, pilot)
 
 
 def _announce(channel: ChildChannel, clock: Clock) -> Any:
