@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -250,5 +249,5 @@ def load_best(folder: TrainingFolder, config: TrainingConfig) -> BaseAlgorithm:
     """Return a learner with the best weights of a run."""
     env = NavigationVecEnv(NavigationVectorEnv(1, config.environment))
     model = make_model(config.algorithm, config.network, env, config.seed)
-    model.set_parameters(str(Path(folder.best_model)), device="cpu")
+    model.set_parameters(str(folder.best_model), device="cpu")
     return model
