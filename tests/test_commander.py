@@ -9,7 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.commander import TABLE, Event, Flight, Phase, transition
+from firmware_sim.autopilot.commander import (
+    READINESS,
+    TABLE,
+    Event,
+    Flight,
+    Phase,
+    transition,
+)
 from firmware_sim.autopilot.state import Mode, Result, Severity
 
 BOOT, STANDBY, GROUND, AIR = Phase.BOOT, Phase.STANDBY, Phase.GROUND, Phase.AIR
@@ -162,6 +169,18 @@ def test_a_failsafe_does_not_change_what_the_user_wants(flight: Flight) -> None:
             if after.failsafe and not flight.failsafe:
                 assert after.intended is flight.intended
                 assert after.after_disarm is flight.after_disarm
+
+
+@pytest.mark.parametrize("flight", FLIGHTS, ids=str)
+@pytest.mark.parametrize("healthy", [False, True])
+def test_readiness_is_told_wherever_it_counts(flight: Flight, healthy: bool) -> None:
+    told = READINESS[flight.phase][healthy]
+    every_tick = transition(flight, Event.READY if healthy else Event.NOT_READY)
+    if told is None:
+        assert (every_tick.flight, every_tick.text) == (flight, None)
+    else:
+        assert transition(flight, told) == every_tick
+        assert every_tick.flight != flight, "an event that changes nothing need not be told"
 
 
 # --- any order of events

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from airl_mav.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
 from airl_mav.control.cascade import Demand, cascade, new_memory, reset_integrals
-from airl_mav.control.gains import Gains
+from airl_mav.control.controller import Controller
+from airl_mav.control.gains import Gains, pack, unpack
 from airl_mav.control.mixer import mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import (
@@ -478,6 +479,52 @@ def test_a_row_of_a_batch_is_one_vehicle() -> None:
     assert not many[[0, 2]].any()
     reset_integrals(many[1])
     assert np.count_nonzero(many[1]) < np.count_nonzero(one)
+
+
+def test_gains_cross_over_whole() -> None:
+    assert len(set(pack(GAINS))) > 20
+    assert unpack(pack(GAINS)) == GAINS
+
+
+@given(triples, triples, quaternions, triples, triples, triples, angles)
+def test_the_controller_is_the_cascade(position, velocity, q, omega, p_sp, v_sp, yaw) -> None:
+    controller, memory = Controller(GAINS, TICK_S), new_memory()
+    state = np.array([*position, *velocity, *q, *omega, 7.0, 8.0])
+    for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):
+        out = cascade(position, velocity, q, omega, demand, memory, GAINS, TICK_S)
+        assert controller.fly(state, demand) == out.motors
+        told = controller.setpoints()
+        assert tuple(told.attitude) == out.attitude
+        assert tuple(told.rates) == out.rates
+        assert tuple(told.velocity) == out.velocity
+        assert told.thrust == controller.thrust == out.thrust
+        assert controller.descending == (out.velocity[2] > 0.0)
+
+
+def test_a_controller_at_rest_winds_nothing_up() -> None:
+    controller, memory = Controller(GAINS, TICK_S), new_memory()
+    state = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    demand = Demand(NAN3, (1.0, 2.0, 0.5), 0.4, NAN)
+    for _ in range(50):
+        wound = controller.fly(state, demand)
+        cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+    assert controller.descending
+    controller.rest()
+    reset_integrals(memory)
+    assert (controller.thrust, controller.descending) == (0.0, False)
+    told = controller.setpoints()
+    assert (told.attitude.tolist(), told.rates.tolist()) == ([1.0, 0.0, 0.0, 0.0], [0.0] * 3)
+    after = controller.fly(state, demand)
+    assert after == cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S).motors
+    assert after != wound
+
+
+def test_a_controller_takes_other_gains() -> None:
+    one, two = Controller(GAINS, TICK_S), Controller(GAINS, TICK_S)
+    state = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    two.set_gains(GAINS._replace(hover_thrust=0.4))
+    assert one.fly(state, hover()) == pytest.approx((0.52,) * 4)
+    assert two.fly(state, hover()) == pytest.approx((0.4,) * 4)
 
 
 def test_gains_follow_the_parameters() -> None:

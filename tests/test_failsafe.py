@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -326,8 +325,8 @@ class Drain:
 
     def _tampered(self, sample: SensorSample) -> ActuatorControls:
         self.remaining = max(0.0, self.remaining - self.per_s * 0.004)
-        battery = replace(sample.battery, remaining=self.remaining)
-        return self._step(replace(sample, battery=battery))
+        battery = sample.battery._replace(remaining=self.remaining)
+        return self._step(sample._replace(battery=battery))
 
 
 def test_battery_levels_are_said_once_each() -> None:

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+from numba.np.unsafe.ndarray import to_fixed_tuple
+from numpy.typing import NDArray
+
 from airl_mav.constants import DEG
+from airl_mav.kernels import kernel
 
 
 class Gains(NamedTuple):
@@ -100,3 +105,17 @@ class Gains(NamedTuple):
             dgyro_cutoff_hz=value("IMU_DGYRO_CUTOFF"),
             yaw_torque_cutoff_hz=value("MC_YAW_TQ_CUTOFF"),
         )
+
+
+_COUNT = len(Gains._fields)
+
+
+def pack(gains: Gains) -> NDArray[np.float64]:
+    """Return the gains as a row of floats: numba takes an array at once, a tuple by its fields."""
+    return np.array(gains, np.float64)
+
+
+@kernel
+def unpack(row: NDArray[np.float64]) -> Gains:
+    """Return the gains of a row by their names. The inverse of `pack`, for compiled code."""
+    return Gains(*to_fixed_tuple(row, _COUNT))

@@ -8,12 +8,16 @@ from collections.abc import Callable
 import numpy as np
 
 from airl_mav.constants import TICK_S
-from airl_mav.control.cascade import Demand, Output, cascade, new_memory, reset_integrals
+from airl_mav.control.cascade import Demand
+from airl_mav.control.controller import Controller
 from airl_mav.control.gains import Gains
-from airl_mav.frames import Geodetic, Vector, local_to_geodetic
-from firmware_sim.autopilot.commander import Event, Flight, Phase, transition
-from firmware_sim.autopilot.estimator import Estimator
+from airl_mav.control.mixer import Motors
+from airl_mav.frames import Geodetic, local_to_geodetic
+from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
+from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.estimator import Estimator, NewFilter
 from firmware_sim.autopilot.failsafe import Watch
+from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.parameters import Parameters
@@ -21,7 +25,6 @@ from firmware_sim.autopilot.state import (
     Arming,
     AutopilotState,
     CommanderStatus,
-    Estimate,
     Landed,
     Message,
     Mode,
@@ -31,9 +34,10 @@ from firmware_sim.autopilot.state import (
 )
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample
 
-_NAN3 = np.full(3, math.nan)
-_NO_SETPOINT = Setpoint(_NAN3, _NAN3, math.nan, math.nan)
-_IDLE = Output((0.0, 0.0, 0.0, 0.0), 0.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+_STILL: Motors = (0.0, 0.0, 0.0, 0.0)
+
+# Bound once: looking up a member of an enumeration at every tick is slow.
+_GROUND, _AIR = Phase.GROUND, Phase.AIR
 
 _MODE_EVENT = {
     Mode.HOLD: Event.HOLD,
@@ -47,28 +51,34 @@ _MODE_EVENT = {
 class BuiltinAutopilot:
     """Implements `interfaces.Autopilot` towards the plant and `port.AutopilotPort` to MAVLink."""
 
-    def __init__(self, parameters: Parameters) -> None:
-        """Boot: not armable until the estimator has converged."""
+    def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
+        """Boot: not armable until the estimator has converged.
+
+        Args:
+            parameters: The parameter store.
+            new_filter: Makes the estimator's filter.
+        """
         self._parameters = parameters
-        value = parameters.__getitem__
-        self._estimator = Estimator(value)
+        value = parameters.value
+        self._estimator = Estimator(value, new_filter)
+        self._state = self._estimator.state
         self._guidance = Guidance(value)
         self._watch = Watch(value)
         self._land_detector = LandDetector(value)
-        self._gains = Gains.from_parameters(value)
+        self._controller = Controller(Gains.from_parameters(value), TICK_S)
         parameters.on_change(self._read_gains)
-        self._memory = new_memory()
         self._flight = Flight()
+        self._status = _status(self._flight)
         self._messages: list[Message] = []
-        self._setpoint: Setpoint | None = None
-        self._demand = Demand((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
-        self._output = _IDLE
-        self._estimate: Estimate | None = None
+        self._demand: Demand | None = None
+        """What is flown; None = the motors stand still."""
+        self._motors = _STILL
         self._sample: SensorSample | None = None
         self._mag = np.zeros(3)
         self._pressure_hpa = math.nan
         self._gps: GpsFix | None = None
         self._home: Geodetic | None = None
+        self._snapshot: AutopilotState | None = None
         self.on_setpoint: Callable[[Setpoint, int], None] | None = None
         """Called with every accepted setpoint and its time of receipt, if set."""
         self.on_message: Callable[[Message], None] | None = None
@@ -78,8 +88,9 @@ class BuiltinAutopilot:
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Take one tick's sensors and return the motor commands until the next."""
-        estimate = self._estimator.step(sample)
-        self._sample, self._estimate = sample, estimate
+        time_us = sample.time_us
+        self._estimator.step(sample)
+        self._sample, self._snapshot = sample, None
         if sample.mag is not None:
             self._mag = sample.mag
         if sample.pressure_hpa is not None:
@@ -87,76 +98,55 @@ class BuiltinAutopilot:
         if sample.gps is not None:
             self._gps = sample.gps
         if self._home is None and self._estimator.origin is not None:
-            self._set_home(estimate)
-        self._handle(Event.READY if estimate.healthy else Event.NOT_READY)
-        idle = self._output is _IDLE
-        for due in self._watch.events(
-            self._flight, sample.time_us, sample.battery.remaining, idle=idle
-        ):
+            self._set_home()
+        readiness = READINESS[self._flight.phase][self._estimator.healthy]
+        if readiness is not None:
+            self._handle(readiness)
+        idle = self._demand is None
+        for due in self._watch.events(self._flight, time_us, sample.battery.remaining, idle=idle):
             if isinstance(due, Message):
                 self._say(due)
             else:
                 self._handle(due)
-        self._output = self._control(estimate)
-        self._detect_ground(estimate)
-        armed = self._flight.phase >= Phase.GROUND
-        return ActuatorControls(sample.time_us, self._output.motors, armed)
+        self._demand = self._guidance.demand(self._state, self._flight.phase, time_us)
+        if self._demand is not None:
+            self._motors = self._controller.fly(self._state, self._demand)
+        elif not idle:
+            self._motors = _STILL
+            self._controller.rest()
+        self._detect_ground(time_us)
+        return ActuatorControls(time_us, self._motors, self._flight.phase >= _GROUND)
 
-    def _control(self, estimate: Estimate) -> Output:
-        phase, guidance = self._flight.phase, self._guidance
-        if phase < Phase.GROUND:
-            return self._rest(estimate)
-        if phase is Phase.GROUND and not guidance.wants_to_lift(self._setpoint):
-            guidance.stand()
-            return self._rest(estimate)
-        demand = guidance.demand(estimate, self._setpoint)
-        climb = guidance.climb_limit(phase, estimate)
-        if climb is not None:
-            demand = _limit_climb(demand, climb)
-        self._demand = demand
-        return cascade(
-            _triple(estimate.position),
-            _triple(estimate.velocity),
-            _quadruple(estimate.quaternion),
-            _triple(estimate.angular_velocity),
-            demand,
-            self._memory,
-            self._gains,
-            TICK_S,
-        )
-
-    def _rest(self, estimate: Estimate) -> Output:
-        """Motors at idle; nothing may wind up against the floor."""
-        reset_integrals(self._memory)
-        self._demand = Demand(_triple(estimate.position), (0.0, 0.0, 0.0), math.nan, 0.0)
-        return _IDLE
-
-    def _detect_ground(self, estimate: Estimate) -> None:
-        if self._flight.phase is Phase.GROUND:
-            if self._land_detector.lifted(estimate, self._output.thrust):
-                self._handle(Event.LIFTED)
-        elif self._flight.phase is Phase.AIR:
-            descending = self._output.velocity[2] > 0.0
-            if self._land_detector.landed(estimate, self._output.thrust, descending):
+    def _detect_ground(self, time_us: int) -> None:
+        phase = self._flight.phase
+        if phase is _AIR:
+            control = self._controller
+            if self._land_detector.landed(
+                self._state, time_us, control.thrust, descending=control.descending
+            ):
                 self._handle(Event.LANDED)
-            elif self._guidance.takeoff_done(estimate):
+            elif self._guidance.takeoff_done(self._state):
                 self._handle(Event.TAKEOFF_DONE)
+        elif phase is _GROUND and self._land_detector.lifted(self._state, self._controller.thrust):
+            self._handle(Event.LIFTED)
 
     # --- commander
 
     def _handle(self, event: Event) -> Result:
         before = self._flight
         step = transition(before, event)
-        self._flight = step.flight
+        self._flight, self._status = step.flight, _status(step.flight)
+        self._snapshot = None
         if step.text is not None:
             self._say(step.text)
-        if step.flight.mode is not before.mode and self._estimate is not None:
-            self._guidance.enter(step.flight.mode, self._estimate)
-        armed_now = before.phase < Phase.GROUND <= step.flight.phase
-        if armed_now and self._estimate is not None:
+        if self._sample is None:
+            return step.result
+        if step.flight.mode is not before.mode:
+            self._guidance.enter(step.flight.mode, self._state)
+        if before.phase < _GROUND <= step.flight.phase:
             self._watch.armed()
-            self._set_home(self._estimate)
-            self._guidance.enter(step.flight.mode, self._estimate)
+            self._set_home()
+            self._guidance.enter(step.flight.mode, self._state)
         return step.result
 
     def _say(self, message: Message) -> None:
@@ -164,13 +154,15 @@ class BuiltinAutopilot:
         if self.on_message is not None:
             self.on_message(message)
 
-    def _set_home(self, estimate: Estimate) -> None:
-        if self._estimator.origin is not None:
-            self._home = local_to_geodetic(estimate.position, self._estimator.origin)
-            self._guidance.at_home(estimate)
+    def _set_home(self) -> None:
+        origin = self._estimator.origin
+        if origin is not None:
+            self._home = local_to_geodetic(self._state[P:V], origin)
+            self._guidance.at_home(self._state)
+            self._snapshot = None
 
     def _read_gains(self) -> None:
-        self._gains = Gains.from_parameters(self._parameters.__getitem__)
+        self._controller.set_gains(Gains.from_parameters(self._parameters.value))
 
     @property
     def _now_us(self) -> int:
@@ -187,6 +179,11 @@ class BuiltinAutopilot:
     def estimator(self) -> Estimator:
         """The estimator, for consistency checks."""
         return self._estimator
+
+    @property
+    def sample(self) -> SensorSample | None:
+        """The newest tick's sensors; None before the first."""
+        return self._sample
 
     @property
     def flight(self) -> Flight:
@@ -227,14 +224,14 @@ class BuiltinAutopilot:
 
     def set_home_here(self) -> Result:
         """Make the present position home."""
-        if self._estimate is None or self._estimator.origin is None:
+        if self._estimator.origin is None:
             return Result.TEMPORARILY_REJECTED
-        self._set_home(self._estimate)
+        self._set_home()
         return Result.ACCEPTED
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
-        self._setpoint = setpoint
+        self._guidance.offer(setpoint)
         self._watch.setpoint(time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint, time_us)
@@ -245,24 +242,30 @@ class BuiltinAutopilot:
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""
-        sample, estimate = self._sample, self._estimate
-        if sample is None or estimate is None:
+        if self._snapshot is None:
+            self._snapshot = self._take_snapshot()
+        return self._snapshot
+
+    def _take_snapshot(self) -> AutopilotState:
+        sample, demand = self._sample, self._demand
+        if sample is None:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        demand, output = self._demand, self._output
+        estimate = self._estimator.estimate()
+        attitude, rates, velocity, thrust = self._controller.setpoints()
+        if demand is None:
+            setpoint = Setpoint(estimate.position, velocity, math.nan, 0.0)
+        else:
+            position = np.array(demand.position)
+            setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
         return AutopilotState(
             time_us=sample.time_us,
             estimate=estimate,
-            status=self._status(),
-            setpoint=Setpoint(
-                np.array(demand.position),
-                np.array(output.velocity),
-                demand.yaw,
-                demand.yaw_rate,
-            ),
-            attitude_setpoint=np.array(output.attitude),
-            rate_setpoint=np.array(output.rates),
-            thrust_setpoint=output.thrust,
-            motors=output.motors,
+            status=self._status,
+            setpoint=setpoint,
+            attitude_setpoint=attitude,
+            rate_setpoint=rates,
+            thrust_setpoint=thrust,
+            motors=self._motors,
             accel=sample.accel,
             gyro=sample.gyro,
             mag=self._mag,
@@ -274,34 +277,15 @@ class BuiltinAutopilot:
             origin=self._estimator.origin,
         )
 
-    def _status(self) -> CommanderStatus:
-        flight = self._flight
-        arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
-        if flight.phase is Phase.AIR:
-            if flight.mode is Mode.TAKEOFF:
-                landed = Landed.TAKEOFF
-            elif flight.mode is Mode.LAND:
-                landed = Landed.LANDING
-            else:
-                landed = Landed.IN_AIR
-        else:
-            landed = Landed.ON_GROUND
-        return CommanderStatus(arming, flight.mode, flight.intended, landed, flight.failsafe)
 
-
-def _limit_climb(demand: Demand, limit: float) -> Demand:
-    """Return the demand with its climb rate limited [m/s, up]; a height becomes that rate."""
-    wanted = demand.velocity[2]
-    down = -limit if math.isnan(wanted) else max(wanted, -limit)
-    position = (demand.position[0], demand.position[1], math.nan)
-    return Demand(
-        position, (demand.velocity[0], demand.velocity[1], down), demand.yaw, demand.yaw_rate
-    )
-
-
-def _triple(v: Vector) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
-
-
-def _quadruple(v: Vector) -> tuple[float, float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2]), float(v[3])
+def _status(flight: Flight) -> CommanderStatus:
+    arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
+    if flight.phase is not Phase.AIR:
+        landed = Landed.ON_GROUND
+    elif flight.mode is Mode.TAKEOFF:
+        landed = Landed.TAKEOFF
+    elif flight.mode is Mode.LAND:
+        landed = Landed.LANDING
+    else:
+        landed = Landed.IN_AIR
+    return CommanderStatus(arming, flight.mode, flight.intended, landed, flight.failsafe)

@@ -257,6 +257,15 @@ TABLE: dict[Event, dict[Phase, Row]] = {
     Event.BATTERY_LAND: {_B: _IGNORE, _S: _IGNORE, _G: _IGNORE, _A: _LOW_LAND},
 }
 
+
+def _heeded(event: Event, phase: Phase) -> Event | None:
+    return None if TABLE[event][phase] is _IGNORE else event
+
+
+READINESS = tuple((_heeded(Event.NOT_READY, phase), _heeded(Event.READY, phase)) for phase in Phase)
+"""[phase][whether the estimator is healthy]: the event that this is, None where the table ignores
+it. Asked at every tick."""
+
 _PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN}
 
 

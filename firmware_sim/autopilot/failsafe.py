@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from airl_mav.constants import US_PER_S
 from firmware_sim.autopilot.commander import Event, Flight, Phase
 from firmware_sim.autopilot.state import Message, Mode, Severity
+
+# Bound once: looking up a member of an enumeration takes as long as a whole timer.
+_GROUND, _AIR, _OFFBOARD = Phase.GROUND, Phase.AIR, Mode.OFFBOARD
 
 # COM_OBL_RC_ACT -> event. 1 and 2 (altitude, manual) need a pilot's sticks as 0 does; 6 is
 # flight termination.
@@ -73,8 +76,8 @@ class Watch:
 
     def events(
         self, flight: Flight, time_us: int, battery: float, *, idle: bool
-    ) -> Iterator[Event | Message]:
-        """Yield what has become due.
+    ) -> list[Event | Message]:
+        """Return what has become due, in the order in which it is to be carried out.
 
         Args:
             flight: The commander's state.
@@ -83,56 +86,62 @@ class Watch:
             idle: Whether the motors stand still: on the ground, time of a take-off's spool-up and
                 ramp is no time of standing.
         """
-        yield from self._offboard(flight, time_us)
-        yield from self._ground(flight, time_us, idle)
-        yield from self._battery(flight, battery)
-        yield from self._ground_station(time_us)
+        due: list[Event | Message] = []
+        self._offboard(flight, time_us, due)
+        self._ground(flight, time_us, idle, due)
+        self._battery(flight, battery, due)
+        self._ground_station(time_us, due)
+        return due
 
-    def _offboard(self, flight: Flight, time_us: int) -> Iterator[Event]:
-        armed = flight.phase >= Phase.GROUND
-        fresh = self.setpoint_fresh(time_us)
-        if not armed or flight.intended is not Mode.OFFBOARD:
+    def _offboard(self, flight: Flight, time_us: int, due: list[Event | Message]) -> None:
+        if flight.phase < _GROUND or flight.intended is not _OFFBOARD:
             self._offboard_lost = False
-        elif not self._offboard_lost and flight.mode is Mode.OFFBOARD and not fresh:
+            return
+        fresh = self.setpoint_fresh(time_us)
+        if not self._offboard_lost and flight.mode is _OFFBOARD and not fresh:
             self._offboard_lost = True
-            yield OFFBOARD_LOSS[int(self._value("COM_OBL_RC_ACT"))]
+            due.append(OFFBOARD_LOSS[int(self._value("COM_OBL_RC_ACT"))])
         elif self._offboard_lost and fresh:
             self._offboard_lost = False
-            yield Event.SETPOINT_BACK
+            due.append(Event.SETPOINT_BACK)
 
-    def _ground(self, flight: Flight, time_us: int, idle: bool) -> Iterator[Event]:
-        if flight.phase is not Phase.GROUND:
+    def _ground(self, flight: Flight, time_us: int, idle: bool, due: list[Event | Message]) -> None:
+        if flight.phase is not _GROUND:
             self._standing_since_us = None
-            self._flown = flight.phase is Phase.AIR
+            self._flown = flight.phase is _AIR
             return
         if self._standing_since_us is None or not idle:
             self._standing_since_us = time_us
-        name = "COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT"
-        limit_s = self._value(name)
+        limit_s = self._value("COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT")
         if limit_s > 0.0 and time_us - self._standing_since_us >= limit_s * US_PER_S:
-            yield Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
+            due.append(Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT)
 
-    def _battery(self, flight: Flight, remaining: float) -> Iterator[Event | Message]:
-        limits = [self._value(n) for n in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")]
-        level = max(self._battery_level, sum(remaining <= limit for limit in limits))
+    def _battery(self, flight: Flight, remaining: float, due: list[Event | Message]) -> None:
+        value = self._value
+        below = (
+            remaining <= value("BAT_LOW_THR"),
+            remaining <= value("BAT_CRIT_THR"),
+            remaining <= value("BAT_EMERGEN_THR"),
+        )
+        level = max(self._battery_level, below.count(True))
         if level > self._battery_level:
             self._battery_level = level
-            yield BATTERY_TEXT[level]
-        if flight.phase is not Phase.AIR or level <= self._battery_acted:
+            due.append(BATTERY_TEXT[level])
+        if flight.phase is not _AIR or level <= self._battery_acted:
             return
         self._battery_acted = level
-        event = BATTERY_ACTION.get((level, int(self._value("COM_LOW_BAT_ACT"))))
+        event = BATTERY_ACTION.get((level, int(value("COM_LOW_BAT_ACT"))))
         if event is not None:
             # The battery now says where to: setpoints that come back must not take it over.
             self._offboard_lost = False
-            yield event
+            due.append(event)
 
-    def _ground_station(self, time_us: int) -> Iterator[Message]:
+    def _ground_station(self, time_us: int, due: list[Event | Message]) -> None:
         if self._gcs_us is None:
             return
         lost = time_us - self._gcs_us > self._value("COM_DL_LOSS_T") * US_PER_S
-        if lost and not self._gcs_lost:
-            yield Message(Severity.INFO, "Connection to ground station lost")
-        elif self._gcs_lost and not lost:
-            yield Message(Severity.INFO, "GCS connection regained")
+        if lost == self._gcs_lost:
+            return
         self._gcs_lost = lost
+        text = "Connection to ground station lost" if lost else "GCS connection regained"
+        due.append(Message(Severity.INFO, text))

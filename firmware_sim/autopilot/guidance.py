@@ -1,4 +1,4 @@
-"""What each mode flies: mode and estimate -> demand for the cascade."""
+"""What each mode flies: mode and nominal state -> demand for the cascade."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from airl_mav.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.control.cascade import Demand
 from airl_mav.frames import Vector, quat_yaw
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.state import Estimate, Mode, Setpoint
+from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.autopilot.state import Mode, Setpoint
 
 NAN = math.nan
+_FREE = (NAN, NAN, NAN)
 
 FALLBACK_DESCENT_M_S = 0.75
 """Descent in Position mode without a pilot's sticks (measured on PX4 1.16)."""
@@ -22,175 +23,200 @@ FALLBACK_DESCENT_M_S = 0.75
 TAKEOFF_REACHED_M = 0.2
 """Closer than this to the take-off altitude, take-off is done."""
 
+# Bound once: looking up a member of an enumeration at every tick is slow.
+_TAKEOFF, _OFFBOARD, _LAND = Mode.TAKEOFF, Mode.OFFBOARD, Mode.LAND
+_RETURN, _POSITION = Mode.RETURN, Mode.POSITION
+_GROUND, _AIR = Phase.GROUND, Phase.AIR
 
-def _triple(v: Vector) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
+
+def _triple(state: Vector, start: int) -> Vec:
+    north, east, down = state[start : start + 3].tolist()
+    return north, east, down
 
 
 @dataclass
 class Anchor:
     """Where a mode began: what hold, take-off, landing and return refer to."""
 
-    position: Vector  # (3,) NED [m]
+    position: Vec
+    """NED [m]."""
     yaw: float
-    time_us: int
 
 
 class Guidance:
-    """Turns the mode into a demand. Told of mode changes by `enter`."""
+    """Turns the mode into a demand. Told of mode changes by `enter`.
+
+    Every `state` is the estimator's newest nominal state (`error_state`).
+    """
 
     def __init__(self, value: Callable[[str], float]) -> None:
         """Take a lookup of PX4 parameter names."""
         self._value = value
         self._mode = Mode.HOLD
-        self._anchor = Anchor(np.zeros(3), 0.0, 0)
+        self._anchor = Anchor((0.0, 0.0, 0.0), 0.0)
         self._braking = False
         self._return_leg = 0
         self._spool_since_us: int | None = None
-        self._home = np.zeros(3)
+        self._home: Vec = (0.0, 0.0, 0.0)
+        self._offboard: Demand | None = None
         self.takeoff_altitude_m = 0.0
         """Height above home that a take-off climbs to [m]."""
 
-    @property
-    def _home_down(self) -> float:
-        return float(self._home[2])
-
-    def enter(self, mode: Mode, estimate: Estimate) -> None:
+    def enter(self, mode: Mode, state: Vector) -> None:
         """A new mode begins here and now."""
         self._mode = mode
-        self._anchor = Anchor(
-            estimate.position.copy(), quat_yaw(estimate.quaternion), estimate.time_us
-        )
+        self._anchor = Anchor(_triple(state, P), quat_yaw(state[Q:RATES]))
         self._braking = mode is Mode.HOLD
         self._return_leg = 0
 
-    def at_home(self, estimate: Estimate) -> None:
+    def at_home(self, state: Vector) -> None:
         """Home (the ground under the vehicle at arming) is here."""
-        self._home = estimate.position.copy()
+        self._home = _triple(state, P)
         self._spool_since_us = None
 
-    def wants_to_lift(self, setpoint: Setpoint | None) -> bool:
+    def offer(self, setpoint: Setpoint) -> None:
+        """From now on this is what offboard flies."""
+        self._offboard = Demand(
+            _triple(setpoint.position, 0),
+            _triple(setpoint.velocity, 0),
+            setpoint.yaw,
+            setpoint.yaw_rate,
+        )
+
+    def takeoff_done(self, state: Vector) -> bool:
+        """Return whether a take-off has reached its altitude."""
+        if self._mode is not _TAKEOFF:
+            return False
+        return self._height(state) > self.takeoff_altitude_m - TAKEOFF_REACHED_M
+
+    def demand(self, state: Vector, phase: Phase, time_us: int) -> Demand | None:
+        """Return what to fly now; None = the motors stand still."""
+        if phase is _AIR:
+            self._spool_since_us = None
+            return self._flown(state)
+        if phase is _GROUND and self._wants_to_lift():
+            return self._ramped(self._flown(state), time_us)
+        self._spool_since_us = None
+        return None
+
+    def _wants_to_lift(self) -> bool:
         """Return whether the mode asks a standing vehicle to leave the floor."""
-        if self._mode is Mode.TAKEOFF:
+        if self._mode is _TAKEOFF:
             return True
-        if self._mode is Mode.OFFBOARD and setpoint is not None:
-            up = setpoint.velocity[2] < -0.1
-            above = setpoint.position[2] < self._home_down - 0.3
-            return bool(up or above)
+        demand = self._offboard
+        if self._mode is _OFFBOARD and demand is not None:
+            return demand.velocity[2] < -0.1 or demand.position[2] < self._home[2] - 0.3
         return False
 
-    def climb_limit(self, phase: Phase, estimate: Estimate) -> float | None:
-        """Return the greatest climb rate of the take-off ramp [m/s, up], None when it is over.
+    def _ramped(self, demand: Demand, time_us: int) -> Demand:
+        """Return a demand of a vehicle that stands, its climb rate limited by the take-off ramp.
 
         PX4's Takeoff: after COM_SPOOLUP_TIME the vertical speed limit rises in MPC_TKO_RAMP_T
-        from the value that commands zero thrust to the take-off speed.
+        from the value that commands zero thrust to the take-off speed. A height becomes that rate.
         """
-        if phase is Phase.AIR:
-            self._spool_since_us = None
-            return None
         if self._spool_since_us is None:
-            self._spool_since_us = estimate.time_us
+            self._spool_since_us = time_us
         value = self._value
-        elapsed_s = (estimate.time_us - self._spool_since_us) / US_PER_S
+        elapsed_s = (time_us - self._spool_since_us) / US_PER_S
         ramp_s = elapsed_s - value("COM_SPOOLUP_TIME")
-        lowest = -GRAVITY_M_S2 / value("MPC_Z_VEL_P_ACC")
-        if ramp_s <= 0.0:
-            return lowest
-        share = min(1.0, ramp_s / max(value("MPC_TKO_RAMP_T"), 1e-3))
-        return lowest + share * (value("MPC_TKO_SPEED") - lowest)
+        limit = -GRAVITY_M_S2 / value("MPC_Z_VEL_P_ACC")
+        if ramp_s > 0.0:
+            share = min(1.0, ramp_s / max(value("MPC_TKO_RAMP_T"), 1e-3))
+            limit += share * (value("MPC_TKO_SPEED") - limit)
+        position, velocity, yaw, yaw_rate = demand
+        down = -limit if math.isnan(velocity[2]) else max(velocity[2], -limit)
+        return Demand(
+            (position[0], position[1], NAN), (velocity[0], velocity[1], down), yaw, yaw_rate
+        )
 
-    def stand(self) -> None:
-        """The vehicle stands with idle motors: a later take-off spools up anew."""
-        self._spool_since_us = None
+    def _flown(self, state: Vector) -> Demand:
+        """Return what the mode flies."""
+        mode = self._mode
+        if mode is _OFFBOARD and self._offboard is not None:
+            return self._offboard
+        if mode is _TAKEOFF:
+            return self._takeoff(state)
+        if mode is _LAND:
+            return self._land(state)
+        if mode is _RETURN:
+            return self._return(state)
+        if mode is _POSITION:
+            return Demand(_FREE, (0.0, 0.0, FALLBACK_DESCENT_M_S), self._anchor.yaw, NAN)
+        return self._hold(state)
 
-    def takeoff_done(self, estimate: Estimate) -> bool:
-        """Return whether a take-off has reached its altitude."""
-        height = self._home_down - float(estimate.position[2])
-        return self._mode is Mode.TAKEOFF and height > self.takeoff_altitude_m - TAKEOFF_REACHED_M
+    def _height(self, state: Vector) -> float:
+        """Return the height above home [m]."""
+        return self._home[2] - state.item(P + 2)
 
-    def demand(self, estimate: Estimate, setpoint: Setpoint | None) -> Demand:
-        """Return what to fly now."""
-        if self._mode is Mode.OFFBOARD and setpoint is not None:
-            return Demand(
-                _triple(setpoint.position),
-                _triple(setpoint.velocity),
-                setpoint.yaw,
-                setpoint.yaw_rate,
-            )
-        if self._mode is Mode.TAKEOFF:
-            return self._takeoff(estimate)
-        if self._mode is Mode.LAND:
-            return self._land(estimate)
-        if self._mode is Mode.RETURN:
-            return self._return(estimate)
-        if self._mode is Mode.POSITION:
-            down = (0.0, 0.0, FALLBACK_DESCENT_M_S)
-            return Demand((NAN, NAN, NAN), down, self._anchor.yaw, NAN)
-        return self._hold(estimate)
-
-    def _hold(self, estimate: Estimate) -> Demand:
+    def _hold(self, state: Vector) -> Demand:
         """Brake first, then hold the place where the vehicle came to rest."""
         anchor = self._anchor
         if self._braking:
-            if float(np.linalg.norm(estimate.velocity)) > 0.3:
-                anchor.position = estimate.position.copy()
-                return Demand((NAN, NAN, NAN), (0.0, 0.0, 0.0), anchor.yaw, NAN)
-            anchor.position = estimate.position.copy()
+            anchor.position = _triple(state, P)
+            if math.hypot(*_triple(state, V)) > 0.3:
+                return Demand(_FREE, (0.0, 0.0, 0.0), anchor.yaw, NAN)
             self._braking = False
-        return Demand(_triple(anchor.position), (NAN, NAN, NAN), anchor.yaw, NAN)
+        return Demand(anchor.position, _FREE, anchor.yaw, NAN)
 
-    def _vertical(self, estimate: Estimate, down_target: float, limit: float) -> float:
+    def _vertical(self, state: Vector, down_target: float, limit: float) -> float:
         """Return the vertical speed NED towards a height, limited [m/s]."""
-        speed = self._value("MPC_Z_P") * (down_target - float(estimate.position[2]))
+        speed = self._value("MPC_Z_P") * (down_target - state.item(P + 2))
         return min(limit, max(-limit, speed))
 
-    def _takeoff(self, estimate: Estimate) -> Demand:
-        anchor = self._anchor
-        target = self._home_down - self.takeoff_altitude_m
+    def _above_anchor(self, vertical: float) -> Demand:
+        """Keep to the anchor's place and heading at a vertical speed NED [m/s]."""
+        north, east, _ = self._anchor.position
+        return Demand((north, east, NAN), (NAN, NAN, vertical), self._anchor.yaw, NAN)
+
+    def _takeoff(self, state: Vector) -> Demand:
+        target = self._home[2] - self.takeoff_altitude_m
         # Aim a little above: the P law alone would take for ever over the last centimetres.
-        speed = self._vertical(estimate, target - 0.5, self._value("MPC_TKO_SPEED"))
-        north, east, _ = _triple(anchor.position)
-        return Demand((north, east, NAN), (NAN, NAN, speed), anchor.yaw, NAN)
+        speed = self._vertical(state, target - 0.5, self._value("MPC_TKO_SPEED"))
+        return self._above_anchor(speed)
 
-    def _land(self, estimate: Estimate) -> Demand:
-        value, anchor = self._value, self._anchor
-        height = self._home_down - float(estimate.position[2])
-        # PX4 slows down linearly between the two heights.
-        heights = (value("MPC_LAND_ALT2"), value("MPC_LAND_ALT1"))
-        speed = float(
-            np.interp(height, heights, (value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")))
-        )
-        if float(np.hypot(*estimate.velocity[:2])) > 0.3 and not self._braking:
-            # Still moving: stop first, then hold that place while descending.
-            anchor.position = estimate.position.copy()
-            return Demand((NAN, NAN, NAN), (0.0, 0.0, speed), anchor.yaw, NAN)
-        self._braking = True
-        north, east, _ = _triple(anchor.position)
-        return Demand((north, east, NAN), (NAN, NAN, speed), anchor.yaw, NAN)
+    def _land(self, state: Vector) -> Demand:
+        speed = self._landing_speed(self._height(state))
+        if not self._braking:
+            north, east, _ = _triple(state, V)
+            if math.hypot(north, east) > 0.3:
+                # Still moving: stop first, then hold that place while descending.
+                anchor = self._anchor
+                anchor.position = _triple(state, P)
+                return Demand(_FREE, (0.0, 0.0, speed), anchor.yaw, NAN)
+            self._braking = True
+        return self._above_anchor(speed)
 
-    def _return(self, estimate: Estimate) -> Demand:
+    def _landing_speed(self, height: float) -> float:
+        """Return how fast to descend [m/s]: PX4 slows down linearly between two heights."""
+        value = self._value
+        low, high = value("MPC_LAND_ALT2"), value("MPC_LAND_ALT1")
+        slow, fast = value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")
+        if height <= low:
+            return slow
+        if height >= high:
+            return fast
+        return slow + (fast - slow) / (high - low) * (height - low)
+
+    def _return(self, state: Vector) -> Demand:
         """Climb to RTL_RETURN_ALT, fly home, land."""
-        value, anchor = self._value, self._anchor
-        height = self._home_down - float(estimate.position[2])
-        away = float(np.hypot(*(estimate.position - self._home)[:2]))
+        value, anchor, home = self._value, self._anchor, self._home
+        position = _triple(state, P)
+        north, east = position[0] - home[0], position[1] - home[1]
+        away = math.hypot(north, east)
         if self._return_leg == 0:
+            height = self._height(state)
             target = max(value("RTL_RETURN_ALT"), height)
             if height > target - TAKEOFF_REACHED_M or away < value("NAV_ACC_RAD"):
                 self._return_leg = 1
-                anchor.position = estimate.position.copy()
-            speed = self._vertical(
-                estimate, self._home_down - target - 0.5, value("MPC_Z_VEL_MAX_UP")
-            )
-            north, east, _ = _triple(anchor.position)
-            return Demand((north, east, NAN), (NAN, NAN, speed), anchor.yaw, NAN)
+                anchor.position = position
+            climb = self._vertical(state, home[2] - target - 0.5, value("MPC_Z_VEL_MAX_UP"))
+            return self._above_anchor(climb)
         if self._return_leg == 1:
             if away > 0.5:
-                north, east = (float(c) for c in (estimate.position - self._home)[:2])
                 cruise = min(value("MPC_XY_CRUISE"), value("MPC_XY_P") * away)
                 velocity = (-north / away * cruise, -east / away * cruise, NAN)
-                down = float(anchor.position[2])
-                return Demand((NAN, NAN, down), velocity, anchor.yaw, NAN)
+                return Demand((NAN, NAN, anchor.position[2]), velocity, anchor.yaw, NAN)
             self._return_leg = 2
-            anchor.position = self._home.copy()
+            anchor.position = home
             self._braking = True  # almost at rest: descend to home itself
-        return self._land(estimate)
+        return self._land(state)

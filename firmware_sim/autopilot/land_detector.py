@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
-import numpy as np
-
 from airl_mav.constants import US_PER_S
-from firmware_sim.autopilot.state import Estimate
+from airl_mav.frames import Vector
+from firmware_sim.autopilot.error_state import V
 
 # Share of the way from least to hover thrust below which the floor must be carrying
 # (LNDMC_LOW_T_THR).
@@ -25,34 +25,34 @@ class LandDetector:
         self._value = value
         self._still_since_us: int | None = None
 
-    def landed(self, estimate: Estimate, thrust: float, descending: bool) -> bool:
+    def landed(self, state: Vector, time_us: int, thrust: float, *, descending: bool) -> bool:
         """Return whether a flying vehicle has come to stand.
 
         Args:
-            estimate: Newest estimate.
+            state: The estimator's newest nominal state.
+            time_us: Its time.
             thrust: Collective that is commanded, 0..1.
             descending: Whether the setpoint asks to go down: a low-thrust moment in
                 level flight is no landing.
         """
-        value = self._value
-        low = value("MPC_THR_MIN")
-        limit = low + LOW_THRUST * (value("MPC_THR_HOVER") - low)
-        still = (
-            descending
-            and thrust <= limit
-            and abs(estimate.velocity[2]) < value("LNDMC_Z_VEL_MAX")
-            and np.hypot(*estimate.velocity[:2]) < value("LNDMC_XY_VEL_MAX")
-        )
-        if not still:
+        if not (descending and self._carried(thrust) and self._still(state)):
             self._still_since_us = None
             return False
         if self._still_since_us is None:
-            self._still_since_us = estimate.time_us
-        elapsed_us = estimate.time_us - self._still_since_us
-        return elapsed_us >= value("LNDMC_TRIG_TIME") * US_PER_S
+            self._still_since_us = time_us
+        return time_us - self._still_since_us >= self._value("LNDMC_TRIG_TIME") * US_PER_S
 
-    def lifted(self, estimate: Estimate, thrust: float) -> bool:
+    def lifted(self, state: Vector, thrust: float) -> bool:
         """Return whether a standing vehicle has left the floor."""
         self._still_since_us = None
-        climbing = estimate.velocity[2] < -LIFT_SPEED_M_S
-        return bool(climbing and thrust > LIFT_THRUST * self._value("MPC_THR_HOVER"))
+        climbing = state.item(V + 2) < -LIFT_SPEED_M_S
+        return climbing and thrust > LIFT_THRUST * self._value("MPC_THR_HOVER")
+
+    def _carried(self, thrust: float) -> bool:
+        low = self._value("MPC_THR_MIN")
+        return thrust <= low + LOW_THRUST * (self._value("MPC_THR_HOVER") - low)
+
+    def _still(self, state: Vector) -> bool:
+        north, east, down = state[V : V + 3].tolist()
+        slow = abs(down) < self._value("LNDMC_Z_VEL_MAX")
+        return slow and math.hypot(north, east) < self._value("LNDMC_XY_VEL_MAX")

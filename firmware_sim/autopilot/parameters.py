@@ -19,7 +19,12 @@ class Parameters:
         Raises:
             UsageError: An override is unknown or out of range.
         """
-        self._values = list(parameter_values(overrides or {}).values())
+        values = parameter_values(overrides or {})
+        self._values = list(values.values())
+        self._floats = {name: float(value) for name, value in values.items()}
+        self.value: Callable[[str], float] = self._floats.__getitem__
+        """Returns a value for the flight code, which asks at every tick. Raises KeyError for an
+        unknown name."""
         self._listeners: list[Callable[[], None]] = []
 
     def on_change(self, listener: Callable[[], None]) -> None:
@@ -31,8 +36,8 @@ class Parameters:
         return len(SPECS)
 
     def __getitem__(self, name: str) -> float:
-        """Return a value for the flight code. Raises KeyError for an unknown name."""
-        return float(self._values[_BY_NAME[name]])
+        """Return a value as a float. Raises KeyError for an unknown name."""
+        return self._floats[name]
 
     def by_name(self, name: str) -> ParameterValue | None:
         """Return a parameter, or None when there is no such name."""
@@ -56,7 +61,8 @@ class Parameters:
         spec = SPECS[index]
         if value == value and abs(value) != float("inf"):
             kind = type(spec.default)
-            self._values[index] = kind(min(spec.high, max(spec.low, value)))
+            stored = kind(min(spec.high, max(spec.low, value)))
+            self._values[index], self._floats[name] = stored, float(stored)
             for listener in self._listeners:
                 listener()
         return self.by_index(index)

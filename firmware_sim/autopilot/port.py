@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from firmware_sim.autopilot.state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.interfaces import SensorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,11 @@ class AutopilotPort(Protocol):
     @property
     def parameters(self) -> ParameterStore:
         """The parameter store."""
+        ...
+
+    @property
+    def sample(self) -> SensorSample | None:
+        """The newest tick's sensors; None before the first. Cheap: may be read every tick."""
         ...
 
     def state(self) -> AutopilotState:

@@ -1,0 +1,135 @@
+"""The cascade of one vehicle that is flown from Python, tick by tick.
+
+Taking forty gains into compiled code one by one costs more than the control law: only arrays and
+flat tuples cross over.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.control.cascade import Demand, Memory, cascade, new_memory, reset_integrals
+from airl_mav.control.gains import Gains, pack, unpack
+from airl_mav.control.mixer import Motors
+from airl_mav.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+
+Row = NDArray[np.float64]
+
+# Layout of the output row.
+_ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
+_SIZE = 11
+
+
+class ControlSetpoints(NamedTuple):
+    """What the loops of the cascade are told."""
+
+    attitude: Row
+    """(4,) body -> NED."""
+    rates: Row
+    """(3,) FRD [rad/s]."""
+    velocity: Row
+    """(3,) after limits, NED [m/s]."""
+    thrust: float
+    """Collective 0..1."""
+
+
+@kernel
+def _fly(
+    state: Row,
+    position: Vec,
+    velocity: Vec,
+    yaw: float,
+    yaw_rate: float,
+    memory: Memory,
+    gains: Row,
+    dt: float,
+    output: Row,
+) -> Motors:
+    """Run one tick of the cascade; updates `memory` and `output`, returns the motor commands."""
+    out = cascade(
+        (state[0], state[1], state[2]),
+        (state[3], state[4], state[5]),
+        (state[6], state[7], state[8], state[9]),
+        (state[10], state[11], state[12]),
+        Demand(position, velocity, yaw, yaw_rate),
+        memory,
+        unpack(gains),
+        dt,
+    )
+    for i in range(4):
+        output[_ATTITUDE + i] = out.attitude[i]
+    for i in range(3):
+        output[_RATES + i] = out.rates[i]
+        output[_VELOCITY + i] = out.velocity[i]
+    output[_THRUST] = out.thrust
+    return out.motors
+
+
+class Controller:
+    """Gains, memory and newest output of one vehicle's cascade."""
+
+    def __init__(self, gains: Gains, dt: float) -> None:
+        """Start at rest.
+
+        Args:
+            gains: Gains and limits.
+            dt: Time between two calls of `fly` [s].
+        """
+        self._gains = pack(gains)
+        self._dt = dt
+        self._memory = new_memory()
+        self._output = np.zeros(_SIZE)
+        self.rest()
+
+    def set_gains(self, gains: Gains) -> None:
+        """Fly on with other gains."""
+        self._gains = pack(gains)
+
+    def fly(self, state: Row, demand: Demand) -> Motors:
+        """Run one tick; return the motor commands 0..1.
+
+        Args:
+            state: Begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
+                rates FRD [rad/s]: 13 floats.
+            demand: What to fly.
+        """
+        position, velocity, yaw, yaw_rate = demand
+        motors: Motors = _fly(
+            state,
+            position,
+            velocity,
+            yaw,
+            yaw_rate,
+            self._memory,
+            self._gains,
+            self._dt,
+            self._output,
+        )
+        return motors
+
+    def rest(self) -> None:
+        """The motors stand still: nothing may wind up against the floor; there is no output."""
+        reset_integrals(self._memory)
+        self._output[:] = 0.0
+        self._output[_ATTITUDE] = 1.0
+
+    @property
+    def thrust(self) -> float:
+        """Collective that is commanded, 0..1."""
+        return self._output.item(_THRUST)
+
+    @property
+    def descending(self) -> bool:
+        """Whether the velocity setpoint points down."""
+        return self._output.item(_VELOCITY + 2) > 0.0
+
+    def setpoints(self) -> ControlSetpoints:
+        """Return a copy of what the newest tick decided."""
+        row = self._output.copy()
+        return ControlSetpoints(
+            row[_ATTITUDE:_RATES], row[_RATES:_VELOCITY], row[_VELOCITY:_THRUST], row.item(_THRUST)
+        )

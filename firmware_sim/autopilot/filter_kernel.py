@@ -1,0 +1,132 @@
+"""The filter of the estimator's error as compiled code: what flies.
+
+The same filter as `filter_filterpy` up to rounding, with what is known of its matrices: most rows
+of the transition matrix are the identity's, and the noises of a measurement's components are
+independent, so that fusing them one after the other equals fusing them together (Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation, ch. 7.2.2). The covariance is
+exactly symmetric at any time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from airl_mav.constants import TICK_S
+from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
+from firmware_sim.autopilot.error_state import (
+    ACC,
+    ATT,
+    GYRO,
+    N_STATES,
+    POS,
+    VEL,
+    gate_ratio,
+    inject,
+    propagate,
+)
+
+_MOVING = 9
+"""Position, velocity and attitude move; biases and the barometer's offset stay as they are."""
+
+
+@kernel
+def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
+    """Write (f p)' for the moving rows of f and the first columns of p.
+
+    Args:
+        f: Transition matrix (16, 16).
+        p: (16, >= columns).
+        columns: How many columns of p.
+        out: (columns, 9), written.
+    """
+    for j in range(columns):
+        ax, ay, az = p[ATT, j], p[ATT + 1, j], p[ATT + 2, j]
+        bx, by, bz = p[ACC, j], p[ACC + 1, j], p[ACC + 2, j]
+        for k in range(3):
+            i = POS + k
+            out[j, i] = p[i, j] + f[i, VEL + k] * p[VEL + k, j]
+            i = VEL + k
+            by_attitude = f[i, ATT] * ax + f[i, ATT + 1] * ay + f[i, ATT + 2] * az
+            by_bias = f[i, ACC] * bx + f[i, ACC + 1] * by + f[i, ACC + 2] * bz
+            out[j, i] = p[i, j] + by_attitude + by_bias
+            i = ATT + k
+            turned = f[i, ATT] * ax + f[i, ATT + 1] * ay + f[i, ATT + 2] * az
+            out[j, i] = turned + f[i, GYRO + k] * p[GYRO + k, j]
+
+
+@kernel
+def _predict(
+    state: Vector, p: Vector, noise: Vector, f: Vector, gyro: Vector, accel: Vector, dt: float
+) -> None:
+    """Move the nominal state and its covariance, p = f p f' + noise, in place."""
+    propagate(state, gyro, accel, f, dt)
+    half = np.empty((N_STATES, _MOVING))
+    whole = np.empty((_MOVING, _MOVING))
+    _times_transposed(f, p, N_STATES, half)
+    _times_transposed(f, half, _MOVING, whole)
+    for i in range(_MOVING):
+        for j in range(i, _MOVING):
+            p[i, j] = p[j, i] = whole[i, j]
+        for j in range(_MOVING, N_STATES):
+            p[i, j] = p[j, i] = half[j, i]
+    for i in range(N_STATES):
+        p[i, i] += noise[i]
+
+
+@kernel
+def _fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
+    """Correct the nominal state and its covariance in place; return the gate's ratio."""
+    m = len(innovation)
+    spread = np.empty(N_STATES)
+    total = np.empty(m)
+    for k in range(m):
+        total[k] = _spread(p, h[k], spread) + variance[k]
+    ratio = gate_ratio(innovation, total)
+    if not ratio <= 1.0:
+        return ratio
+    error = np.zeros(N_STATES)
+    for k in range(m):
+        weight = 1.0 / (_spread(p, h[k], spread) + variance[k])
+        rest = innovation[k]
+        for i in range(N_STATES):
+            rest -= h[k, i] * error[i]
+        for i in range(N_STATES):
+            error[i] += spread[i] * rest * weight
+            for j in range(N_STATES):
+                p[i, j] -= spread[i] * spread[j] * weight
+    inject(state, error)
+    return ratio
+
+
+@kernel
+def _spread(p: Vector, row: Vector, out: Vector) -> float:
+    """Write p row' (16,); return row p row'. Skips the many zeros of the row."""
+    out[:] = 0.0
+    for k in range(N_STATES):
+        if row[k] != 0.0:
+            for i in range(N_STATES):
+                out[i] += row[k] * p[k, i]
+    square = 0.0
+    for k in range(N_STATES):
+        square += row[k] * out[k]
+    return square
+
+
+class KernelFilter:
+    """Implements `estimator.ErrorFilter`."""
+
+    def __init__(self, covariance: Vector, noise: Vector) -> None:
+        """Start with a covariance (16, 16); variances `noise` (16,) are added at every tick."""
+        self.covariance = covariance.copy()
+        self._noise = noise.copy()
+        self._transition = np.eye(N_STATES)
+
+    def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
+        """Move the nominal state, updated in place, and the covariance by one tick."""
+        _predict(state, self.covariance, self._noise, self._transition, gyro, accel, TICK_S)
+
+    def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
+        """Correct the nominal state by one measurement, unless it fails the gate."""
+        ratio: float = _fuse(state, self.covariance, innovation, h, variance)
+        return ratio
