@@ -116,11 +116,36 @@ def test_a_recorder_at_250_hz_keeps_50() -> None:
     assert flight.velocity[-1].tolist() == [1.0, 2.0, 3.0]
 
 
+def test_integrating_and_keeping_is_adding() -> None:
+    """The way that costs a tick little records the same."""
+    rng = np.random.default_rng(1)
+    thorough, quick = TrajectoryRecorder(), TrajectoryRecorder()
+    time_us = 8_000
+    for i in range(500):
+        state, power = rng.normal(size=10), float(rng.uniform(0.0, 900.0))
+        last = i == 499
+        thorough.add(time_us, state[:3], state[3:6], state[6:], power, keep=last)
+        if quick.integrate(time_us, power) or last:
+            quick.keep(state)
+        time_us += int(rng.choice([4_000, 7_000]))
+    a, b = thorough.trajectory().arrays(), quick.trajectory().arrays()
+    assert 100 < len(a["time_us"]) < 200
+    for name, values in a.items():
+        np.testing.assert_array_equal(b[name], values)
+
+
+def test_a_sample_needs_a_tick() -> None:
+    with pytest.raises(ValueError, match="integrate first"):
+        TrajectoryRecorder().keep(np.zeros(10))
+
+
 def test_time_must_advance() -> None:
     recorder = TrajectoryRecorder()
     recorder.add(4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
     with pytest.raises(ValueError, match="must be later"):
         recorder.add(4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
+    with pytest.raises(ValueError, match="must be later"):
+        recorder.integrate(3_999, 1.0)
     good = helix(1.0).arrays()
     with pytest.raises(ValueError, match="must increase"):
         Trajectory.from_arrays({**good, "time_us": good["time_us"][::-1]})

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import pybullet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -19,8 +20,11 @@ from airl_mav.location import HOME
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
+from firmware_sim.plant import sensors as sensors_module
+from firmware_sim.plant import wind as wind_module
+from firmware_sim.plant.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.plant.plant import Collision, Plant
-from firmware_sim.plant.sensors import Kinematics, Rate, SensorSuite
+from firmware_sim.plant.sensors import Rate, SensorSuite
 from firmware_sim.plant.wind import Wind, WindSettings
 
 G = 9.80665
@@ -82,13 +86,14 @@ def arena(
     center: tuple[float, float, float] = (5.0, 0.0, -2.0),
     half: tuple[float, float, float] = (0.5, 0.5, 0.5),
     tour: Tour | None = None,
+    yaw: float = 0.0,
 ) -> Arena:
     n = 0 if shape is None else 1
     obstacles = Obstacles(
         np.array([shape] * n, np.int8),
         np.array([center] * n, np.float64).reshape(n, 3),
         np.array([half] * n, np.float64).reshape(n, 3),
-        np.zeros(n),
+        np.full(n, yaw),
     )
     tours = () if tour is None else (tour,)
     bounds = Bounds(-15.0, 20.0, -12.0, 10.0, 6.0)
@@ -375,6 +380,17 @@ def test_a_moving_obstacle_runs_into_a_standing_vehicle(
     assert hit.speed_m_s < 0.01  # the vehicle's own
 
 
+@pytest.mark.parametrize(("yaw", "reach"), [(0.0, 0.2), (math.pi / 2, 1.5), (math.pi, 0.2)])
+def test_a_moving_box_keeps_its_heading(make: PlantMaker, yaw: float, reach: float) -> None:
+    tour = Tour(np.array([0.0, 2.0, 60.0]), np.array([[4.0, 0.0], [0.0, 0.0], [4.0, 0.0]]))
+    place = arena(Shape.BOX, (4.0, 0.0, -0.5), (0.2, 1.5, 0.5), tour, yaw)
+    plant = make(QUIET, place)
+    run(plant, OFF, 2.0)
+    meeting = (4.0 - reach - WIDTH / 2) / 2.0
+    assert plant.collisions[0].what == "moving-box-0"
+    assert plant.collisions[0].time_us / 1e6 == pytest.approx(meeting, abs=0.012)
+
+
 def test_being_pushed_along_is_one_contact(make: PlantMaker) -> None:
     tour = Tour(np.array([0.0, 2.0, 60.0]), np.array([[4.0, 0.0], [0.0, 0.0], [4.0, 0.0]]))
     plant = make(QUIET, arena(Shape.CYLINDER, (4.0, 0.0, -1.0), (0.5, 0.5, 1.0), tour))
@@ -423,15 +439,16 @@ def test_a_soft_touch_down_and_sliding_are_no_collisions(make: PlantMaker) -> No
 # --- sensors: spread
 
 
-def still(**fields: Vector) -> Kinematics:
-    truth = {
-        "position": np.zeros(3),
-        "velocity": np.zeros(3),
-        "specific_force": np.array([0.0, 0.0, -G]),
-        "angular_velocity": np.zeros(3),
-        "quaternion": LEVEL,
-    }
-    return Kinematics(**(truth | fields))
+def still(
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    attitude: Rotation | None = None,
+) -> Vector:
+    """Return the motion of a vehicle that does not turn and feels its weight."""
+    row = np.zeros(16)
+    row[POSITION], row[VELOCITY], row[FORCE] = position, velocity, (0.0, 0.0, -G)
+    row[QUATERNION] = (attitude or Rotation.identity()).as_quat(scalar_first=True)
+    return row
 
 
 def suite(seed: int = 1, **tables: dict[str, float]) -> SensorSuite:
@@ -518,8 +535,9 @@ def local_metres(sample: SensorSample) -> Vector:
     return np.array([north, east, HOME.altitude_m - fix.altitude_m])
 
 
-def fixes(suite: SensorSuite, n: int, truth: Kinematics | None = None) -> list[SensorSample]:
-    return [suite.sample(100_000 * i, truth or still(), BATTERY) for i in range(n)]
+def fixes(suite: SensorSuite, n: int, row: Vector | None = None) -> list[SensorSample]:
+    row = still() if row is None else row
+    return [suite.sample(100_000 * i, row, BATTERY) for i in range(n)]
 
 
 def test_gps_noise_in_metres() -> None:
@@ -537,7 +555,7 @@ def test_gps_noise_in_metres() -> None:
 
 
 def test_gps_is_right_without_noise() -> None:
-    truth = still(position=np.array([30.0, -40.0, -10.0]), velocity=np.array([1.0, 2.0, -3.0]))
+    truth = still((30.0, -40.0, -10.0), (1.0, 2.0, -3.0))
     sample = fixes(suite(), 1, truth)[0]
     np.testing.assert_allclose(local_metres(sample), [30.0, -40.0, -10.0], atol=2e-3)
     assert sample.gps is not None
@@ -621,8 +639,7 @@ def test_level_and_facing_north_the_magnetometer_reads_the_field_of_zurich(
 def test_the_magnetometer_turns_with_the_body(yaw: float, pitch: float, roll: float) -> None:
     level = suite().sample(0, still(), BATTERY).mag
     turned = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True)
-    x, y, z, w = turned.as_quat()
-    mag = suite().sample(0, still(quaternion=np.array([w, x, y, z])), BATTERY).mag
+    mag = suite().sample(0, still(attitude=turned), BATTERY).mag
     assert level is not None
     assert mag is not None
     np.testing.assert_allclose(mag, turned.inv().apply(level), atol=1e-12)
@@ -648,6 +665,82 @@ def test_the_seed_decides_every_sample(make: PlantMaker) -> None:
         assert a[1] != b[1]
         assert a[2] != b[2]
     assert [r[5] for r in first if r[5]] != [r[5] for r in other if r[5]]
+
+
+def test_no_sensor_hears_how_often_another_one_measures() -> None:
+    noisy = QUAD.sensors
+    rates = {name: getattr(noisy, name) for name in ("gps", "magnetometer", "barometer")}
+    slower = {name: table.model_copy(update={"rate_hz": 1.0}) for name, table in rates.items()}
+
+    def flown(profile: Sensors) -> list[SensorSample]:
+        given_ = SensorSuite(profile, np.random.default_rng(3))
+        return [given_.sample(i * TICK_US, still(), BATTERY) for i in range(600)]
+
+    usual = flown(noisy)
+    for name in rates:
+        other = flown(noisy.model_copy(update={name: slower[name]}))
+        for a, b in zip(usual, other, strict=True):
+            assert tuple(a.accel) + tuple(a.gyro) == tuple(b.accel) + tuple(b.gyro)
+            if name != "gps" and a.gps and b.gps:
+                assert a.gps.position == b.gps.position
+            if name != "barometer":
+                assert a.pressure_hpa == b.pressure_hpa
+            if name != "magnetometer":
+                assert (a.mag is None) == (b.mag is None)
+                assert a.mag is None or tuple(a.mag) == tuple(b.mag)
+
+
+def test_how_much_noise_is_drawn_ahead_changes_nothing(
+    make: PlantMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gusty = WindSettings(gust_m_s=2.0)
+    usual = record(make(QUAD, None, 5, wind=gusty))
+    monkeypatch.setattr(sensors_module, "BLOCK", 1)
+    monkeypatch.setattr(wind_module, "BLOCK", 7)
+    assert record(make(QUAD, None, 5, wind=gusty)) == usual
+
+
+# --- what others read of it
+
+
+def test_the_state_for_the_referee_is_the_true_one(make: PlantMaker) -> None:
+    plant = make(wind=WindSettings(north_m_s=3.0))
+    put(plant, (1.0, -2.0, -30.0), (3.0, 2.0, 1.0))
+    for _ in range(3):
+        run(plant, thrust(0.7), 0.1)
+        truth = plant.truth()
+        assert plant.position == tuple(truth.position)
+        assert plant.battery_remaining == truth.battery_remaining < 1.0
+        assert plant.power_w == truth.power_w > 100.0
+        assert [type(c) for c in plant.position] == [float] * 3
+        np.testing.assert_array_equal(plant.motion[:3], truth.position)
+    # East, north, up of the body itself.
+    at, _ = plant.world.client.getBasePositionAndOrientation(plant._body)
+    assert plant.position == (at[1], at[0], -at[2])
+
+
+def test_the_truth_that_was_given_out_does_not_change(make: PlantMaker) -> None:
+    plant = make()
+    put(plant, (0.0, 0.0, -30.0))
+    before = plant.truth()
+    kept = before.position.copy()
+    before.position[0] += 100.0
+    assert plant.truth().position[0] == plant.position[0] == kept[0]
+    run(plant, OFF, 0.1)
+    np.testing.assert_array_equal(before.position - [100.0, 0.0, 0.0], kept)
+
+
+def test_a_closed_plant_cannot_touch_another_one(make: PlantMaker) -> None:
+    closed = make()
+    number = closed.world.number
+    closed.close()
+    closed.close()
+    assert not pybullet.isConnected(number)
+    other = make()  # pybullet gives it the number that has become free
+    start = other.position
+    with pytest.raises(pybullet.error, match="Not connected"):
+        closed.step(HOVER)
+    assert other.position == start
 
 
 # --- battery and power

@@ -18,7 +18,7 @@ from airl_mav.frames import ned_to_enu, quat_ned_frd_to_enu_flu, quat_wxyz_to_xy
 from airl_mav.kernels import kernel
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
@@ -257,6 +257,13 @@ def test_free_body_agrees_with_pybullet() -> None:
     client.disconnect()
     assert np.linalg.norm(p) > 5.0, "it went somewhere"
     assert worst < 1e-9
+
+
+def test_a_row_is_an_airframe_field_by_field() -> None:
+    numbers = np.arange(1.0, 14.0)
+    assert airframe_of(numbers) == Airframe(*numbers)
+    assert len(Airframe._fields) == len(numbers)
+    assert airframe_of(np.array(QUAD)) == QUAD
 
 
 # --- power

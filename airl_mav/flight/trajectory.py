@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.constants import US_PER_S
-
 SAMPLE_US = 20_000
 """Time between samples [µs]: 50 Hz."""
 
@@ -94,14 +92,21 @@ class Trajectory:
 
 
 class TrajectoryRecorder:
-    """Collects the true state tick by tick and keeps it at 50 Hz."""
+    """Collects the true state tick by tick and keeps it at 50 Hz.
+
+    Either `add` every tick with all there is; or, where a tick may cost no more than it must,
+    `integrate` every tick, and `keep` when that says so.
+    """
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []
         self._times: list[int] = []
+        self._states: list[NDArray[np.float64]] = []
+        self._powers: list[float] = []
         self._last_us: int | None = None
         self._kept_us = 0
-        self._energy_j = 0.0
+        self._energy_uj = 0.0
+        """Since the last sample: power [W] times microseconds."""
+        self._power_w = 0.0
 
     def add(
         self,
@@ -126,22 +131,57 @@ class TrajectoryRecorder:
         Raises:
             ValueError: Time does not advance.
         """
-        if self._last_us is not None and time_us <= self._last_us:
-            raise ValueError(f"time_us={time_us}: must be later than {self._last_us}")
-        if self._last_us is not None:
-            self._energy_j += power_w * (time_us - self._last_us) / US_PER_S
+        if self.integrate(time_us, power_w) or keep:
+            self.keep(np.concatenate([position, velocity, quaternion]).astype(np.float64))
+
+    def integrate(self, time_us: int, power_w: float) -> bool:
+        """Take the power of the tick that ends now; return whether a sample is due.
+
+        Args:
+            time_us: Simulated time [µs], later than the call before.
+            power_w: Electrical power over the tick that ends now [W].
+
+        Raises:
+            ValueError: Time does not advance.
+        """
+        last_us = self._last_us
+        self._power_w = power_w
+        if last_us is None:
+            self._last_us = time_us
+            return True
+        if time_us <= last_us:
+            raise ValueError(f"time_us={time_us}: must be later than {last_us}")
+        self._energy_uj += power_w * (time_us - last_us)
         self._last_us = time_us
+        return time_us - self._kept_us >= SAMPLE_US or not self._times
+
+    def keep(self, state: NDArray[np.float64]) -> None:
+        """Sample the moment of the newest `integrate`.
+
+        Args:
+            state: (10,) position, velocity, quaternion, as in `add`. Kept as it is, not copied:
+                it must not change afterwards.
+
+        Raises:
+            ValueError: Nothing was integrated yet.
+        """
+        time_us = self._last_us
+        if time_us is None:
+            raise ValueError("integrate first: a sample has the time of the newest tick")
         first = not self._times
-        if not (first or keep or time_us - self._kept_us >= SAMPLE_US):
-            return
-        mean_w = power_w if first else self._energy_j * US_PER_S / (time_us - self._kept_us)
+        passed_us = time_us - self._kept_us
+        self._powers.append(self._power_w if first else self._energy_uj / passed_us)
         self._times.append(time_us)
-        self._rows.append((*map(float, np.concatenate([position, velocity, quaternion])), mean_w))
-        self._kept_us, self._energy_j = time_us, 0.0
+        self._states.append(state)
+        self._kept_us, self._energy_uj = time_us, 0.0
 
     def trajectory(self) -> Trajectory:
         """Return what was recorded so far."""
-        rows = np.array(self._rows, np.float64).reshape(-1, 11)
+        rows = np.array(self._states, np.float64).reshape(-1, 10)
         return Trajectory(
-            np.array(self._times, np.int64), rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10]
+            np.array(self._times, np.int64),
+            rows[:, :3],
+            rows[:, 3:6],
+            rows[:, 6:],
+            np.array(self._powers, np.float64),
         )

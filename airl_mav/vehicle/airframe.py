@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 
 
@@ -43,3 +45,10 @@ class Airframe(NamedTuple):
             drag.quadratic_n_s2_m2,
             drag.angular_n_m_s,
         )
+
+
+@kernel
+def airframe_of(row: Vector) -> Airframe:
+    """Return a row (13,) by its names: an array costs a kernel's caller far less than names do."""
+    r = row
+    return Airframe(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12])

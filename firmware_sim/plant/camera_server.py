@@ -60,9 +60,14 @@ class DepthCamera:
         self._start_us = time_us
         self._slot = 0
 
+    @property
+    def next_us(self) -> int:
+        """Simulated time from which on the next frame is due [µs]."""
+        return self._slot_time_us(self._slot)
+
     def due(self, time_us: int) -> bool:
         """Return whether the next frame is due at a simulated time [µs]."""
-        return time_us >= self._slot_time_us(self._slot)
+        return time_us >= self.next_us
 
     def capture(
         self,

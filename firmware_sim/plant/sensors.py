@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from airl_mav.atmosphere import pressure_hpa, temperature_c
 from airl_mav.constants import TICK_S, US_PER_S
-from airl_mav.frames import Vector, local_to_geodetic, quat_to_matrix
+from airl_mav.frames import Vector, local_to_geodetic
+from airl_mav.kernels import kernel
 from airl_mav.location import HOME, MAGNETIC_FIELD_NED
-from airl_mav.profiles.vehicle import Gps, Sensors
+from airl_mav.profiles.vehicle import Barometer, Gps, Magnetometer, Sensors
+from airl_mav.vehicle.rotation import conjugate, rotate
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
+from firmware_sim.plant.kinematics import POSITION, VELOCITY, force, quaternion, rates
 
 PA_PER_HPA = 100.0
 GPS_SATELLITES = 12
 
-
-@dataclass(frozen=True, slots=True)
-class Kinematics:
-    """What the sensors feel."""
-
-    position: Vector  # (3,) NED [m]
-    velocity: Vector  # (3,) NED [m/s]
-    specific_force: Vector  # (3,) FRD [m/s²]
-    angular_velocity: Vector  # (3,) FRD [rad/s]
-    quaternion: Vector  # (4,) body -> NED
+BLOCK = 128
+"""Noise is drawn for so many samples at once; how many changes no value."""
 
 
 class Rate:
@@ -34,101 +28,180 @@ class Rate:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._next = 0
+        self.next_us = 0.0
+        """Simulated time before which it is not due [µs]."""
 
     def due(self, time_us: int) -> bool:
         """Return True once for every period that has passed."""
-        if time_us < self._start_us(self._next):
+        if time_us < self.next_us:
             return False
         period = int(time_us * self._rate_hz / US_PER_S)
         # Rounding may put a time that lies on a boundary into the period before it.
         if self._start_us(period + 1) <= time_us:
             period += 1
-        self._next = period + 1
+        self.next_us = self._start_us(period + 1)
         return True
 
     def _start_us(self, period: int) -> float:
         return period * US_PER_S / self._rate_hz
 
 
-class _GpsDrift:
-    """Slowly wandering position error: Gauss-Markov, one per axis."""
+class _White:
+    """White noise of one sensor, standard deviation 1."""
+
+    def __init__(self, rng: np.random.Generator, width: int) -> None:
+        self._rng = rng
+        self._rows = np.zeros((0, width))
+        self._next = 0
+
+    def draw(self) -> Vector:
+        """Return new numbers (width,)."""
+        if self._next == len(self._rows):
+            self._rows, self._next = self._rng.standard_normal((BLOCK, self._rows.shape[1])), 0
+        row: Vector = self._rows[self._next]
+        self._next += 1
+        return row
+
+
+@kernel
+def _feel(
+    row: Vector,
+    noise: Vector,
+    sigma: Vector,
+    accel_bias: Vector,
+    gyro_bias: Vector,
+    accel: Vector,
+    gyro: Vector,
+) -> None:
+    """Write what accelerometer and gyro measure, and let their biases walk.
+
+    Args:
+        row: (16,) the vehicle's motion.
+        noise: (12,) white: of the accelerometer, of the gyro, of their biases (3 each).
+        sigma: (12,) what it is multiplied by.
+        accel_bias: (3,) [m/s²], updated.
+        gyro_bias: (3,) [rad/s], updated.
+        accel: (3,) FRD [m/s²], overwritten.
+        gyro: (3,) FRD [rad/s], overwritten.
+    """
+    felt, turning = force(row), rates(row)
+    for axis in range(3):
+        accel_bias[axis] += sigma[6 + axis] * noise[6 + axis]
+        gyro_bias[axis] += sigma[9 + axis] * noise[9 + axis]
+        accel[axis] = felt[axis] + accel_bias[axis] + sigma[axis] * noise[axis]
+        gyro[axis] = turning[axis] + gyro_bias[axis] + sigma[3 + axis] * noise[3 + axis]
+
+
+@kernel
+def _point(row: Vector, field: Vector, noise: Vector, sigma: float, mag: Vector) -> None:
+    """Write what a magnetometer reads, FRD (3,), in a field NED (3,); noise white (3,)."""
+    x, y, z = rotate(conjugate(quaternion(row)), (field[0], field[1], field[2]))
+    mag[0] = x + sigma * noise[0]
+    mag[1] = y + sigma * noise[1]
+    mag[2] = z + sigma * noise[2]
+
+
+class _Compass:
+    """Magnetometer: white noise."""
+
+    def __init__(self, magnetometer: Magnetometer, rng: np.random.Generator) -> None:
+        self.rate = Rate(magnetometer.rate_hz)
+        self._sigma = magnetometer.noise_gauss
+        self._white = _White(rng, 3)
+
+    def read(self, row: Vector) -> Vector:
+        """Return the field FRD [gauss]."""
+        mag = np.empty(3)
+        _point(row, MAGNETIC_FIELD_NED, self._white.draw(), self._sigma, mag)
+        return mag
+
+
+class _Barometer:
+    """Barometer: white noise and a drift that walks."""
+
+    def __init__(self, barometer: Barometer, rng: np.random.Generator) -> None:
+        self.rate = Rate(barometer.rate_hz)
+        self._noise_pa = barometer.noise_pa
+        self._step_pa = barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
+        self._drift_pa = 0.0
+        self._white = _White(rng, 2)
+
+    def read(self, altitude: float) -> float:
+        """Return the static pressure [hPa] at an altitude above mean sea level [m]."""
+        white = self._white.draw()
+        self._drift_pa += self._step_pa * white.item(0)
+        noise_pa = self._noise_pa * white.item(1)
+        return pressure_hpa(altitude) + (self._drift_pa + noise_pa) / PA_PER_HPA
+
+
+class _Gps:
+    """GPS: white noise, and a slowly wandering position error (Gauss-Markov on each axis)."""
 
     def __init__(self, gps: Gps, rng: np.random.Generator) -> None:
+        self.rate = Rate(gps.rate_hz)
+        self._gps = gps
         self._keep = math.exp(-1.0 / (gps.rate_hz * gps.drift_time_constant_s))
         sigma = gps.drift_m_sqrt_s * math.sqrt(0.5 * gps.drift_time_constant_s)
         self._drive = sigma * math.sqrt(1.0 - self._keep**2)
-        self._rng = rng
         self._error = np.zeros(3)
+        noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
+        self._position_noise = np.array(noise)
+        self._white = _White(rng, 9)
 
-    def step(self) -> Vector:
-        """Advance one fix and return the error (3,) NED [m]."""
-        self._error = self._keep * self._error + self._drive * self._rng.standard_normal(3)
-        return self._error
-
-
-class SensorSuite:
-    """All sensors of the vehicle; one call a tick."""
-
-    def __init__(self, profile: Sensors, rng: np.random.Generator) -> None:
-        imu = profile.imu
-        self._profile = profile
-        self._rng = rng
-        self._accel_bias = imu.accel_bias_m_s2 * rng.standard_normal(3)
-        self._gyro_bias = imu.gyro_bias_rad_s * rng.standard_normal(3)
-        self._baro_drift_pa = 0.0
-        self._gps_drift = _GpsDrift(profile.gps, rng)
-        self._mag_rate = Rate(profile.magnetometer.rate_hz)
-        self._baro_rate = Rate(profile.barometer.rate_hz)
-        self._gps_rate = Rate(profile.gps.rate_hz)
-        walk = math.sqrt(TICK_S)
-        self._sigmas = np.concatenate(
-            [
-                np.full(3, imu.accel_noise_m_s2),
-                np.full(3, imu.gyro_noise_rad_s),
-                np.full(3, imu.accel_walk_m_s2_sqrt_s * walk),
-                np.full(3, imu.gyro_walk_rad_s_sqrt_s * walk),
-            ]
-        )
-
-    def sample(self, time_us: int, truth: Kinematics, battery: BatterySample) -> SensorSample:
-        """Return what is measured at `time_us` [µs]."""
-        noise = self._sigmas * self._rng.standard_normal(12)
-        self._accel_bias = self._accel_bias + noise[6:9]
-        self._gyro_bias = self._gyro_bias + noise[9:12]
-        altitude = HOME.altitude_m - float(truth.position[2])
-        return SensorSample(
-            time_us=time_us,
-            accel=truth.specific_force + self._accel_bias + noise[0:3],
-            gyro=truth.angular_velocity + self._gyro_bias + noise[3:6],
-            temperature_c=temperature_c(altitude),
-            battery=battery,
-            mag=self._mag(truth) if self._mag_rate.due(time_us) else None,
-            pressure_hpa=self._pressure(altitude) if self._baro_rate.due(time_us) else None,
-            gps=self._gps(truth) if self._gps_rate.due(time_us) else None,
-        )
-
-    def _mag(self, truth: Kinematics) -> Vector:
-        field = quat_to_matrix(truth.quaternion).T @ MAGNETIC_FIELD_NED
-        noise: Vector = self._profile.magnetometer.noise_gauss * self._rng.standard_normal(3)
-        return field + noise
-
-    def _pressure(self, altitude: float) -> float:
-        baro = self._profile.barometer
-        step = baro.drift_pa_sqrt_s / math.sqrt(baro.rate_hz)
-        self._baro_drift_pa += step * self._rng.standard_normal()
-        noise = baro.noise_pa * self._rng.standard_normal()
-        return pressure_hpa(altitude) + (self._baro_drift_pa + noise) / PA_PER_HPA
-
-    def _gps(self, truth: Kinematics) -> GpsFix:
-        gps = self._profile.gps
-        sigma = np.array([gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m])
-        position = truth.position + self._gps_drift.step() + sigma * self._rng.standard_normal(3)
-        velocity = truth.velocity + gps.velocity_noise_m_s * self._rng.standard_normal(3)
+    def read(self, row: Vector) -> GpsFix:
+        """Return a fix."""
+        gps, white = self._gps, self._white.draw()
+        self._error = self._keep * self._error + self._drive * white[0:3]
+        position = row[POSITION] + self._error + self._position_noise * white[3:6]
         return GpsFix(
             position=local_to_geodetic(position, HOME),
-            velocity_ned=velocity,
+            velocity_ned=row[VELOCITY] + gps.velocity_noise_m_s * white[6:9],
             eph_m=gps.horizontal_noise_m,
             epv_m=gps.vertical_noise_m,
             satellites=GPS_SATELLITES,
         )
+
+
+class SensorSuite:
+    """All sensors of the vehicle; one call a tick.
+
+    Every sensor draws from a stream of its own, so that what one measures does not depend on how
+    often another does.
+    """
+
+    def __init__(self, profile: Sensors, rng: np.random.Generator) -> None:
+        imu = profile.imu
+        inertial, compass, barometer, gps = rng.spawn(4)
+        walk = math.sqrt(TICK_S)
+        self._sigma = np.repeat(
+            [
+                imu.accel_noise_m_s2,
+                imu.gyro_noise_rad_s,
+                imu.accel_walk_m_s2_sqrt_s * walk,
+                imu.gyro_walk_rad_s_sqrt_s * walk,
+            ],
+            3,
+        )
+        self._accel_bias = imu.accel_bias_m_s2 * inertial.standard_normal(3)
+        self._gyro_bias = imu.gyro_bias_rad_s * inertial.standard_normal(3)
+        self._white = _White(inertial, 12)
+        self._compass = _Compass(profile.magnetometer, compass)
+        self._barometer = _Barometer(profile.barometer, barometer)
+        self._gps = _Gps(profile.gps, gps)
+        self._rates = (self._compass.rate, self._barometer.rate, self._gps.rate)
+        self._slow_us = 0.0
+        """Simulated time before which none of the slower ones is due [µs]."""
+
+    def sample(self, time_us: int, row: Vector, battery: BatterySample) -> SensorSample:
+        """Return what is measured at `time_us` [µs] in motion `row` (16,), `plant.kinematics`."""
+        accel, gyro, noise = np.empty(3), np.empty(3), self._white.draw()
+        _feel(row, noise, self._sigma, self._accel_bias, self._gyro_bias, accel, gyro)
+        altitude = HOME.altitude_m - row.item(2)
+        air = temperature_c(altitude)
+        if time_us < self._slow_us:
+            return SensorSample(time_us, accel, gyro, air, battery)
+        mag = self._compass.read(row) if self._compass.rate.due(time_us) else None
+        pressure = self._barometer.read(altitude) if self._barometer.rate.due(time_us) else None
+        gps = self._gps.read(row) if self._gps.rate.due(time_us) else None
+        self._slow_us = min(rate.next_us for rate in self._rates)
+        return SensorSample(time_us, accel, gyro, air, battery, mag, pressure, gps)

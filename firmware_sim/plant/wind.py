@@ -9,6 +9,10 @@ import numpy as np
 
 from airl_mav.constants import TICK_S
 from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
+
+BLOCK = 256
+"""Gusts are drawn for so many ticks at once; how many changes no value."""
 
 
 @dataclass(frozen=True)
@@ -25,21 +29,36 @@ class WindSettings:
     """Correlation time of the gusts [s]."""
 
 
+@kernel
+def _blow(noise: Vector, gust: Vector, keep: float, drive: Vector, steady: Vector) -> None:
+    """Turn white noise (n, 3) in place into wind NED [m/s]; the gust (3,) goes on where it was."""
+    for i in range(len(noise)):
+        for axis in range(3):
+            gust[axis] = keep * gust[axis] + drive[axis] * noise[i, axis]
+            noise[i, axis] = steady[axis] + gust[axis]
+
+
 class Wind:
     """Steady wind plus first-order Gauss-Markov gusts (the first-order form of Dryden's model)."""
 
     def __init__(self, settings: WindSettings, rng: np.random.Generator) -> None:
         self._steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
-        self._sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
+        sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
         self._keep = math.exp(-TICK_S / settings.gust_time_s)
+        self._drive = math.sqrt(1.0 - self._keep**2) * sigma
         self._calm = settings.gust_m_s == 0.0
         self._rng = rng
-        self._gust = np.zeros(3) if self._calm else self._sigma * rng.standard_normal(3)
+        self._gust = np.zeros(3) if self._calm else sigma * rng.standard_normal(3)
+        self._ahead = np.zeros((0, 3))
+        self._next = 0
 
     def step(self) -> Vector:
-        """Advance one tick and return the wind (3,) NED [m/s]."""
+        """Advance one tick and return the wind (3,) NED [m/s]; not to be written to."""
         if self._calm:
             return self._steady
-        drive = math.sqrt(1.0 - self._keep**2) * self._sigma
-        self._gust = self._keep * self._gust + drive * self._rng.standard_normal(3)
-        return self._steady + self._gust
+        if self._next == len(self._ahead):
+            self._ahead, self._next = self._rng.standard_normal((BLOCK, 3)), 0
+            _blow(self._ahead, self._gust, self._keep, self._drive, self._steady)
+        wind: Vector = self._ahead[self._next]
+        self._next += 1
+        return wind

@@ -15,7 +15,8 @@ from airl_mav.frames import (
     quat_ned_frd_to_enu_flu,
     quat_wxyz_to_xyzw,
 )
-from firmware_sim.plant.bullet import connect, pybullet
+from firmware_sim.plant.bullet import NO_CLIENT, connect, number_of, pybullet
+from firmware_sim.plant.movers import Movers, Xyzw
 
 WALL_THICKNESS_M = 0.2
 
@@ -23,44 +24,66 @@ FLOOR = "floor"
 """Name of the floor in a collision event."""
 
 
+def facing(yaw: float) -> Xyzw:
+    """Return pybullet's attitude of a level body that faces `yaw` [rad], 0 = north."""
+    return quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quat_from_euler(0.0, 0.0, yaw)))
+
+
+LEVEL = facing(0.0)
+
+
 class World:
     """A pybullet world: floor, walls, obstacles. ENU inside, NED outside."""
 
-    def __init__(self, arena: Arena | None) -> None:
-        """Build the bodies of an arena; None = an endless floor."""
+    def __init__(self, arena: Arena | None, vehicle_radius_m: float) -> None:
+        """Build the bodies of an arena.
+
+        Args:
+            arena: None = an endless floor.
+            vehicle_radius_m: No part of the vehicle is further from its centre than this [m].
+        """
         self.client: Any = connect()
+        self.number: int = number_of(self.client)
+        """Of the client, for direct calls of pybullet's functions."""
         self.client.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         self.client.setTimeStep(TICK_S)
         self.names: dict[int, str] = {}
         """What each body is called in a collision event."""
-        self._movers: list[int] = []
-        self._arena = arena
+        self._movers: Movers | None = None
         floor = self.client.createCollisionShape(pybullet.GEOM_PLANE)
-        self._add(floor, np.zeros(3), 0.0, FLOOR)
+        self._add(floor, np.zeros(3), LEVEL, FLOOR)
         if arena is not None:
             self._add_walls(arena)
-            self._add_obstacles(arena)
+            bodies, attitudes = self._add_obstacles(arena)
+            if arena.tours:
+                first = arena.n_static
+                self._movers = Movers(arena, bodies[first:], attitudes[first:], vehicle_radius_m)
 
     def close(self) -> None:
         """Release the physics server."""
-        self.client.disconnect()
+        if self.number != NO_CLIENT:
+            self.client.disconnect()
+            self.number = NO_CLIENT
 
-    def move_obstacles(self, time_us: int) -> None:
-        """Put the moving obstacles where they are `time_us` after the start of the episode."""
-        if self._arena is None or not self._movers:
-            return
-        centers = self._arena.centers_at(time_us)[self._arena.n_static :]
-        for body, center in zip(self._movers, ned_to_enu(centers), strict=True):
-            self.client.resetBasePositionAndOrientation(body, center, (0.0, 0.0, 0.0, 1.0))
+    def move_obstacles(self, time_us: int, vehicle: Vector) -> None:
+        """Move what moves to where it is `time_us` [µs] after the start of the episode.
 
-    def _add(self, shape: int, center: Vector, yaw: float, name: str) -> int:
-        attitude = quat_ned_frd_to_enu_flu(quat_from_euler(0.0, 0.0, yaw))
+        Far from the vehicle, at (>= 2,) NED [m], bodies may stay behind: nothing can touch them.
+        """
+        if self._movers is not None:
+            self._movers.move(time_us, vehicle, self.number)
+
+    def _add(self, shape: int, center: Vector, attitude: Xyzw, name: str) -> int:
         body = self.client.createMultiBody(
             baseMass=0.0,
             baseCollisionShapeIndex=shape,
             basePosition=ned_to_enu(center),
-            baseOrientation=quat_wxyz_to_xyzw(attitude),
+            baseOrientation=attitude,
+            # A rigid body at rest costs nothing in a step. A multi-body, pybullet's default, goes
+            # through Featherstone's algorithm each time; one that is awake gets a new bounding box.
+            useMaximalCoordinates=True,
         )
+        self.client.changeDynamics(body, -1, activationState=pybullet.ACTIVATION_STATE_SLEEP)
         self.names[body] = name
         return int(body)
 
@@ -74,13 +97,15 @@ class World:
         half_n, half_e = 0.5 * (b.north_max - b.north_min), 0.5 * (b.east_max - b.east_min)
         # Inner faces stand on the bounds. A box's own axes are forward, left, up.
         along_east, along_north = (t, half_e + 2 * t, h), (half_n + 2 * t, t, h)
-        self._add(self._box(along_east), np.array([b.north_max + t, east, -h]), 0.0, "wall-north")
-        self._add(self._box(along_east), np.array([b.north_min - t, east, -h]), 0.0, "wall-south")
-        self._add(self._box(along_north), np.array([north, b.east_max + t, -h]), 0.0, "wall-east")
-        self._add(self._box(along_north), np.array([north, b.east_min - t, -h]), 0.0, "wall-west")
+        self._add(self._box(along_east), np.array([b.north_max + t, east, -h]), LEVEL, "wall-north")
+        self._add(self._box(along_east), np.array([b.north_min - t, east, -h]), LEVEL, "wall-south")
+        self._add(self._box(along_north), np.array([north, b.east_max + t, -h]), LEVEL, "wall-east")
+        self._add(self._box(along_north), np.array([north, b.east_min - t, -h]), LEVEL, "wall-west")
 
-    def _add_obstacles(self, arena: Arena) -> None:
+    def _add_obstacles(self, arena: Arena) -> tuple[list[int], list[Xyzw]]:
+        """Return the obstacles' bodies and attitudes."""
         o = arena.obstacles
+        bodies, attitudes = [], []
         for i in range(len(o)):
             x, y, z = (float(v) for v in o.half_size[i])
             if o.shape[i] == Shape.BOX:
@@ -91,9 +116,8 @@ class World:
                 )
             else:
                 shape = self.client.createCollisionShape(pybullet.GEOM_SPHERE, radius=x)
-            moving = i >= arena.n_static
             kind = Shape(int(o.shape[i])).name.lower()
-            name = f"{'moving' if moving else 'static'}-{kind}-{i}"
-            body = self._add(shape, o.center[i], float(o.yaw[i]), name)
-            if moving:
-                self._movers.append(body)
+            name = f"{'moving' if i >= arena.n_static else 'static'}-{kind}-{i}"
+            attitudes.append(facing(float(o.yaw[i])))
+            bodies.append(self._add(shape, o.center[i], attitudes[i], name))
+        return bodies, attitudes

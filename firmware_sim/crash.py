@@ -1,0 +1,45 @@
+"""Which contact ends a flight."""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.state import Mode
+from firmware_sim.plant.plant import Collision
+from firmware_sim.plant.world import FLOOR
+from firmware_sim.simulation import Simulation
+
+TOUCHDOWN_M_S = 2.0
+"""A slower touch of the floor is a landing: PX4 comes down with 0.7 to 1.5 m/s [m/s]."""
+
+
+def is_crash(hit: Collision, flight: Flight) -> bool:
+    """Return whether a contact ends a flight: all do but what happens on the ground.
+
+    On the way up and down that includes a gentle touch of the floor, in the modes that fly there.
+    """
+    if hit.what != FLOOR:
+        return True
+    gentle = flight.mode not in (Mode.OFFBOARD, Mode.HOLD) and hit.speed_m_s < TOUCHDOWN_M_S
+    return flight.phase is Phase.AIR and not gentle
+
+
+class CrashWatch:
+    """Remembers the first thing that was hit in flight. Looks once a tick, for the flight then."""
+
+    def __init__(self) -> None:
+        self.hit: str | None = None
+        """What was hit; None so far."""
+        self._seen = 0
+
+    def look(self, simulation: Simulation) -> bool:
+        """Take this tick's contacts; True when one of them is the first that ends the flight."""
+        hits = simulation.plant.collisions
+        if len(hits) == self._seen:
+            return False
+        new = hits[self._seen :]
+        self._seen = len(hits)
+        crashes = [hit.what for hit in new if is_crash(hit, simulation.autopilot.flight)]
+        if self.hit is not None or not crashes:
+            return False
+        self.hit = crashes[0]
+        return True

@@ -1,0 +1,138 @@
+"""What happens to the vehicle in one tick, before and after pybullet's step: compiled."""
+
+from __future__ import annotations
+
+from airl_mav.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
+from airl_mav.profiles.vehicle import Battery, Power
+from airl_mav.vehicle.airframe import airframe_of
+from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
+from airl_mav.vehicle.power import coefficients, power_w
+from airl_mav.vehicle.rigid_body import drag_force
+from airl_mav.vehicle.rotation import Quat, Vec, rotate
+from airl_mav.vehicle.rotor import settle, wrench
+from firmware_sim.plant.kinematics import from_bullet, quaternion, rates, velocity
+
+IDLE_POWER_W = 5.0
+"""Avionics on the ground, motors off [W]."""
+
+Speeds = tuple[float, float, float, float]
+"""Of the rotors, as fractions of the speed at full command."""
+
+Supply = tuple[float, float, float, float]
+"""Voltage [V], current [A], charge used [mAh], share of it that is left; as `BatterySample`."""
+
+
+def power_row(power: Power) -> tuple[float, ...]:
+    """Return b1..b9 and the payload [g], for `absorb`."""
+    return (*coefficients(power), power.payload_g)
+
+
+def pack_row(battery: Battery) -> tuple[float, ...]:
+    """Return voltage empty and full [V], resistance [ohm] and capacity [mAh], for `supply`."""
+    cells = battery.cells
+    return (
+        cells * battery.cell_empty_v,
+        cells * battery.cell_full_v,
+        battery.resistance_ohm,
+        battery.capacity_mah,
+    )
+
+
+@kernel
+def actuate(
+    speeds: Speeds, motors: Speeds, row: Vector, wind: Vector, airframe: Vector, left: float
+) -> tuple[Speeds, Vec, Vec, Vec]:
+    """Turn motor commands into what pybullet applies for one tick.
+
+    Args:
+        speeds: Of the rotors.
+        motors: Commands, 0..1.
+        row: (16,) the vehicle's motion.
+        wind: (3,) NED [m/s].
+        airframe: (13,) as `Airframe`.
+        left: Share of a speed error that a tick leaves (`rotor.lag`).
+
+    Returns:
+        Rotor speeds after the tick; in ENU the centre of mass [m], the force without gravity [N]
+        and the torque [N m].
+    """
+    a = airframe_of(airframe)
+    s = (
+        settle(speeds[0], motors[0], a, left),
+        settle(speeds[1], motors[1], a, left),
+        settle(speeds[2], motors[2], a, left),
+        settle(speeds[3], motors[3], a, left),
+    )
+    thrust, torque = wrench(s[0], s[1], s[2], s[3], a)
+    q, w, k = quaternion(row), rates(row), a.drag_angular
+    lift = rotate(q, (0.0, 0.0, -thrust))
+    drag = drag_force(velocity(row), (wind[0], wind[1], wind[2]), a)
+    turn = rotate(q, (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2]))
+    here = (row[1], row[0], -row[2])
+    force = (lift[1] + drag[1], lift[0] + drag[0], -(lift[2] + drag[2]))
+    return s, here, force, (turn[1], turn[0], -turn[2])
+
+
+@kernel
+def supply(power: float, charge: float, pack: Vector) -> Supply:
+    """Return what the battery's monitor reads under a load [W] at a state of charge 0..1."""
+    voltage = terminal_voltage(open_circuit(charge, pack[0], pack[1]), pack[2], power)
+    return voltage, power / voltage, (1.0 - charge) * pack[3], charge
+
+
+@kernel
+def absorb(
+    at: Vec,
+    orientation: Quat,
+    linear: Vec,
+    angular: Vec,
+    before: Vector,
+    row: Vector,
+    wind: Vector,
+    speeds: Speeds,
+    standing: bool,
+    charge: float,
+    airframe: Vector,
+    power: Vector,
+    pack: Vector,
+) -> tuple[float, Supply, float]:
+    """Take in pybullet's state after a tick: the motion, what it took, what is left.
+
+    Args:
+        at: Position ENU [m].
+        orientation: FLU -> ENU, xyzw.
+        linear: Velocity ENU [m/s].
+        angular: Angular velocity ENU [rad/s].
+        before: (16,) the motion before the tick.
+        row: (16,) overwritten with the motion after it.
+        wind: (3,) NED [m/s].
+        speeds: Of the rotors.
+        standing: In touch with something.
+        charge: State of charge before the tick, 0..1.
+        airframe: (13,) as `Airframe`.
+        power: (10,) as `power_row`.
+        pack: (4,) as `pack_row`.
+
+    Returns:
+        Power over the tick [W], what the battery's monitor reads, the state of charge after it.
+    """
+    accel = (
+        (linear[1] - before[3]) / TICK_S,
+        (linear[0] - before[4]) / TICK_S,
+        (-linear[2] - before[5]) / TICK_S,
+    )
+    from_bullet(at, orientation, linear, angular, accel, row)
+    b = power
+    model = (b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8])
+    if standing:
+        # The model is one of flight, and an impact is no electrical load. Standing, rotors take
+        # the induced power of their thrust, P ~ T^1.5 (momentum theory).
+        a = airframe_of(airframe)
+        thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
+        load = IDLE_POWER_W + model[8] * (thrust / (a.mass * GRAVITY_M_S2)) ** 1.5
+    else:
+        load = power_w(velocity(row), accel, (wind[0], wind[1], wind[2]), b[9], model)
+    reading = supply(load, charge, pack)
+    return load, reading, drain(charge, reading[1], pack[3], TICK_S)

@@ -1,0 +1,125 @@
+"""Moving obstacles: where they are, and their pybullet bodies where it matters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.constants import US_PER_S
+from airl_mav.frames import Vector
+from airl_mav.kernels import kernel
+from firmware_sim.plant.bullet import pybullet
+
+MARGIN_M = 0.5
+"""A body is in its place when the vehicle is this much further away than it could touch. pybullet
+looks for contacts before it moves the vehicle, and 2 cm around it: nearly all of this is spare."""
+
+Xyzw = tuple[float, float, float, float]
+"""pybullet's quaternion."""
+
+
+@kernel
+def _due(
+    time_us: int,
+    vehicle: Vector,
+    times_s: Vector,
+    points: Vector,
+    leg: NDArray[np.int64],
+    reach: Vector,
+    place: Vector,
+    due: NDArray[np.int64],
+) -> int:
+    """Find the movers that could touch the vehicle, or whose bodies stand where they could.
+
+    Args:
+        time_us: Since the start of the episode [µs].
+        vehicle: (>= 2,) north, east [m].
+        times_s: (n, 1 + k) period of the tour; then when its way-points are passed [s].
+        points: (n, k, 2) way-points north, east [m].
+        leg: (n,) the way-point passed last; updated.
+        reach: (n,) what could touch is nearer than this, seen from above [m].
+        place: (n, 2) north, east of the bodies [m]; updated for those that are due.
+        due: (n,) overwritten with the numbers of those that are due.
+
+    Returns:
+        How many are due.
+    """
+    count = 0
+    for i in range(len(leg)):
+        t = (time_us / US_PER_S) % times_s[i, 0]
+        passed = times_s[i, 1:]
+        k = leg[i] if passed[leg[i]] <= t else 0
+        while passed[k + 1] <= t:
+            k += 1
+        leg[i] = k
+        # The order of numpy.interp, so that body and picture agree to the last bit.
+        a, b, step = points[i, k], points[i, k + 1], passed[k + 1] - passed[k]
+        north = (b[0] - a[0]) / step * (t - passed[k]) + a[0]
+        east = (b[1] - a[1]) / step * (t - passed[k]) + a[1]
+        north_off, east_off = north - vehicle[0], east - vehicle[1]
+        north_stands, east_stands = place[i, 0] - vehicle[0], place[i, 1] - vehicle[1]
+        away = min(
+            north_off * north_off + east_off * east_off,
+            north_stands * north_stands + east_stands * east_stands,
+        )
+        if away < reach[i] * reach[i]:
+            place[i, 0], place[i, 1] = north, east
+            due[count] = i
+            count += 1
+    return count
+
+
+class Movers:
+    """The moving obstacles of one arena.
+
+    pybullet gets a body's place only where that can matter, near the vehicle: thirty bodies moved
+    at every tick would cost as much as all the rest of the plant.
+    """
+
+    def __init__(
+        self, arena: Arena, bodies: Sequence[int], attitudes: Sequence[Xyzw], radius_m: float
+    ) -> None:
+        """Take the bodies, which stand where the arena has them at time 0.
+
+        Args:
+            arena: Tours and sizes.
+            bodies: pybullet's numbers of its moving obstacles, in the arena's order.
+            attitudes: Of the bodies, FLU -> ENU.
+            radius_m: No part of the vehicle is further from its centre than this [m].
+        """
+        obstacles, first = arena.obstacles, arena.n_static
+        n, k = len(bodies), max((len(tour.times_s) for tour in arena.tours), default=1)
+        self._bodies, self._attitudes = list(bodies), list(attitudes)
+        self._times_s = np.full((n, 1 + k), np.inf)
+        self._points = np.zeros((n, k, 2))
+        for i, tour in enumerate(arena.tours):
+            self._times_s[i, 0] = tour.times_s[-1]
+            self._times_s[i, 1 : 1 + len(tour.times_s)] = tour.times_s
+            self._points[i, : len(tour.points)] = tour.points
+        half = obstacles.half_size[first:]
+        is_box = obstacles.shape[first:] == Shape.BOX
+        bounding = np.where(is_box, np.hypot(half[:, 0], half[:, 1]), half[:, 0])
+        self._reach = bounding + radius_m + MARGIN_M
+        self._place = np.ascontiguousarray(obstacles.center[first:, :2])
+        self._up: list[float] = (-obstacles.center[first:, 2]).tolist()
+        self._leg = np.zeros(n, np.int64)
+        self._due = np.zeros(n, np.int64)
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._bodies)
+
+    def move(self, time_us: int, vehicle: Vector, client: int) -> None:
+        """Put bodies in place, `time_us` [µs] after the start, for a vehicle at (>= 2,) NED [m]."""
+        due, place = self._due, self._place
+        count = _due(
+            time_us, vehicle, self._times_s, self._points, self._leg, self._reach, place, due
+        )
+        for i in due[:count].tolist() if count else ():
+            north, east = place[i].tolist()
+            pybullet.resetBasePositionAndOrientation(
+                self._bodies[i], (east, north, self._up[i]), self._attitudes[i], client
+            )
