@@ -15,6 +15,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _KERNEL_SOURCES = (
     "airl_mav/constants.py",
+    "airl_mav/frames.py",
     "airl_mav/kernels.py",
     "airl_mav/arena",
     "airl_mav/camera",
@@ -22,6 +23,7 @@ _KERNEL_SOURCES = (
     "airl_mav/envs",
     "airl_mav/vehicle",
     "firmware_sim/autopilot",
+    "firmware_sim/mavlink/streams",
     "firmware_sim/plant",
 )
 """Where kernels, and the constants that are compiled into them, come from."""

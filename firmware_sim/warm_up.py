@@ -11,6 +11,9 @@ from airl_mav.clock import SimClock
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
@@ -24,9 +27,12 @@ def warm_up(vehicle: VehicleProfile) -> None:
     arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
     setup = EpisodeSetup(vehicle, arena, 0, WindSettings())
     simulation = Simulation(setup, start_us=0, clock=SimClock())
+    links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
+    server = MavlinkServer(links, simulation.autopilot, boot_unix_us=0)
     try:
         for _ in range(TICKS):
             simulation.tick()
+            server.send(simulation.time_us)
             simulation.capture_due(lambda _frame: None)
             if simulation.autopilot.arm(force=False) == 0:
                 simulation.autopilot.takeoff(2.0)

@@ -26,7 +26,7 @@ from firmware_sim.autopilot.state import (
     Severity,
     Vector,
 )
-from firmware_sim.interfaces import BatterySample, GpsFix
+from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -113,6 +113,10 @@ class KinematicAutopilot:
         self._target_height = 0.0
 
     # --- the port ---
+
+    @property
+    def sample(self) -> SensorSample:
+        return SensorSample(self.time_us, self.accel, self.gyro, 25.31, self.battery)
 
     def take_messages(self) -> list[Message]:
         taken, self.messages = self.messages, []

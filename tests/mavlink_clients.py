@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -188,6 +188,10 @@ class RawLane(MemoryEndpoint):
         self.sent[int.from_bytes(data[7:10], "little")] += 1
         if self.mavsdk is not None:
             self.mavsdk.pass_received_raw_bytes(data)
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        for frame in frames:
+            self.send(frame)
 
 
 class Companion:

@@ -188,6 +188,14 @@ def test_an_address_of_another_machine_cannot_be_bound(endpoints: list[UdpEndpoi
         endpoint(endpoints, None, local=("192.0.2.1", 0), insecure=True)
 
 
+def test_telemetry_goes_frame_by_frame(
+    sockets: list[socket.socket], endpoints: list[UdpEndpoint]
+) -> None:
+    companion = client(sockets)
+    endpoint(endpoints, companion.getsockname()).send_streams([b"\xfd 1", b"\xfd 2"])
+    assert [companion.recv(9) for _ in range(2)] == [b"\xfd 1", b"\xfd 2"]
+
+
 def test_memory_endpoint_is_two_queues() -> None:
     memory = MemoryEndpoint()
     memory.inbox.extend([b"a", b"b"])
@@ -195,6 +203,7 @@ def test_memory_endpoint_is_two_queues() -> None:
     assert memory.receive() == []
     memory.send(b"c")
     memory.send(b"d")
-    assert memory.take() == [b"c", b"d"]
+    memory.send_streams([b"e", b"f"])
+    assert memory.take() == [b"c", b"d", b"e", b"f"]
     assert memory.take() == []
     assert memory.fileno() is None

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.constants import EARTH_RADIUS_M, TICK_US, US_PER_S
-from firmware_sim.autopilot.state import Arming, Landed, Mode, Setpoint
+from firmware_sim.autopilot.state import Arming, AutopilotState, Landed, Mode, Setpoint
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.modes import base_mode, custom_mode, requested_mode, system_status
 from firmware_sim.mavlink.scheduler import OFF, StreamScheduler
@@ -469,14 +469,19 @@ def test_a_diverged_estimate_silences_no_heartbeat(bad: float) -> None:
     client = RawClient(bench.onboard)
     autopilot.arming = Arming.ARMED
     autopilot.mode = Mode.HOLD
-    state = autopilot.state()
-    for field in (state.estimate.position, state.estimate.velocity, state.accel, state.gyro):
-        field[:] = bad
-    autopilot.state = lambda: state  # type: ignore[method-assign]
-    for _ in range(500):
-        bench.server.receive(state.time_us)
-        state.time_us += TICK_US
-        bench.server.send(state.time_us)
+    autopilot.frozen = True
+    sane = autopilot.state
+
+    def diverged() -> AutopilotState:
+        for name in ("position", "velocity", "accel", "gyro"):
+            setattr(autopilot, name, np.zeros(3))
+        state = sane()
+        for field in (state.estimate.position, state.estimate.velocity, state.accel, state.gyro):
+            field[:] = bad
+        return state
+
+    autopilot.state = diverged  # type: ignore[method-assign]
+    bench.run(2.0)
     counts = client.count()
     assert counts["HEARTBEAT"] == 2
     assert counts["SYS_STATUS"] == 10

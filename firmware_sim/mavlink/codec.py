@@ -1,24 +1,36 @@
 """The MAVLink 2 codec: the only module that touches pymavlink.
 
 Of pymavlink only the generated `common` dialect is used: message classes, constants and the
-decoder of one whole frame. Framing is done here, because pymavlink's own parser throws away
-everything that a damaged header claims as its payload, and waits for it to arrive.
+decoder of one whole frame. Framing is done here. Received: because pymavlink's own parser throws
+away everything that a damaged header claims as its payload, and waits for it to arrive. Streamed:
+because making and packing a message object costs several times as much as `Layout` and
+`Encoder.frame`, which read from pymavlink's classes what a message looks like.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
+import re
 import struct
+from collections.abc import Callable, Iterable, Sequence
+from itertools import accumulate
+from operator import itemgetter
 from typing import TypeAlias
 
 from pymavlink.dialects.v20 import common as dialect
+from pymavlink.generator import mavcrc
 
 __all__ = [
     "COMPONENT_ID",
     "SYSTEM_ID",
     "Decoder",
     "Encoder",
+    "Layout",
+    "Values",
     "WireMessage",
     "dialect",
+    "layout",
     "message_id",
     "param_value",
     "payload",
@@ -26,6 +38,10 @@ __all__ = [
 
 WireMessage: TypeAlias = dialect.MAVLink_message
 """A decoded message, or one to be packed."""
+
+Values: TypeAlias = Sequence[float]
+"""The fields of a message in the order of common.xml, ints where a field is one. Arrays are
+unrolled; extension fields (the last ones) may be left out and are zero then."""
 
 SYSTEM_ID = 1
 """MAVLink system id of the vehicle (PX4's MAV_SYS_ID default)."""
@@ -36,6 +52,16 @@ _MARKER_V1, _MARKER_V2 = 0xFE, 0xFD
 _HEADER_V1, _HEADER_V2 = 6, 10
 _CHECKSUM, _SIGNATURE = 2, 13
 _FLAG_SIGNED = 0x01
+
+_MARK_V2 = bytes([_MARKER_V2])
+_HEADER_PACK = struct.Struct("<BBBB2s3s").pack
+"""The MAVLink 2 header behind its marker: length, flags (two), sequence, sender, message id."""
+
+_FIELD_FORMAT = re.compile(r"\d*[a-zA-Z]")
+"""One field in a struct format: 21f, 50s, B."""
+
+_Sort: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+_Packer: TypeAlias = tuple[_Sort | None, Callable[..., bytes]]
 
 _PARAM_VALUE = struct.Struct("<4sHH16sB")
 
@@ -86,20 +112,90 @@ def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> Wir
     return message
 
 
+class Layout:
+    """How one message lies on the wire, read from pymavlink's class of it."""
+
+    def __init__(self, kind: type[WireMessage]) -> None:
+        self.id_bytes: bytes = kind.id.to_bytes(3, "little")
+        self.crc_extra = bytes([kind.crc_extra])
+        names = kind.ordered_fieldnames
+        formats = dict(zip(names, _FIELD_FORMAT.findall(kind.unpacker.format), strict=True))
+        sizes = dict(zip(names, kind.lengths, strict=True))
+        firsts = dict(zip(kind.fieldnames, _starts(sizes[n] for n in kind.fieldnames), strict=True))
+        self._packers: dict[int, _Packer] = {}
+        # Extension fields come last on the wire too: without them a payload is a shorter one.
+        for end in range(len(names) - len(_extension_fields(kind)), len(names) + 1):
+            slots = [firsts[n] + i for n in names[:end] for i in range(sizes[n])]
+            pack = struct.Struct("<" + "".join(formats[n] for n in names[:end])).pack
+            # Many messages are defined in the order of the wire: nothing to sort there.
+            in_order = slots == sorted(slots)
+            self._packers[len(slots)] = (None if in_order else itemgetter(*slots), pack)
+
+    def payload(self, values: Values) -> bytes:
+        """Return the payload without its trailing zeros, which MAVLink 2 does not send.
+
+        Raises struct.error or OverflowError when a value does not fit its field.
+        """
+        try:
+            sort, pack = self._packers[len(values)]
+        except KeyError:
+            counts = sorted(self._packers)
+            raise struct.error(f"{len(values)} values, expected {counts}") from None
+        packed = pack(*values) if sort is None else pack(*sort(values))
+        return packed.rstrip(b"\0") or b"\0"
+
+
+@functools.cache
+def layout(name: str) -> Layout:
+    """Return the layout of a message such as "ATTITUDE". Raises AttributeError when unknown."""
+    return Layout(dialect.mavlink_map[message_id(name)])
+
+
+def _x25(data: bytes) -> int:
+    crc: int = mavcrc.x25crc(data).crc
+    return crc
+
+
+# CRC-16/MCRF4XX. pymavlink's x25crc is a class around fastcrc's function (which a platform may
+# lack): making its object would cost more than the checksum.
+_checksum: Callable[[bytes], int] = _x25 if mavcrc.mcrf4xx is None else mavcrc.mcrf4xx
+
+
+def _starts(sizes: Iterable[int]) -> list[int]:
+    """Return where each of some consecutive runs of the given sizes begins."""
+    return [0, *accumulate(sizes)][:-1]
+
+
+def _extension_fields(kind: type[WireMessage]) -> list[str]:
+    """Return the extension fields: pymavlink gives them, and only them, a default."""
+    parameters = inspect.signature(kind).parameters.values()
+    return [p.name for p in parameters if p.default is not inspect.Parameter.empty]
+
+
 class Encoder:
     """Packs the messages of one link: the vehicle's ids and the link's own sequence numbers."""
 
     def __init__(self, system_id: int = SYSTEM_ID, component_id: int = COMPONENT_ID) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._seq = 0
+        self._ids = bytes([system_id, component_id])
 
     def pack(self, message: WireMessage) -> bytes:
         """Return the frame of a message.
 
         Raises struct.error or OverflowError when a field does not fit its type.
         """
+        self._mav.seq = self._seq
         frame: bytes = message.pack(self._mav)
-        self._mav.seq = (self._mav.seq + 1) & 0xFF
+        self._seq = (self._seq + 1) & 0xFF
         return frame
+
+    def frame(self, layout: Layout, payload: bytes) -> bytes:
+        """Return the frame around a payload of that layout: what `pack` makes of the message."""
+        seq = self._seq
+        self._seq = (seq + 1) & 0xFF
+        covered = _HEADER_PACK(len(payload), 0, 0, seq, self._ids, layout.id_bytes) + payload
+        return _MARK_V2 + covered + _checksum(covered + layout.crc_extra).to_bytes(2, "little")
 
 
 class Decoder:

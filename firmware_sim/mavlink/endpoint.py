@@ -6,6 +6,7 @@ import errno
 import ipaddress
 import socket
 from collections import deque
+from collections.abc import Sequence
 from typing import Protocol
 
 from airl_mav.errors import UsageError
@@ -35,7 +36,11 @@ class Endpoint(Protocol):
         ...
 
     def send(self, data: bytes) -> None:
-        """Send one frame."""
+        """Send one frame: an answer, now."""
+        ...
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send the telemetry of one tick, one frame after the other."""
         ...
 
     def fileno(self) -> int | None:
@@ -61,17 +66,25 @@ class MemoryEndpoint:
 
     def receive(self) -> list[bytes]:
         """Return all chunks put into `inbox`, oldest first."""
-        chunks = []
-        while self.inbox:
-            chunks.append(self.inbox.popleft())
+        chunks: list[bytes] = []
+        inbox = self.inbox
+        while inbox:  # one by one: another thread may be appending
+            chunks.append(inbox.popleft())
         return chunks
 
     def send(self, data: bytes) -> None:
         """Append one frame to `outbox`."""
         self.outbox.append(data)
 
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Append frames to `outbox`."""
+        self.outbox.extend(frames)
+
     def take(self) -> list[bytes]:
-        """Return and forget all frames sent so far, oldest first."""
+        """Return and forget all frames sent so far, oldest first; `b"".join` makes them one chunk.
+
+        Who has to tell answers from telemetry overrides `send` and `send_streams`.
+        """
         frames = list(self.outbox)
         self.outbox.clear()
         return frames
@@ -159,6 +172,11 @@ class UdpEndpoint:
                 self._socket.sendto(data, address)
             except OSError:
                 self.send_errors += 1
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send each frame as a datagram of its own."""
+        for frame in frames:
+            self.send(frame)
 
     def fileno(self) -> int | None:
         """Return the socket's descriptor, None once closed."""

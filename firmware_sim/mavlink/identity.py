@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.codec import Values, dialect
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -27,21 +27,21 @@ CUSTOM_VERSION = b"airl-mav"
 UID = 0x4149_524C_4D41_5601
 """Constant hardware id: every emulated vehicle is the same piece of hardware."""
 
-_ZEROS_8 = (0,) * 8
 
-
-def autopilot_version(state: AutopilotState) -> WireMessage:  # noqa: ARG001 - a stream builder
+def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a stream builder
     """Return AUTOPILOT_VERSION."""
-    return dialect.MAVLink_autopilot_version_message(
+    os_version = vendor = product = 0
+    middleware_custom_version = os_custom_version = (0,) * 8
+    return (
         CAPABILITIES,
         FIRMWARE_VERSION,
         FIRMWARE_VERSION,
-        0,
+        os_version,
         BOARD_VERSION,
-        tuple(CUSTOM_VERSION),
-        _ZEROS_8,
-        _ZEROS_8,
-        0,
-        0,
+        *CUSTOM_VERSION,
+        *middleware_custom_version,
+        *os_custom_version,
+        vendor,
+        product,
         UID,
     )

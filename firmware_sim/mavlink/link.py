@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage
+from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMessage, layout
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.rates import GCS_HZ, ONBOARD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
+
+Payloads = dict[Builder, "bytes | None"]
+"""What has been built and packed in one tick, for all links together: None = nothing to say, empty
+= the values do not fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,16 +26,20 @@ class LinkConfig:
     endpoint: Endpoint
     rates_hz: Mapping[str, float]
     """Default rate per stream [Hz]; streams not named are off."""
+    separate_replies: bool = False
+    """Whether answers to requests count their own sequence numbers, so that the bytes of the
+    telemetry do not depend on when somebody asked for something. Only for a link whose other end
+    does not take a jump in the sequence for lost messages."""
 
 
-def onboard_link(endpoint: Endpoint) -> LinkConfig:
+def onboard_link(endpoint: Endpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the link for the companion (PX4: 14580 -> 14540)."""
-    return LinkConfig("onboard", endpoint, ONBOARD_HZ)
+    return LinkConfig("onboard", endpoint, ONBOARD_HZ, separate_replies)
 
 
-def gcs_link(endpoint: Endpoint) -> LinkConfig:
+def gcs_link(endpoint: Endpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the link for a ground station (PX4: 18570 -> 14550)."""
-    return LinkConfig("gcs", endpoint, GCS_HZ)
+    return LinkConfig("gcs", endpoint, GCS_HZ, separate_replies)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +60,26 @@ class LinkCounters:
 
 
 class Link:
-    """Receives and sends the messages of one endpoint."""
+    """Receives and sends the messages of one endpoint.
 
-    def __init__(self, config: LinkConfig, builders: Mapping[str, Builder]) -> None:
+    Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) goes one lane, answers
+    to requests (`send`, `send_stream`) go the other. Both share one sequence, in the order of
+    sending, unless `LinkConfig.separate_replies` parts them.
+    """
+
+    def __init__(
+        self,
+        config: LinkConfig,
+        builders: Mapping[str, Builder],
+        replies: Mapping[str, Builder] | None = None,
+    ) -> None:
+        """Open the link.
+
+        Args:
+            config: What it is made of.
+            builders: What can be streamed.
+            replies: Builds the same messages when they are asked for; None = the same builders.
+        """
         self.name = config.name
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
@@ -65,8 +90,13 @@ class Link:
         """Is given every frame of both directions."""
         self.ignored = 0
         self._endpoint = config.endpoint
-        self._encoder = Encoder()
+        self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
+        self._replies = builders if replies is None else replies
+        self._stream_encoder = Encoder()
+        self._reply_encoder = Encoder() if config.separate_replies else self._stream_encoder
         self._decoder = Decoder(datagrams=config.endpoint.datagrams)
+        self._pending: list[bytes] = []
+        """This tick's telemetry."""
         self._rx = 0
         self._tx = 0
         self._unsendable = 0
@@ -85,7 +115,10 @@ class Link:
     def receive(self) -> list[WireMessage]:
         """Return the messages that have arrived, oldest first."""
         messages: list[WireMessage] = []
-        for chunk in self._endpoint.receive():
+        chunks = self._endpoint.receive()
+        if not chunks:
+            return messages
+        for chunk in chunks:
             messages += self._decoder.feed(chunk)
         self._rx += len(messages)
         if self.tap is not None:
@@ -93,25 +126,79 @@ class Link:
                 self.tap(bytes(message.get_msgbuf()))
         return messages
 
+    # --- answers
+
     def send(self, message: WireMessage) -> None:
         """Send a message; one whose values do not fit their fields is dropped and counted."""
-        try:
-            frame = self._encoder.pack(message)
-        except (struct.error, OverflowError):
+        frame = self._packed(self._reply_encoder, message)
+        if frame is not None:
+            self._reply(frame)
+
+    def send_stream(self, name: str, state: AutopilotState) -> bool:
+        """Send one of the streamed messages now; tell whether there was something to say."""
+        payload = _payload(layout(name), self._replies[name](state))
+        if payload is None:
+            return False
+        if payload:
+            self._reply(self._reply_encoder.frame(layout(name), payload))
+        else:
             self._unsendable += 1
-            return
+        return True
+
+    def _reply(self, frame: bytes) -> None:
+        if self._reply_encoder is self._stream_encoder:
+            self.flush()  # frames leave in the order of their sequence numbers
         self._endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
             self.tap(frame)
 
-    def send_stream(self, name: str, state: AutopilotState) -> bool:
-        """Build and send one streamed message; tell whether there was something to say."""
-        message = self.builders[name](state)
-        if message is None:
-            return False
-        self.send(message)
-        return True
+    # --- telemetry
+
+    def stream(self, message: WireMessage) -> None:
+        """Add a message to this tick's telemetry; as `send` when its values do not fit."""
+        frame = self._packed(self._stream_encoder, message)
+        if frame is not None:
+            self._pending.append(frame)
+
+    def stream_due(self, names: Iterable[str], state: AutopilotState, payloads: Payloads) -> None:
+        """Add streams to this tick's telemetry; as `send` when their values do not fit.
+
+        Args:
+            names: The streams.
+            state: The snapshot of this tick.
+            payloads: What has been built from it so far; gets what is built here.
+        """
+        frames, encoder = self._pending, self._stream_encoder
+        for name in names:
+            shape, builder = self._streams[name]
+            if builder in payloads:
+                payload = payloads[builder]
+            else:
+                payload = payloads[builder] = _payload(shape, builder(state))
+            if payload:
+                frames.append(encoder.frame(shape, payload))
+            elif payload is not None:
+                self._unsendable += 1
+
+    def flush(self) -> None:
+        """Send the telemetry that has been added."""
+        frames = self._pending
+        if not frames:
+            return
+        self._pending = []
+        self._endpoint.send_streams(frames)
+        self._tx += len(frames)
+        if self.tap is not None:
+            for frame in frames:
+                self.tap(frame)
+
+    def _packed(self, encoder: Encoder, message: WireMessage) -> bytes | None:
+        try:
+            return encoder.pack(message)
+        except (struct.error, OverflowError):
+            self._unsendable += 1
+            return None
 
     def fileno(self) -> int | None:
         """Return the endpoint's descriptor, None when there is none."""
@@ -120,3 +207,13 @@ class Link:
     def close(self) -> None:
         """Close the endpoint."""
         self._endpoint.close()
+
+
+def _payload(shape: Layout, values: Values | None) -> bytes | None:
+    """Return the payload, empty when the values do not fit, None when there are none."""
+    if values is None:
+        return None
+    try:
+        return shape.payload(values)
+    except (struct.error, OverflowError):
+        return b""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Mapping, Sequence
+from heapq import heapify, heapreplace
 
 from airl_mav.constants import TICK_US
 
 OFF = 0
 """Interval of a stream that is not sent."""
+
+_INDEX_BITS = 8
+_INDEX_MASK = (1 << _INDEX_BITS) - 1
 
 
 class StreamScheduler:
@@ -31,7 +34,8 @@ class StreamScheduler:
         self._index = {name: i for i, name in enumerate(self._names)}
         self._default = [default_us.get(name, OFF) for name in self._names]
         self._interval = list(self._default)
-        self._heap: list[tuple[int, int]] = []
+        self._heap: list[int] = []
+        """Due time and index of each stream that is on, in one number: quicker to compare."""
         self._rebase_pending = False
         self._rebase(0)
 
@@ -55,10 +59,10 @@ class StreamScheduler:
         if interval_us == self._interval[index]:
             return
         self._interval[index] = interval_us
-        self._heap = [entry for entry in self._heap if entry[1] != index]
+        self._heap = [entry for entry in self._heap if entry & _INDEX_MASK != index]
         if interval_us != OFF:
-            self._heap.append((now_us, index))
-        heapq.heapify(self._heap)
+            self._heap.append(now_us << _INDEX_BITS | index)
+        heapify(self._heap)
 
     def restart(self) -> None:
         """Keep the intervals, take the time base from the next `due` call (it may have jumped)."""
@@ -70,21 +74,23 @@ class StreamScheduler:
             self._rebase(now_us)
         heap = self._heap
         names: list[str] = []
-        while heap and heap[0][0] <= now_us:
-            due_us, index = heap[0]
+        horizon = now_us + 1 << _INDEX_BITS
+        while heap and (entry := heap[0]) < horizon:
+            index = entry & _INDEX_MASK
             interval = self._interval[index]
+            due_us = entry >> _INDEX_BITS
             next_us = due_us + interval
             if next_us <= now_us:
                 next_us = now_us + interval - (now_us - due_us) % interval
-            heapq.heapreplace(heap, (next_us, index))
+            heapreplace(heap, next_us << _INDEX_BITS | index)
             names.append(self._names[index])
         return names
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
         self._heap = [
-            (now_us + index * TICK_US % interval, index)
+            now_us + index * TICK_US % interval << _INDEX_BITS | index
             for index, interval in enumerate(self._interval)
             if interval != OFF
         ]
-        heapq.heapify(self._heap)
+        heapify(self._heap)

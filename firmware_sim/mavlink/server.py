@@ -8,8 +8,8 @@ from airl_mav.frames import Geodetic
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.autopilot.state import AutopilotState, Message
 from firmware_sim.mavlink import identity
-from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
-from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
+from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.services import (
     commands,
     data_streams,
@@ -25,7 +25,7 @@ from firmware_sim.mavlink.services.params import ParameterService
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
-from firmware_sim.mavlink.texts import TextEncoder
+from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
 
 _STATELESS: dict[str, Handler] = {
@@ -47,12 +47,13 @@ _DISCARD_CALLS = 4
 class _Session:
     """One link and what is remembered about it."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link, *, separate_replies: bool) -> None:
         self.link = link
         self.context: Context | None = None
         """None while there is no autopilot."""
         self.parameters = ParameterService()
         self.texts = TextEncoder()
+        self.reply_texts = TextEncoder(REPLY_IDS) if separate_replies else self.texts
         self.handlers = _STATELESS | self.parameters.handlers
         self.announced_origin: Geodetic | None = None
 
@@ -75,11 +76,19 @@ class MavlinkServer:
             port: The autopilot, None = not yet.
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
         """
-        self._boot_unix_us = boot_unix_us
         self._port: AutopilotPort | None = None
         self._now_us = 0
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        # The same functions on every link: what two links send in one tick is built once.
+        self._builders: dict[str, Builder] = {
+            **BUILDERS,
+            "AUTOPILOT_VERSION": identity.autopilot_version,
+            "SYSTEM_TIME": system_time(boot_unix_us),
+            "VIBRATION": lambda state: self._vibration.message(state),
+            "BATTERY_STATUS": self._battery_status,
+            "TIMESYNC": timesync.request,
+        }
         self._sessions = [self._open(config) for config in links]
         if port is not None:
             self.attach(port)
@@ -87,13 +96,12 @@ class MavlinkServer:
     def attach(self, port: AutopilotPort) -> None:
         """Exchange the autopilot, between two episodes.
 
-        Rates that clients have set stay; unsent texts, running parameter lists and what arrived
-        for the old autopilot (stale setpoints) go. Simulated time may start anew.
+        Rates that clients have set stay; running parameter lists and what arrived for the old
+        autopilot (stale setpoints) go. Simulated time may start anew.
         """
         if self._port is not None:
             self._discard_received()
         self._port = port
-        self._texts.clear()
         self._vibration = VibrationMeter()
         for session in self._sessions:
             session.context = Context(
@@ -117,6 +125,8 @@ class MavlinkServer:
                     effective += 1
                 else:
                     session.link.ignored += 1
+        if self._texts:
+            self._send_texts()
         return effective
 
     def send(self, now_us: int) -> None:
@@ -129,21 +139,29 @@ class MavlinkServer:
         port = self._port
         if port is None:
             return
-        state = port.state()
-        self._vibration.update(state)
-        texts = [*self._texts, *port.take_messages()]
-        self._texts.clear()
+        sample = port.sample
+        if sample is not None:
+            self._vibration.update(sample)
+        texts = port.take_messages()
+        state: AutopilotState | None = None
+        payloads: Payloads = {}
         for session in self._sessions:
             link = session.link
             for text in texts:
                 for chunk in session.texts.encode(text):
-                    link.send(chunk)
-            if state.origin is not None and state.origin != session.announced_origin:
-                session.announced_origin = state.origin
-                link.send_stream("GPS_GLOBAL_ORIGIN", state)
+                    link.stream(chunk)
+            due = link.scheduler.due(now_us)
+            if due or session.announced_origin is None:
+                # Not in every tick: the snapshot costs more than asking the schedulers.
+                if state is None:
+                    state = port.state()
+                if state.origin is not None and state.origin != session.announced_origin:
+                    session.announced_origin = state.origin
+                    link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
             session.parameters.send_pending(link, port.parameters)
-            for name in link.scheduler.due(now_us):
-                link.send_stream(name, state)
+            if state is not None:
+                link.stream_due(due, state, payloads)
+            link.flush()
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
         """Write both directions of a link to a tlog from now on; None ends it.
@@ -168,16 +186,13 @@ class MavlinkServer:
             session.link.close()
 
     def _open(self, config: LinkConfig) -> _Session:
-        builders: dict[str, Builder] = {
-            **BUILDERS,
-            "AUTOPILOT_VERSION": identity.autopilot_version,
-            "SYSTEM_TIME": system_time(self._boot_unix_us),
-            "VIBRATION": lambda state: self._vibration.message(state),
-            "BATTERY_STATUS": self._battery_status,
-            "TIMESYNC": timesync.request,
-            "PING": ping.PingRequests().message,
-        }
-        return _Session(Link(config, builders))
+        builders = self._link_builders()
+        # A PING that somebody asks for must not count in those that are streamed.
+        replies = self._link_builders() if config.separate_replies else builders
+        return _Session(Link(config, builders, replies), separate_replies=config.separate_replies)
+
+    def _link_builders(self) -> dict[str, Builder]:
+        return {**self._builders, "PING": ping.PingRequests().message}
 
     def _dispatch(self, session: _Session, message: WireMessage) -> bool:
         if (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, COMPONENT_ID):
@@ -193,11 +208,19 @@ class MavlinkServer:
             for _ in range(_DISCARD_CALLS):
                 session.link.ignored += len(session.link.receive())
 
+    def _send_texts(self) -> None:
+        """Send what the services have to say to the operators."""
+        for session in self._sessions:
+            for text in self._texts:
+                for chunk in session.reply_texts.encode(text):
+                    session.link.send(chunk)
+        self._texts.clear()
+
     def _broadcast(self, message: WireMessage) -> None:
         for session in self._sessions:
             session.link.send(message)
 
-    def _battery_status(self, state: AutopilotState) -> WireMessage | None:
+    def _battery_status(self, state: AutopilotState) -> Values | None:
         if self._port is None:
             return None
         charge = sensors.charge_state(state.battery.remaining, self._port.parameters)

@@ -8,12 +8,17 @@ from firmware_sim.mavlink.codec import WireMessage, dialect
 CHUNK_BYTES = 50
 _LAST_ID = 65_535
 
+REPLY_IDS = 32_768
+"""Where the ids of answers begin that are counted apart from the autopilot's texts: two long texts
+in a row must differ in them."""
+
 
 class TextEncoder:
     """Turns texts into STATUSTEXT messages, with the ids that tie the chunks together."""
 
-    def __init__(self) -> None:
-        self._id = 0
+    def __init__(self, last_id: int = 0) -> None:
+        """Give the first long text the id after `last_id`."""
+        self._id = last_id
 
     def encode(self, message: Message) -> list[WireMessage]:
         """Return the messages of one text, in order.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, Context, Handler, sender
 
 
@@ -26,8 +26,8 @@ class PingRequests:
     def __init__(self) -> None:
         self._sequence = 0
 
-    def message(self, state: AutopilotState) -> WireMessage:
+    def message(self, state: AutopilotState) -> Values:
         """Return the next request."""
-        request = dialect.MAVLink_ping_message(state.time_us, self._sequence, ANY, ANY)
-        self._sequence = (self._sequence + 1) & 0xFFFF_FFFF
-        return request
+        sequence = self._sequence
+        self._sequence = (sequence + 1) & 0xFFFF_FFFF
+        return state.time_us, sequence, ANY, ANY

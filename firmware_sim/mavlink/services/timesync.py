@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from airl_mav.clock import NS_PER_US
 from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context, Handler
 
 
@@ -19,6 +19,7 @@ def handle_timesync(message: WireMessage, context: Context) -> bool:
 HANDLERS: dict[str, Handler] = {"TIMESYNC": handle_timesync}
 
 
-def request(state: AutopilotState) -> WireMessage:
+def request(state: AutopilotState) -> Values:
     """Return our own request, a stream on the onboard link."""
-    return dialect.MAVLink_timesync_message(0, state.time_us * NS_PER_US)
+    tc1 = 0
+    return tc1, state.time_us * NS_PER_US

@@ -10,11 +10,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage
+from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import attitude, position, sensors, status
 
-Builder = Callable[[AutopilotState], "WireMessage | None"]
-"""Builds one message from a snapshot; None = there is nothing to say yet."""
+Builder = Callable[[AutopilotState], "Values | None"]
+"""Returns one message's fields, in the order of its definition, from a snapshot; None = there is
+nothing to say yet. Plain values, because message objects would cost more than all the rest."""
 
 BUILDERS: Mapping[str, Builder] = MappingProxyType(
     {

@@ -2,42 +2,48 @@
 
 from __future__ import annotations
 
-from airl_mav.frames import quat_to_euler
-from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+import math
+
+from airl_mav.kernels import kernel
+from airl_mav.vehicle.rotation import yaw_of
+from firmware_sim.autopilot.state import AutopilotState, Vector
+from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams.units import boot_ms
 
 _NO_ROTATION_OFFSET = (0.0, 0.0, 0.0, 0.0)
 """PX4 saves bytes: zeros mean the identity (tailsitters alone differ)."""
 
 
-def attitude(state: AutopilotState) -> WireMessage:
+def attitude(state: AutopilotState) -> Values:
     """Euler angles [rad] and body rates [rad/s]."""
     estimate = state.estimate
-    return dialect.MAVLink_attitude_message(
-        boot_ms(estimate.time_us),
-        *quat_to_euler(estimate.quaternion),
-        *estimate.angular_velocity.tolist(),
-    )
+    roll, pitch, yaw = _euler(estimate.quaternion)
+    rollspeed, pitchspeed, yawspeed = estimate.angular_velocity.tolist()
+    return boot_ms(estimate.time_us), roll, pitch, yaw, rollspeed, pitchspeed, yawspeed
 
 
-def attitude_quaternion(state: AutopilotState) -> WireMessage:
+def attitude_quaternion(state: AutopilotState) -> Values:
     """Quaternion w, x, y, z (body FRD -> NED) and body rates [rad/s]."""
     estimate = state.estimate
-    return dialect.MAVLink_attitude_quaternion_message(
-        boot_ms(estimate.time_us),
-        *estimate.quaternion.tolist(),
-        *estimate.angular_velocity.tolist(),
-        _NO_ROTATION_OFFSET,
-    )
+    w, x, y, z = estimate.quaternion.tolist()
+    rollspeed, pitchspeed, yawspeed = estimate.angular_velocity.tolist()
+    time_boot_ms = boot_ms(estimate.time_us)
+    return time_boot_ms, w, x, y, z, rollspeed, pitchspeed, yawspeed, *_NO_ROTATION_OFFSET
 
 
-def attitude_target(state: AutopilotState) -> WireMessage:
+def attitude_target(state: AutopilotState) -> Values:
     """What the attitude and rate controllers track; collective thrust 0..1."""
-    return dialect.MAVLink_attitude_target_message(
-        boot_ms(state.time_us),
-        0,
-        state.attitude_setpoint.tolist(),
-        *state.rate_setpoint.tolist(),
-        state.thrust_setpoint,
-    )
+    type_mask = 0
+    w, x, y, z = state.attitude_setpoint.tolist()
+    roll_rate, pitch_rate, yaw_rate = state.rate_setpoint.tolist()
+    time_boot_ms, thrust = boot_ms(state.time_us), state.thrust_setpoint
+    return time_boot_ms, type_mask, w, x, y, z, roll_rate, pitch_rate, yaw_rate, thrust
+
+
+@kernel
+def _euler(quaternion: Vector) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw [rad] of a quaternion (4,), as `frames.quat_to_euler`."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    return roll, pitch, yaw_of((w, x, y, z))

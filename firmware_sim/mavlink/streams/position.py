@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 
+from numba.extending import register_jitable
+
 from airl_mav import atmosphere
-from airl_mav.frames import geodetic_to_local, local_to_geodetic, quat_to_matrix, quat_yaw
-from firmware_sim.autopilot.state import Arming, AutopilotState, Estimate
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from airl_mav.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
+from airl_mav.kernels import kernel
+from airl_mav.vehicle.rotation import conjugate, rotate, yaw_of
+from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
+from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import (
     NAN,
     boot_ms,
@@ -15,107 +19,112 @@ from firmware_sim.mavlink.streams.units import (
     cm_s,
     deg_e7,
     int16,
+    int32,
     mm,
+    saturate,
     uint16,
 )
 
-_UNKNOWN_QUATERNION = (NAN, NAN, NAN, NAN)
+for _function in (
+    local_to_geodetic,
+    boot_ms,
+    centidegrees,
+    cm_s,
+    deg_e7,
+    int16,
+    int32,
+    mm,
+    saturate,
+):
+    register_jitable(_function)  # so that kernels can call them, as Python can
 
-_POSITION_IGNORE = (
-    dialect.POSITION_TARGET_TYPEMASK_X_IGNORE,
-    dialect.POSITION_TARGET_TYPEMASK_Y_IGNORE,
-    dialect.POSITION_TARGET_TYPEMASK_Z_IGNORE,
-)
-_VELOCITY_IGNORE = (
-    dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE,
-    dialect.POSITION_TARGET_TYPEMASK_VY_IGNORE,
-    dialect.POSITION_TARGET_TYPEMASK_VZ_IGNORE,
-)
-_ACCELERATION_IGNORE = (
+_UNKNOWN_QUATERNION = (NAN, NAN, NAN, NAN)
+_NO_ACCELERATION = (NAN, NAN, NAN)
+_NO_APPROACH = (0.0, 0.0, 0.0)
+"""HOME_POSITION: there is no special way to land."""
+
+_X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
+_VX_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE
+"""The bits of y and z follow."""
+_ACCELERATION_IGNORE: int = (
     dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
     | dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
     | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
 )
+_YAW_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+_YAW_RATE_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 
 
-def local_position_ned(state: AutopilotState) -> WireMessage | None:
+def local_position_ned(state: AutopilotState) -> Values | None:
     """Position [m] and velocity [m/s], local NED; nothing until the estimator has converged."""
     estimate = state.estimate
     if not estimate.healthy:
         return None
-    return dialect.MAVLink_local_position_ned_message(
-        boot_ms(estimate.time_us), *estimate.position.tolist(), *estimate.velocity.tolist()
-    )
+    x, y, z = estimate.position.tolist()
+    vx, vy, vz = estimate.velocity.tolist()
+    return boot_ms(estimate.time_us), x, y, z, vx, vy, vz
 
 
-def global_position_int(state: AutopilotState) -> WireMessage | None:
+def global_position_int(state: AutopilotState) -> Values | None:
     """Position on the globe, height above home, NED velocity; nothing without an origin."""
-    estimate = state.estimate
-    if state.origin is None or not all(map(math.isfinite, estimate.position.tolist())):
+    estimate, origin, home = state.estimate, state.origin, state.home
+    x, y, z = estimate.position.tolist()
+    if origin is None or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
         return None
-    here = local_to_geodetic(estimate.position, state.origin)
-    velocity = estimate.velocity.tolist()
-    return dialect.MAVLink_global_position_int_message(
-        boot_ms(estimate.time_us),
-        deg_e7(here.latitude_deg),
-        deg_e7(here.longitude_deg),
-        mm(here.altitude_m),
-        mm(_height_above_home(state)),
-        cm_s(velocity[0]),
-        cm_s(velocity[1]),
-        cm_s(velocity[2]),
-        centidegrees(quat_yaw(estimate.quaternion)),
+    return _on_globe(
+        estimate.time_us,
+        estimate.position,
+        estimate.velocity,
+        estimate.quaternion,
+        *origin,
+        origin.altitude_m if home is None else home.altitude_m,
     )
 
 
-def odometry(state: AutopilotState) -> WireMessage:
+def odometry(state: AutopilotState) -> Values:
     """Pose in local NED, velocity in body FRD, variances on the diagonals (NaN elsewhere)."""
     estimate = state.estimate
-    variance = (estimate.sigma[:9] ** 2).tolist()
-    pose_covariance = [NAN] * 21
-    velocity_covariance = [NAN] * 21
-    # Upper triangle of a 6 x 6 matrix, row by row: 0, 6, 11, 15, 18, 20 is its diagonal.
-    for slot, index in ((0, 0), (6, 1), (11, 2), (15, 6), (18, 7), (20, 8)):
-        pose_covariance[slot] = variance[index]
-    for slot, index in ((0, 3), (6, 4), (11, 5)):
-        velocity_covariance[slot] = variance[index]
-    return dialect.MAVLink_odometry_message(
+    x, y, z, vx, vy, vz, roll, pitch, yaw, *_ = (estimate.sigma**2).tolist()
+    reset_counter = 0
+    return (
         estimate.time_us,
         dialect.MAV_FRAME_LOCAL_NED,
         dialect.MAV_FRAME_BODY_FRD,
         *estimate.position.tolist(),
-        estimate.quaternion.tolist(),
-        *_in_body(estimate),
+        *estimate.quaternion.tolist(),
+        *_in_body(estimate.quaternion, estimate.velocity),
         *estimate.angular_velocity.tolist(),
-        pose_covariance,
-        velocity_covariance,
-        0,
+        *_covariance(x, y, z, roll, pitch, yaw),
+        *_covariance(vx, vy, vz, NAN, NAN, NAN),
+        reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT,
         100 if estimate.healthy else 0,
     )
 
 
-def altitude(state: AutopilotState) -> WireMessage:
+def altitude(state: AutopilotState) -> Values:
     """All altitudes [m]; there is no rangefinder, so terrain is unknown."""
     down = float(state.estimate.position[2])
-    return dialect.MAVLink_altitude_message(
+    altitude_terrain = bottom_clearance = NAN
+    return (
         state.time_us,
         atmosphere.altitude_m(state.pressure_hpa),
         NAN if state.origin is None else state.origin.altitude_m - down,
         -down,
         _height_above_home(state),
-        NAN,
-        NAN,
+        altitude_terrain,
+        bottom_clearance,
     )
 
 
-def vfr_hud(state: AutopilotState) -> WireMessage:
+def vfr_hud(state: AutopilotState) -> Values:
     """The head-up display: ground speed, heading, throttle, altitude, climb; no airspeed sensor."""
     north, east, down = state.estimate.velocity.tolist()
     armed = state.status.arming is Arming.ARMED
     heading = math.degrees(quat_yaw(state.estimate.quaternion)) % 360.0
-    return dialect.MAVLink_vfr_hud_message(
-        0.0,
+    airspeed = 0.0
+    return (
+        airspeed,
         math.hypot(north, east),
         int16(heading) % 360,
         uint16(100.0 * state.thrust_setpoint if armed else 0.0, unknown=0),
@@ -126,57 +135,45 @@ def vfr_hud(state: AutopilotState) -> WireMessage:
     )
 
 
-def position_target_local_ned(state: AutopilotState) -> WireMessage:
+def position_target_local_ned(state: AutopilotState) -> Values:
     """What the position and velocity controllers track; the mask marks what is not commanded."""
     setpoint = state.setpoint
-    position, velocity = setpoint.position.tolist(), setpoint.velocity.tolist()
-    mask: int = _ACCELERATION_IGNORE
-    for value, bit in zip(position + velocity, _POSITION_IGNORE + _VELOCITY_IGNORE, strict=True):
-        if not math.isfinite(value):
-            mask |= bit
-    if not math.isfinite(setpoint.yaw):
-        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-    if not math.isfinite(setpoint.yaw_rate):
-        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
-    return dialect.MAVLink_position_target_local_ned_message(
+    position, velocity = setpoint.position, setpoint.velocity
+    return (
         boot_ms(state.time_us),
         dialect.MAV_FRAME_LOCAL_NED,
-        mask,
-        *position,
-        *velocity,
-        NAN,
-        NAN,
-        NAN,
+        _ignored(position, velocity, setpoint.yaw, setpoint.yaw_rate),
+        *position.tolist(),
+        *velocity.tolist(),
+        *_NO_ACCELERATION,
         setpoint.yaw,
         setpoint.yaw_rate,
     )
 
 
-def home_position(state: AutopilotState) -> WireMessage | None:
+def home_position(state: AutopilotState) -> Values | None:
     """Home on the globe and in local NED; nothing before it is set."""
     home, origin = state.home, state.origin
     if home is None:
         return None
     local = [NAN, NAN, NAN] if origin is None else geodetic_to_local(home, origin).tolist()
-    return dialect.MAVLink_home_position_message(
+    return (
         deg_e7(home.latitude_deg),
         deg_e7(home.longitude_deg),
         mm(home.altitude_m),
         *local,
-        _UNKNOWN_QUATERNION,
-        0.0,
-        0.0,
-        0.0,
+        *_UNKNOWN_QUATERNION,
+        *_NO_APPROACH,
         state.time_us,
     )
 
 
-def gps_global_origin(state: AutopilotState) -> WireMessage | None:
+def gps_global_origin(state: AutopilotState) -> Values | None:
     """The point of the globe where local NED is zero; nothing before it is set."""
     origin = state.origin
     if origin is None:
         return None
-    return dialect.MAVLink_gps_global_origin_message(
+    return (
         deg_e7(origin.latitude_deg),
         deg_e7(origin.longitude_deg),
         mm(origin.altitude_m),
@@ -184,11 +181,59 @@ def gps_global_origin(state: AutopilotState) -> WireMessage | None:
     )
 
 
-def _in_body(estimate: Estimate) -> list[float]:
-    """Return the velocity [m/s] in body FRD; plain floats, so that inf raises no warning."""
-    north, east, down = estimate.velocity.tolist()
-    columns = quat_to_matrix(estimate.quaternion).T.tolist()
-    return [n * north + e * east + d * down for n, e, d in columns]
+def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:
+    """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else NaN."""
+    n = NAN
+    return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
+
+
+@kernel
+def _on_globe(
+    time_us: int,
+    position: Vector,
+    velocity: Vector,
+    q: Vector,
+    latitude_deg: float,
+    longitude_deg: float,
+    altitude_m: float,
+    home_altitude_m: float,
+) -> Values:
+    """Return GLOBAL_POSITION_INT of a local position; latitude .. altitude are the origin's."""
+    origin = Geodetic(latitude_deg, longitude_deg, altitude_m)
+    here = local_to_geodetic(position, origin)
+    return (
+        boot_ms(time_us),
+        deg_e7(here.latitude_deg),
+        deg_e7(here.longitude_deg),
+        mm(here.altitude_m),
+        mm(here.altitude_m - home_altitude_m),
+        cm_s(velocity[0]),
+        cm_s(velocity[1]),
+        cm_s(velocity[2]),
+        centidegrees(yaw_of((q[0], q[1], q[2], q[3]))),
+    )
+
+
+@kernel
+def _ignored(position: Vector, velocity: Vector, yaw: float, yaw_rate: float) -> int:
+    """Return the POSITION_TARGET_TYPEMASK of a setpoint: what is not commanded."""
+    mask = _ACCELERATION_IGNORE
+    for i in range(3):
+        if not math.isfinite(position[i]):
+            mask |= _X_IGNORE << i
+        if not math.isfinite(velocity[i]):
+            mask |= _VX_IGNORE << i
+    if not math.isfinite(yaw):
+        mask |= _YAW_IGNORE
+    if not math.isfinite(yaw_rate):
+        mask |= _YAW_RATE_IGNORE
+    return mask
+
+
+@kernel
+def _in_body(q: Vector, v: Vector) -> tuple[float, float, float]:
+    """Return a NED vector (3,) in body FRD; q (4,) is the attitude."""
+    return rotate(conjugate((q[0], q[1], q[2], q[3])), (v[0], v[1], v[2]))
 
 
 def _height_above_home(state: AutopilotState) -> float:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 from airl_mav import atmosphere
+from airl_mav.kernels import kernel
 from firmware_sim.autopilot.port import ParameterStore
-from firmware_sim.autopilot.state import Arming, AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
+from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import (
     INT16_MAX,
     UINT16_MAX,
+    UINT32_MAX,
     boot_ms,
     centidegrees,
     deg_e7,
@@ -25,8 +27,14 @@ from firmware_sim.mavlink.streams.units import (
 _IMU_FIELDS = 0b1_1011_1111_1111
 """HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
 
+_NO_AIRSPEED = 0.0
+"""Differential pressure: there is no such sensor."""
+
 _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
+
+_NO_CELL_VOLTAGES = (UINT16_MAX,) * 9
+"""BATTERY_STATUS.voltages[1:]."""
 
 _CHARGE_WARNINGS = (
     ("BAT_LOW_THR", dialect.MAV_BATTERY_CHARGE_STATE_LOW),
@@ -36,36 +44,44 @@ _CHARGE_WARNINGS = (
 """Threshold parameters, from the highest to the lowest."""
 
 
-def highres_imu(state: AutopilotState) -> WireMessage:
+def highres_imu(state: AutopilotState) -> Values:
     """Newest IMU sample with the estimated biases removed, as PX4 sends it; mag and baro raw."""
     estimate = state.estimate
-    return dialect.MAVLink_highres_imu_message(
+    xacc, yacc, zacc = _difference(state.accel, estimate.accel_bias)
+    xgyro, ygyro, zgyro = _difference(state.gyro, estimate.gyro_bias)
+    xmag, ymag, zmag = state.mag.tolist()
+    return (
         state.time_us,
-        *(state.accel - estimate.accel_bias).tolist(),
-        *(state.gyro - estimate.gyro_bias).tolist(),
-        *state.mag.tolist(),
+        xacc,
+        yacc,
+        zacc,
+        xgyro,
+        ygyro,
+        zgyro,
+        xmag,
+        ymag,
+        zmag,
         state.pressure_hpa,
-        0.0,
+        _NO_AIRSPEED,
         atmosphere.altitude_m(state.pressure_hpa),
         state.temperature_c,
         _IMU_FIELDS,
     )
 
 
-def scaled_pressure(state: AutopilotState) -> WireMessage:
+def scaled_pressure(state: AutopilotState) -> Values:
     """Static pressure [hPa] and temperature [0.01 °C]."""
-    return dialect.MAVLink_scaled_pressure_message(
-        boot_ms(state.time_us), state.pressure_hpa, 0.0, int16(state.temperature_c * 100.0)
-    )
+    temperature = int16(state.temperature_c * 100.0)
+    return boot_ms(state.time_us), state.pressure_hpa, _NO_AIRSPEED, temperature
 
 
-def gps_raw_int(state: AutopilotState) -> WireMessage | None:
+def gps_raw_int(state: AutopilotState) -> Values | None:
     """Newest GPS fix; nothing before the first. Dilution of precision is unknown."""
     fix = state.gps
     if fix is None:
         return None
     north, east, _ = fix.velocity_ned.tolist()
-    return dialect.MAVLink_gps_raw_int_message(
+    return (
         state.time_us,
         fix.fix_type,
         deg_e7(fix.position.latitude_deg),
@@ -82,7 +98,7 @@ def gps_raw_int(state: AutopilotState) -> WireMessage | None:
     )
 
 
-def battery_status(state: AutopilotState, charge_state: int) -> WireMessage:
+def battery_status(state: AutopilotState, charge_state: int) -> Values:
     """Battery 0: pack voltage in the first slot (cells are not measured), current, charge.
 
     Args:
@@ -90,19 +106,19 @@ def battery_status(state: AutopilotState, charge_state: int) -> WireMessage:
         charge_state: MAV_BATTERY_CHARGE_STATE.
     """
     battery = state.battery
-    voltages = [UINT16_MAX] * 10
-    voltages[0] = uint16(battery.voltage_v * 1e3)
-    return dialect.MAVLink_battery_status_message(
-        0,
+    number, no_temperature, no_energy, no_time_remaining = 0, INT16_MAX, -1, 0
+    return (
+        number,
         dialect.MAV_BATTERY_FUNCTION_ALL,
         dialect.MAV_BATTERY_TYPE_LIPO,
-        INT16_MAX,
-        voltages,
+        no_temperature,
+        uint16(battery.voltage_v * 1e3),
+        *_NO_CELL_VOLTAGES,
         int16(battery.current_a * 100.0, unknown=-1),
         int32(battery.consumed_mah, unknown=-1),
-        -1,
+        no_energy,
         percent(battery.remaining),
-        0,
+        no_time_remaining,
         charge_state,
     )
 
@@ -119,15 +135,19 @@ def charge_state(remaining: float, parameters: ParameterStore) -> int:
     return state
 
 
-def servo_output_raw(state: AutopilotState) -> WireMessage:
+def servo_output_raw(state: AutopilotState) -> Values:
     """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
     if state.status.arming is Arming.ARMED:
         pulses = [_PWM_MIN + saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
     else:
         pulses = [_PWM_DISARMED] * len(state.motors)
-    return dialect.MAVLink_servo_output_raw_message(
-        state.time_us & 0xFFFF_FFFF, 0, *pulses, 0, 0, 0, 0
-    )
+    port = 0
+    return state.time_us & UINT32_MAX, port, *pulses, 0, 0, 0, 0
+
+
+@kernel
+def _difference(a: Vector, b: Vector) -> tuple[float, float, float]:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def percent(share: float) -> int:

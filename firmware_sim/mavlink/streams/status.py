@@ -6,13 +6,16 @@ import math
 from collections.abc import Callable
 
 from firmware_sim.autopilot.state import Arming, AutopilotState, Landed
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.modes import base_mode, custom_mode, system_status
 from firmware_sim.mavlink.streams.sensors import percent
 from firmware_sim.mavlink.streams.units import NAN, boot_ms, int16, uint16
 
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
+
+_NO_ERRORS = (0, 0, 0, 0, 0, 0)
+"""SYS_STATUS: drop rate, communication errors, errors 1..4."""
 
 _LANDED = {
     Landed.ON_GROUND: dialect.MAV_LANDED_STATE_ON_GROUND,
@@ -48,10 +51,10 @@ _ESTIMATOR_GOOD = (
 _ESTIMATOR_GOOD_GLOBAL = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
-def heartbeat(state: AutopilotState) -> WireMessage:
+def heartbeat(state: AutopilotState) -> Values:
     """A PX4 quadrotor and its mode."""
     status = state.status
-    return dialect.MAVLink_heartbeat_message(
+    return (
         dialect.MAV_TYPE_QUADROTOR,
         dialect.MAV_AUTOPILOT_PX4,
         base_mode(status),
@@ -61,14 +64,12 @@ def heartbeat(state: AutopilotState) -> WireMessage:
     )
 
 
-def extended_sys_state(state: AutopilotState) -> WireMessage:
+def extended_sys_state(state: AutopilotState) -> Values:
     """Landed state; the vehicle is no VTOL."""
-    return dialect.MAVLink_extended_sys_state_message(
-        dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
-    )
+    return dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
 
 
-def sys_status(state: AutopilotState) -> WireMessage:
+def sys_status(state: AutopilotState) -> Values:
     """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%]."""
     health: int = _SENSORS_ALWAYS
     if bool(state.mag.any()):
@@ -82,7 +83,7 @@ def sys_status(state: AutopilotState) -> WireMessage:
     if state.status.arming is not Arming.BOOT:
         health |= dialect.MAV_SYS_STATUS_PREARM_CHECK
     battery = state.battery
-    return dialect.MAVLink_sys_status_message(
+    return (
         _SENSORS_PRESENT,
         _SENSORS_PRESENT,
         health,
@@ -90,16 +91,11 @@ def sys_status(state: AutopilotState) -> WireMessage:
         uint16(battery.voltage_v * 1e3),
         int16(battery.current_a * 100.0, unknown=-1),
         percent(battery.remaining),
-        0,
-        0,
-        0,
-        0,
-        0,
-        0,
+        *_NO_ERRORS,
     )
 
 
-def estimator_status(state: AutopilotState) -> WireMessage:
+def estimator_status(state: AutopilotState) -> Values:
     """Which outputs are good, innovation test ratios (1 = rejection gate), accuracies [m]."""
     estimate = state.estimate
     flags: int = 0
@@ -107,7 +103,7 @@ def estimator_status(state: AutopilotState) -> WireMessage:
         flags = _ESTIMATOR_GOOD | (_ESTIMATOR_GOOD_GLOBAL if state.origin is not None else 0)
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
-    return dialect.MAVLink_estimator_status_message(
+    return (
         estimate.time_us,
         flags,
         max(horizontal, vertical),
@@ -121,17 +117,16 @@ def estimator_status(state: AutopilotState) -> WireMessage:
     )
 
 
-def mission_current(state: AutopilotState) -> WireMessage:  # noqa: ARG001 - a builder
+def mission_current(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
     """There is no mission."""
-    return dialect.MAVLink_mission_current_message(0, 0, dialect.MISSION_STATE_NO_MISSION)
+    sequence, total = 0, 0
+    return sequence, total, dialect.MISSION_STATE_NO_MISSION
 
 
-def system_time(boot_unix_us: int) -> Callable[[AutopilotState], WireMessage]:
+def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:
     """Return the builder of SYSTEM_TIME for a calendar time of boot [µs since 1970, UTC]."""
 
-    def build(state: AutopilotState) -> WireMessage:
-        return dialect.MAVLink_system_time_message(
-            boot_unix_us + state.time_us, boot_ms(state.time_us)
-        )
+    def build(state: AutopilotState) -> Values:
+        return boot_unix_us + state.time_us, boot_ms(state.time_us)
 
     return build

@@ -23,13 +23,21 @@ def saturate(value: float, low: int, high: int, unknown: int) -> int:
     return low if value <= low else round(value)
 
 
+# The common case, a value within range, is told apart first: it is asked for thousands of times a
+# second.
+
+
 def int16(value: float, unknown: int = 0) -> int:
     """Return a value for an int16 field."""
+    if -INT16_MAX <= value <= INT16_MAX:
+        return round(value)
     return saturate(value, -INT16_MAX - 1, INT16_MAX, unknown)
 
 
 def int32(value: float, unknown: int = 0) -> int:
     """Return a value for an int32 field."""
+    if -INT32_MAX <= value <= INT32_MAX:
+        return round(value)
     return saturate(value, -INT32_MAX - 1, INT32_MAX, unknown)
 
 
@@ -50,17 +58,20 @@ def boot_ms(time_us: int) -> int:
 
 def deg_e7(angle_deg: float) -> int:
     """Return an angle [deg] as degE7."""
-    return int32(angle_deg * 1e7)
+    value = angle_deg * 1e7
+    return round(value) if -INT32_MAX <= value <= INT32_MAX else int32(value)
 
 
 def mm(length_m: float) -> int:
     """Return a length [m] as int32 millimetres."""
-    return int32(length_m * 1e3)
+    value = length_m * 1e3
+    return round(value) if -INT32_MAX <= value <= INT32_MAX else int32(value)
 
 
 def cm_s(speed_m_s: float) -> int:
     """Return a velocity [m/s] as int16 cm/s."""
-    return int16(speed_m_s * 1e2)
+    value = speed_m_s * 1e2
+    return round(value) if -INT16_MAX <= value <= INT16_MAX else int16(value)
 
 
 def centidegrees(angle_rad: float) -> int:

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from airl_mav.constants import GRAVITY_M_S2, US_PER_S
-from firmware_sim.autopilot.state import AutopilotState
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from airl_mav.kernels import kernel
+from firmware_sim.autopilot.state import AutopilotState, Vector
+from firmware_sim.interfaces import SensorSample
+from firmware_sim.mavlink.codec import Values
 
 _OLD, _NEW = 0.99, 0.01
 """Filter weights per sample (PX4 VehicleIMU::UpdateAccelVibrationMetrics)."""
 
 _CLIP_M_S2 = 16.0 * GRAVITY_M_S2
 """Range of PX4's simulated accelerometer [m/s²]."""
+
+# What the meter remembers: the four metrics, and the last sample (time, gyro, accel).
+_CONING, _GYRO, _ACCEL, _CLIPPED, _LAST_US, _LAST_GYRO, _LAST_ACCEL, _SIZE = 0, 1, 2, 3, 4, 5, 8, 11
 
 
 class VibrationMeter:
@@ -24,30 +31,38 @@ class VibrationMeter:
     """
 
     def __init__(self) -> None:
-        self._coning = self._gyro = self._accel = 0.0
-        self._clipped = 0
-        self._last: tuple[int, list[float], list[float]] | None = None
+        self._memory = np.zeros(_SIZE)
+        self._memory[_LAST_US] = math.nan
 
-    def update(self, state: AutopilotState) -> None:
+    def update(self, sample: SensorSample) -> None:
         """Take in the newest sample; call once per tick."""
-        gyro, accel = state.gyro.tolist(), state.accel.tolist()
-        if self._last is not None:
-            last_us, last_gyro, last_accel = self._last
-            dt = (state.time_us - last_us) / US_PER_S
-            self._coning = _OLD * self._coning + _NEW * dt * dt * _cross_norm(gyro, last_gyro)
-            self._gyro = _OLD * self._gyro + _NEW * math.dist(gyro, last_gyro)
-            self._accel = _OLD * self._accel + _NEW * math.dist(accel, last_accel)
-        self._last = (state.time_us, gyro, accel)
-        self._clipped += max(map(abs, accel)) >= _CLIP_M_S2
+        _update(self._memory, sample.time_us, sample.gyro, sample.accel)
 
-    def message(self, state: AutopilotState) -> WireMessage:
-        """Return VIBRATION."""
-        return dialect.MAVLink_vibration_message(
-            state.time_us, self._coning, self._gyro, self._accel, self._clipped, 0, 0
-        )
+    def message(self, state: AutopilotState) -> Values:
+        """Return VIBRATION; there is one accelerometer."""
+        coning, gyro, accel, clipped = self._memory[: _CLIPPED + 1].tolist()
+        clipping_1 = clipping_2 = 0
+        return state.time_us, coning, gyro, accel, int(clipped), clipping_1, clipping_2
 
 
-def _cross_norm(a: list[float], b: list[float]) -> float:
-    return math.hypot(
-        a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-    )
+@kernel
+def _update(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
+    """Filter one sample into `memory` (11,); gyro (3,) FRD [rad/s], accel (3,) FRD [m/s²]."""
+    clipped = False
+    last_gyro, last_accel = memory[_LAST_GYRO:_LAST_ACCEL], memory[_LAST_ACCEL:_SIZE]
+    if not math.isnan(memory[_LAST_US]):
+        dt = (time_us - memory[_LAST_US]) / US_PER_S
+        cross, gyro_step, accel_step = 0.0, 0.0, 0.0
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            cross += (gyro[j] * last_gyro[k] - gyro[k] * last_gyro[j]) ** 2
+            gyro_step += (gyro[i] - last_gyro[i]) ** 2
+            accel_step += (accel[i] - last_accel[i]) ** 2
+        memory[_CONING] = _OLD * memory[_CONING] + _NEW * dt * dt * math.sqrt(cross)
+        memory[_GYRO] = _OLD * memory[_GYRO] + _NEW * math.sqrt(gyro_step)
+        memory[_ACCEL] = _OLD * memory[_ACCEL] + _NEW * math.sqrt(accel_step)
+    for i in range(3):
+        last_gyro[i], last_accel[i] = gyro[i], accel[i]
+        clipped = clipped or abs(accel[i]) >= _CLIP_M_S2
+    memory[_LAST_US] = time_us
+    memory[_CLIPPED] += clipped
