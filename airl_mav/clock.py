@@ -6,6 +6,7 @@ All times are integer microseconds of simulated time. `SimClock` is moved by who
 
 from __future__ import annotations
 
+import threading
 import time
 from datetime import datetime, timezone
 from typing import Protocol
@@ -22,8 +23,13 @@ class Clock(Protocol):
         """Return the present simulated time [µs]."""
         ...
 
-    def sleep_until(self, time_us: int) -> None:
-        """Return once `time_us()` has reached the given simulated time [µs]."""
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Return once `time_us()` has reached the given simulated time [µs].
+
+        Args:
+            time_us: Until when [µs].
+            interrupt: Ends the sleep early when it is set.
+        """
         ...
 
 
@@ -43,9 +49,10 @@ class SimClock:
             raise ValueError(f"time cannot go back: step_us={step_us}")
         self._now_us += step_us
 
-    def sleep_until(self, time_us: int) -> None:
-        """Jump to `time_us` [µs], or stay when it has passed."""
-        self._now_us = max(self._now_us, time_us)
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Jump to `time_us` [µs], or stay when it has passed or `interrupt` is set."""
+        if interrupt is None or not interrupt.is_set():
+            self._now_us = max(self._now_us, time_us)
 
 
 class WallClock:
@@ -76,10 +83,13 @@ class WallClock:
         target_ns = self.epoch_ns + time_us * NS_PER_US / self.speed
         return (target_ns - time.monotonic_ns()) / (US_PER_S * NS_PER_US)
 
-    def sleep_until(self, time_us: int) -> None:
-        """Sleep until simulated `time_us` [µs]."""
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Sleep until simulated `time_us` [µs], or until `interrupt` is set."""
         while (wait_s := self.wall_seconds_until(time_us)) > 0.0:
-            time.sleep(wait_s)
+            if interrupt is None:
+                time.sleep(wait_s)
+            elif interrupt.wait(wait_s):
+                return
 
     def slip(self, step_us: int) -> None:
         """Give up `step_us` [µs] of simulated time: the host could not keep up."""

@@ -7,8 +7,10 @@ this process hangs; `watchdog.py` is there for that.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,6 +19,7 @@ from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from mavsdk.logging import log_subscribe
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
+from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import LandedState, Telemetry, TelemetryError
 
 from airl_mav.clock import Clock, WallClock
@@ -27,7 +30,7 @@ from airl_mav.policy.observation import Kinematics
 RATE_HZ = 50.0
 """Rate asked for position, velocity and attitude [Hz]."""
 
-POLL_S = 0.05
+POLL_S = 0.1
 """How often a condition is looked at while waiting for it [s]."""
 
 CONNECT_SLICE_S = 0.5
@@ -38,6 +41,16 @@ HEALTH_SETTLE_S = 0.5
 
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
+
+RAW_URL = "raw://"
+"""Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
+
+RAW_CHUNK = 65_536
+"""Bytes that are fed at a time; MAVSDK's parser puts a divided frame together again."""
+
+RAW_TIMEOUT_S = 3600.0
+"""MAVSDK's time-out of a command on a raw connection [wall s]. Its answer is certain, but not when
+by the wall clock: a stopped process must not repeat commands when it goes on."""
 
 
 class LinkError(Exception):
@@ -83,15 +96,24 @@ class Link(Protocol):
 
 
 class MavsdkLink:
-    """MAVSDK over UDP or serial. Implements `Link`."""
+    """MAVSDK over UDP, serial or raw bytes. Implements `Link`."""
 
-    def __init__(self, url: str, clock: Clock, abandon: threading.Event | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        clock: Clock,
+        abandon: threading.Event | None = None,
+        heard: Callable[[], bool] | None = None,
+    ) -> None:
         """Open a connection; `connect` waits for the vehicle.
 
         Args:
-            url: MAVSDK connection, `udpin://127.0.0.1:14540` or `serial:///dev/ttyAMA0:921600`.
+            url: MAVSDK connection, `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or
+                `raw://`.
             clock: For time-outs.
             abandon: Set from another thread to break off whatever is being waited for.
+            heard: Whether the flight controller is heard, where the wall clock does not tell;
+                None = MAVSDK's word.
 
         Raises:
             UsageError: The URL is invalid or its port is taken.
@@ -99,6 +121,9 @@ class MavsdkLink:
         self.url = url
         self._clock = clock
         self._abandon = abandon or threading.Event()
+        self._heard = heard
+        self.setpoints_sent = 0
+        """Setpoints handed to MAVSDK so far, its own repetitions not counted."""
         # MAVSDK's own log goes to standard output; its findings reach us as results.
         log_subscribe(lambda *_: True)
         configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
@@ -111,6 +136,7 @@ class MavsdkLink:
         self._telemetry: Any = None
         self._action: Any = None
         self._offboard: Any = None
+        self._texts: Any = None
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Wait for a flight controller. Raises LinkError when none is heard in time [wall s].
@@ -134,9 +160,59 @@ class MavsdkLink:
         self._call("telemetry", lambda: self._telemetry.set_rate_position_velocity_ned(RATE_HZ))
         self._call("telemetry", lambda: self._telemetry.set_rate_attitude_quaternion(RATE_HZ))
 
+    def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """Take over the bytes of a `raw://` connection.
+
+        Args:
+            sent: Called with every MAVLink frame that MAVSDK sends, from MAVSDK's own thread: it
+                must return at once and take no lock that somebody who feeds bytes may hold.
+
+        Returns:
+            What to feed MAVSDK with, whole frames, from one thread at a time.
+        """
+        self.set_timeout(RAW_TIMEOUT_S)
+        library, handle = self._mavsdk._lib, self._mavsdk._handle
+        self._mavsdk.subscribe_raw_bytes_to_be_sent(sent)
+        # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
+        buffer = (ctypes.c_uint8 * RAW_CHUNK)()
+        pass_bytes = library.mavsdk_pass_received_raw_bytes
+
+        def feed(data: bytes) -> None:
+            for start in range(0, len(data), RAW_CHUNK):
+                chunk = data[start : start + RAW_CHUNK]
+                ctypes.memmove(buffer, chunk, len(chunk))
+                pass_bytes(handle, buffer, len(chunk))
+
+        return feed
+
+    def set_timeout(self, seconds: float) -> None:
+        """Let MAVSDK repeat what has not been answered after so long [wall s], not after 0.5 s."""
+        # Exported by the library, not wrapped by MAVSDK-Python 4.1.
+        set_timeout = self._mavsdk._lib.mavsdk_set_timeout_s
+        set_timeout.argtypes = [ctypes.c_void_p, ctypes.c_double]
+        set_timeout(self._mavsdk._handle, seconds)
+
+    def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
+        """Exchange STATUSTEXTs with the flight controller; `connect` comes first.
+
+        Args:
+            heard: Called with every text, from a thread of MAVSDK's: all telemetry that came before
+                has been taken in by then. It must return at once.
+
+        Returns:
+            What sends a text of at most 50 characters, behind all that was sent before.
+        """
+        self._texts = texts = ServerUtility(self._system)
+        self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
+
+        def send(text: str) -> None:
+            texts.send_status_text(StatusTextType.DEBUG, text)
+
+        return send
+
     def close(self) -> None:
         """Release MAVSDK."""
-        for plugin in (self._offboard, self._action, self._telemetry):
+        for plugin in (self._texts, self._offboard, self._action, self._telemetry):
             if plugin is not None:
                 plugin.destroy()
         self._mavsdk.destroy()
@@ -144,7 +220,9 @@ class MavsdkLink:
     @property
     def connected(self) -> bool:
         """Whether heartbeats of the flight controller arrive (MAVSDK allows gaps of 3 s)."""
-        return self._system is not None and bool(self._system.is_connected())
+        if self._system is None:
+            return False
+        return bool(self._system.is_connected()) if self._heard is None else self._heard()
 
     @property
     def healthy(self) -> bool:
@@ -225,6 +303,7 @@ class MavsdkLink:
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
         s = setpoint
+        self.setpoints_sent += 1
         yaw_rate_deg_s = math.degrees(s.yaw_rate_rad_s)
         try:
             self._offboard.set_velocity_body(

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.clock import Clock
+from airl_mav.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import Policy
+from airl_mav.policy.actions import CameraBound, Policy
 from companion.camera import FrameSource
+from companion.guard import Guard
 from companion.link import STOP, LinkError, MavsdkLink
 from companion.pilot import FRAME_WAIT_S, Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
@@ -49,6 +51,7 @@ def fly_mission(
     *,
     pilot_settings: PilotSettings,
     watchdog_settings: WatchdogSettings,
+    guard: Guard,
     latency: LatencySampler | None = None,
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
@@ -65,6 +68,7 @@ def fly_mission(
         progress: Called with the name of each phase as it begins.
         pilot_settings: How the policy is flown.
         watchdog_settings: Bounds on silence.
+        guard: Who looks after them.
         latency: Where to draw t2 from, to fly as a slower computer.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
@@ -76,7 +80,8 @@ def fly_mission(
         link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
         link.enter_offboard()
         progress("navigating")
-        watchdog.start()
+        watchdog.begin()
+        guard.start(watchdog)
         reason = pilot.fly(goal, stop)
     except LinkError as error:
         reason = str(error)
@@ -85,7 +90,7 @@ def fly_mission(
         reason = f"policy failed: {type(error).__name__}: {error}"
         traceback.print_exc(file=sys.stderr)
     finally:
-        watchdog.stop()
+        guard.stop()
     lost = not link.connected
     if abandon.is_set():
         reason = "stopped"
@@ -102,6 +107,20 @@ def fly_mission(
         notes += _come_down(link, left_offboard=watchdog.left_offboard)
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
+
+
+def check_camera(policy: Policy, frames: FrameSource, stop: threading.Event) -> None:
+    """Look at the camera before take-off. Raises UsageError when the policy cannot use it.
+
+    Args:
+        policy: What will decide.
+        frames: The camera.
+        stop: Set from outside to stop waiting for a first frame.
+    """
+    if isinstance(policy, CameraBound):
+        lens = first_lens(frames, stop)
+        if lens is not None and (reason := policy.refuses(lens)) is not None:
+            raise UsageError(f"--policy {policy.name}: {reason}")
 
 
 def first_lens(frames: FrameSource, stop: threading.Event) -> Intrinsics | None:

@@ -6,7 +6,6 @@ Sequential, as in the paper: while the next decision is computed, the last comma
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,6 +116,7 @@ class Pilot:
         started_us = clock.time_us()
         action = limited(self._policy.act(encode(frame, state, goal)), settings.max_speed_m_s)
         if self._latency is not None:
+            # Not to be interrupted: a computation is not.
             clock.sleep_until(started_us + self._latency.sample_us())
         ready_us = clock.time_us()
         setpoint = self._setpoint(action, self._link.kinematics())
@@ -127,7 +127,7 @@ class Pilot:
         if not self._watchdog.command(setpoint, hold_us):
             return False
         self._watchdog.doing("holding an action")
-        _sleep(clock, sent_us + hold_us, stop.is_set)
+        clock.sleep_until(sent_us + hold_us, stop)
         self.log.record(
             frame.capture_time_us,
             decoded_us,
@@ -143,9 +143,3 @@ class Pilot:
         """Add the vertical speed that holds the altitude."""
         down = vertical_speed(self._settings.altitude_m, float(state.position[2]))
         return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
-
-
-def _sleep(clock: Clock, until_us: int, interrupted: Callable[[], bool]) -> None:
-    """Sleep until a time [µs] in slices short enough to be interrupted."""
-    while (now_us := clock.time_us()) < until_us and not interrupted():
-        clock.sleep_until(min(until_us, now_us + 50_000))

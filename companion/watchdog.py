@@ -6,28 +6,19 @@ defence, each for the case that the one before cannot see:
 
 1. A decision that is overdue zeroes the velocity.
 2. Still none: offboard is left, the flight controller holds.
-3. This thread itself cannot run (a policy that holds Python's interpreter lock): a C-level timer
-   ends the process, the setpoints stop, and the flight controller's offboard-loss failsafe acts.
+3. Nobody looks any more (a policy that holds Python's interpreter lock): a C-level timer ends the
+   process, the setpoints stop, and the flight controller's offboard-loss failsafe acts; see
+   `guard.py`, which does the looking.
 """
 
 from __future__ import annotations
 
-import faulthandler
 import threading
 from dataclasses import dataclass
 
 from airl_mav.clock import Clock
 from airl_mav.constants import US_PER_S
 from companion.link import STOP, BodyVelocity, Link, LinkError
-
-POLL_US = 10_000
-"""How often deadlines are looked at [µs]."""
-
-STDERR = 2
-"""File descriptor for the last words of a process that is ended."""
-
-STARVED_S = 5.0
-"""When this thread has not run for so long, the process ends [s of wall time]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +35,10 @@ class WatchdogSettings:
 
 
 class Watchdog:
-    """Guards the setpoints of one mission. All commands of the pilot go through `command`."""
+    """Guards the setpoints of one mission. All commands of the pilot go through `command`.
+
+    It keeps the deadlines; a guard calls `look` when one may have passed.
+    """
 
     def __init__(self, link: Link, clock: Clock, settings: WatchdogSettings) -> None:
         self.notes: list[str] = []
@@ -59,20 +53,10 @@ class Watchdog:
         self._fed_us = clock.time_us()
         self._hover_us: int | None = None
         self._stopped = False
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
 
-    def start(self) -> None:
-        """Begin to watch: the first decision is due."""
+    def begin(self) -> None:
+        """The pilot takes over: the first decision is due."""
         self._fed_us = self._clock.time_us()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop watching."""
-        self._done.set()
-        if self._thread.is_alive():
-            self._thread.join()
-        faulthandler.cancel_dump_traceback_later()
 
     def doing(self, activity: str) -> None:
         """Say what the pilot is at: it names the culprit when a decision is overdue."""
@@ -97,30 +81,26 @@ class Watchdog:
                 self._hover_us = self._fed_us + hold_us + int(hover_s * US_PER_S)
             return True
 
-    def _run(self) -> None:
-        try:
-            while not self._done.is_set():
-                faulthandler.dump_traceback_later(STARVED_S, exit=True, file=STDERR)
-                for _ in range(25):
-                    if self._done.is_set():
-                        return
-                    self._look()
-                    self._clock.sleep_until(self._clock.time_us() + POLL_US)
-        finally:
-            faulthandler.cancel_dump_traceback_later()
+    @property
+    def due_us(self) -> int | None:
+        """When `look` next has something to do, unless a decision comes first [µs]; None: never."""
+        if self.left_offboard:
+            return None
+        bound_us = self._leave_us if self._stopped else self._overdue_us
+        return bound_us if self._hover_us is None else min(bound_us, self._hover_us)
 
-    def _look(self) -> None:
-        settings = self._settings
+    def look(self) -> None:
+        """Do what is due now."""
         with self._lock:
             now_us = self._clock.time_us()
-            overdue_s = (now_us - self._fed_us) / US_PER_S - settings.decision_timeout_s
             try:
-                if overdue_s > settings.leave_after_s and not self.left_offboard:
+                if now_us >= self._leave_us and not self.left_offboard:
                     self.left_offboard = True
                     self._note("left offboard", now_us)
                     self._link.leave_offboard()
-                elif overdue_s > 0.0 and not self._stopped:
+                elif now_us >= self._overdue_us and not self._stopped:
                     self._stopped = True
+                    self._hover_us = None
                     self._note("velocity zeroed", now_us)
                     self._link.set_velocity_body(STOP)
                 elif self._hover_us is not None and now_us >= self._hover_us:
@@ -128,6 +108,14 @@ class Watchdog:
                     self._link.set_velocity_body(STOP)
             except LinkError as error:
                 self._note(str(error), now_us)
+
+    @property
+    def _overdue_us(self) -> int:
+        return self._fed_us + int(self._settings.decision_timeout_s * US_PER_S)
+
+    @property
+    def _leave_us(self) -> int:
+        return self._overdue_us + int(self._settings.leave_after_s * US_PER_S)
 
     def _note(self, what: str, now_us: int) -> None:
         age_s = (now_us - self._fed_us) / US_PER_S

@@ -6,17 +6,33 @@ import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
+from airl_mav.camera.frame import Frame
 from airl_mav.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.state import Message
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
-from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 IDLE_S = 0.02
 """How often requests are looked for while no episode stands [s]."""
+
+
+class FrameServer(Protocol):
+    """Where the camera's frames go; `plant.camera_server.CameraServer` is one."""
+
+    endpoint: str
+    """Where subscribers connect."""
+
+    def publish(self, frame: Frame) -> None:
+        """Offer a frame, without waiting for anybody."""
+        ...
+
+    def close(self) -> None:
+        """Release the resources."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,7 +47,7 @@ class Loaded:
 class Firmware:
     """Flies one episode after the other; its links and its camera stay."""
 
-    def __init__(self, server: MavlinkServer, camera: CameraServer | None, pacing: Pacing) -> None:
+    def __init__(self, server: MavlinkServer, camera: FrameServer | None, pacing: Pacing) -> None:
         self.server = server
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
@@ -41,6 +57,7 @@ class Firmware:
         """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
         self._pacing = pacing
+        self._sockets = server.filenos()
         self._tlog: TlogWriter | None = None
 
     @property
@@ -76,10 +93,11 @@ class Firmware:
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
             self.server.log_to(self._tlog)
-        # What lives for the whole episode need not be searched by the garbage collector: a full
-        # collection would stall the 250 Hz loop by tens of milliseconds.
-        gc.collect()
-        gc.freeze()
+        if self.epoch_ns is not None:
+            # What lives for the whole episode need not be searched by the garbage collector: a
+            # full collection would stall the 250 Hz loop by tens of milliseconds.
+            gc.collect()
+            gc.freeze()
         # All this took wall time, which is no part of the episode: it starts now.
         self._pacing.restart(simulation.time_us)
         return Loaded(start_us, self.epoch_ns)
@@ -90,8 +108,7 @@ class Firmware:
         if simulation is None:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
-        sockets = server.filenos()
-        server.receive(self._pacing.wait(simulation.time_us, sockets, server.receive))
+        server.receive(self._pacing.wait(simulation.time_us, self._sockets, server.receive))
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
@@ -121,7 +138,8 @@ class Firmware:
         """Forget the episode."""
         self._close_tlog()
         if self.simulation is not None:
-            gc.unfreeze()
+            if self.epoch_ns is not None:
+                gc.unfreeze()
             self.simulation.close()
             self.simulation = None
 

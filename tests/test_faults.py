@@ -37,6 +37,7 @@ from airl_mav.harness.run_folder import load
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from companion.camera import ZmqFrameSource
+from companion.guard import ThreadGuard
 from companion.link import MavsdkLink
 from companion.mission import MissionResult, fly_mission
 from companion.pilot import PilotSettings
@@ -298,6 +299,7 @@ def fly_in_thread(ports: TestPorts, policy: Any) -> tuple[threading.Thread, list
                     *(link, frames, policy, (FAR_M, 0.0), clock, stop, abandon, lambda _: None),
                     pilot_settings=PilotSettings(altitude_m=1.5),
                     watchdog_settings=WatchdogSettings(decision_timeout_s=1.5, leave_after_s=1.0),
+                    guard=ThreadGuard(clock),
                 )
             )
         finally:

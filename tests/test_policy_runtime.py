@@ -24,7 +24,7 @@ from processes import ROOT, running
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli import companion, sitl
+from airl_mav.cli import companion, companion_command, sitl
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.errors import UsageError
@@ -315,14 +315,14 @@ def test_greedy_takes_no_runtime_and_no_ablation() -> None:
 
 def test_the_pilot_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> None:
     learned, greedy = find_policy(str(exported / "discrete")), find_policy("greedy")
-    silent = companion.PilotOptions()
-    assert companion.pilot_settings(silent, greedy) == PilotSettings()
-    assert companion.pilot_settings(silent, learned) == PilotSettings(
+    silent = companion_command.PilotOptions()
+    assert companion_command.pilot_settings(silent, greedy) == PilotSettings()
+    assert companion_command.pilot_settings(silent, learned) == PilotSettings(
         hold_s=0.4, goal_radius_m=2.5, altitude_m=2.0, max_speed_m_s=5.0
     )
-    asked = companion.PilotOptions(hold_s=0.0, altitude_m=3.0)
+    asked = companion_command.PilotOptions(hold_s=0.0, altitude_m=3.0)
     for info, radius in ((learned, 2.5), (greedy, PilotSettings.goal_radius_m)):
-        settings = companion.pilot_settings(asked, info)
+        settings = companion_command.pilot_settings(asked, info)
         assert (settings.hold_s, settings.altitude_m) == (0.0, 3.0)
         assert settings.goal_radius_m == radius
 
@@ -371,10 +371,12 @@ def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path:
     assert guess.injection.origin == "estimated"
 
     # The companion draws the same, under a harness; by itself it runs on that very computer.
-    served = companion.CompanionCommand(policy=path, computer=str(computer), control="stdio")
-    assert companion.injection(served) == setup.injection
-    alone = companion.CompanionCommand(policy=path, computer=str(computer))
-    assert companion.injection(alone).origin == "measured"
+    served = companion_command.CompanionCommand(
+        policy=path, computer=str(computer), control="stdio"
+    )
+    assert companion_command.injection(served) == setup.injection
+    alone = companion_command.CompanionCommand(policy=path, computer=str(computer))
+    assert companion_command.injection(alone).origin == "measured"
 
 
 # --- refused before anything flies

@@ -8,9 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from airl_mav.constants import US_PER_MS
 from airl_mav.profiles.computer import Latency
-
-US_PER_MS = 1_000
 
 
 class LatencySampler(Protocol):

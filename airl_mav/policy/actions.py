@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.policy.observation import Observation
 
 
@@ -51,6 +52,20 @@ class Policy(Protocol):
 
     def act(self, observation: Observation) -> Action:
         """Return the action for an observation."""
+        ...
+
+
+@runtime_checkable
+class CameraBound(Protocol):
+    """A policy that not every camera can serve."""
+
+    @property
+    def name(self) -> str:
+        """Name of the policy."""
+        ...
+
+    def refuses(self, camera: Intrinsics) -> str | None:
+        """Return why a camera cannot serve the policy, or None when it can."""
         ...
 
 

@@ -58,6 +58,11 @@ class LearnedPolicy:
         self._fitting: Intrinsics | None = None
         """The camera that was found to fit."""
 
+    @property
+    def name(self) -> str:
+        """Name on the card."""
+        return self.card.name
+
     def with_generator(self, rng: np.random.Generator) -> LearnedPolicy:
         """Return the same policy with another source of random actions."""
         return LearnedPolicy(self.card, self._runtime, rng=rng, ablate=self._ablate)

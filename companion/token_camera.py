@@ -1,0 +1,71 @@
+"""The camera when the companion is conducted by another process.
+
+Frames come over ZeroMQ as always, by the wall clock. What the companion sees of them is decided by
+its turn, which names the newest one that has reached it.
+"""
+
+from __future__ import annotations
+
+from airl_mav.clock import Clock
+from airl_mav.constants import US_PER_S
+from companion.camera import FrameSource, ReceivedFrame
+from companion.conducted import Abandoned
+from companion.token_clock import TokenTurns
+from companion.tokens import NO_FRAME
+
+
+class TokenFrameSource:
+    """Shows the frame that the turn names. Implements `camera.FrameSource`."""
+
+    def __init__(self, frames: FrameSource, turns: TokenTurns, clock: Clock) -> None:
+        """Take where the frames come from, who names them, and the companion's clock."""
+        self._frames = frames
+        self._turns = turns
+        self._clock = clock
+        self._newest: ReceivedFrame | None = None
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the frame that the turn names; None before the first.
+
+        Raises Abandoned when it does not come.
+        """
+        wanted = self._turns.frame
+        if wanted == NO_FRAME:
+            return None
+        if self._newest is None or self._newest.frame.sequence != wanted:
+            self._newest = self._await(wanted)
+        return self._newest
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen; see `camera.FrameSource`.
+
+        Here the time-out counts in simulated time.
+        """
+        clock, arrived = self._clock, self._turns.frame_arrived
+        deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
+        while True:
+            newest = self.latest()
+            if newest is not None and newest.frame.sequence != newer_than_sequence:
+                return newest
+            if clock.time_us() >= deadline_us:
+                return None
+            arrived.clear()
+            clock.sleep_until(deadline_us, arrived)
+
+    def _await(self, wanted: int) -> ReceivedFrame:
+        """Wait for a frame that is on its way through the operating system."""
+        received, patience_s = self._frames.latest(), self._turns.patience_s
+        waited_s = 0
+        while received is None or received.frame.sequence != wanted:
+            # It is sent again as long as the turn has not been given back.
+            seen = NO_FRAME if received is None else received.frame.sequence
+            newer = self._frames.wait(newer_than_sequence=seen, timeout_s=1.0)
+            if newer is None:
+                waited_s += 1
+                if waited_s >= patience_s:
+                    raise Abandoned(
+                        f"frame {wanted} of the camera did not come in {patience_s:g} s"
+                    )
+            else:
+                received = newer
+        return received

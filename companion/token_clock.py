@@ -1,0 +1,171 @@
+"""The companion's end of the turns when whoever conducts is another process.
+
+The turn comes as a MAVLink STATUSTEXT behind all telemetry, and goes back as one behind all
+setpoints: both travel through MAVSDK in order. See docs/lockstep.md, "In two processes".
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from queue import Empty, SimpleQueue
+from typing import Protocol
+
+from airl_mav.clock import Clock, SimClock
+from companion.conducted import Abandoned
+from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
+
+FAREWELL_S = 3
+"""After its end the companion stays so long, in case that the word of it is lost [s, as above]."""
+
+
+class TextLink(Protocol):
+    """What carries the words; `link.MavsdkLink` is one."""
+
+    setpoints_sent: int
+
+    def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
+        """Hear the texts of the flight controller; return what sends one to it."""
+        ...
+
+
+class TokenTurns:
+    """Takes turns and gives them back. One flight; all but `_hear` on the companion's thread."""
+
+    def __init__(self, stop: threading.Event, abandon: threading.Event, patience_s: float) -> None:
+        """Wait for nobody yet.
+
+        Args:
+            stop: Set when the companion is told to land, or to abandon the flight.
+            abandon: Set when it is told that there is nothing left to land.
+            patience_s: Longest wait for a turn, or for a frame that a turn names [s of wall time,
+                while this process runs].
+        """
+        self.patience_s = patience_s
+        """Longest wait for anything."""
+        self.frame = NO_FRAME
+        """Sequence of the newest frame that has reached the companion by now."""
+        self.frame_arrived = threading.Event()
+        """Set when there is a newer one; whoever waits for it clears it first."""
+        self._stop, self._abandon = stop, abandon
+        self._clock = SimClock()
+        self._inbox: SimpleQueue[TurnGiven] = SimpleQueue()
+        self._link: TextLink | None = None
+        self._send: Callable[[str], None] = lambda _: None
+        self._number = 0
+        self._said: list[str] = []
+        """All words of this turn, to be said again should they be lost."""
+
+    @property
+    def clock(self) -> Clock:
+        """Simulated time: it moves with the turns."""
+        return self._clock
+
+    @contextmanager
+    def taken(self, link: TextLink) -> Iterator[None]:
+        """Take turns on a connected link for a while; what goes wrong in it ends them, too.
+
+        Raises Abandoned when none comes.
+        """
+        self._link = link
+        self._send = link.exchange_texts(self._hear)
+        self._await_turn()
+        try:
+            yield
+        except Abandoned:
+            raise
+        except BaseException:
+            self._end()
+            raise
+        self._end()
+
+    def sleep(self, wake_us: int, interrupt: threading.Event | None) -> None:
+        """Give the turn back until simulated `wake_us` [µs]; see `conducted.Sleep`.
+
+        Raises:
+            Abandoned: No turn comes any more.
+            ValueError: Nobody could tell of that event: it is neither `stop` nor `frame_arrived`.
+        """
+        sent = 0 if self._link is None else self._link.setpoints_sent
+        self._give_back(TurnBack(self._number, wake_us, sent, self._name_of(interrupt)))
+        self._await_turn()
+
+    def tell(self, phase: str) -> None:
+        """Say that the mission enters a phase."""
+        self._say(Phase(self._number, phase).text())
+
+    def _end(self) -> None:
+        """Give the turn back for good."""
+        self._give_back(TurnBack(self._number, ended=True))
+        for _ in range(FAREWELL_S):
+            given = self._next_given(1.0)
+            if given is not None and given.order == "end":
+                return
+            if given is not None:
+                self._say_again()
+
+    def _name_of(self, interrupt: threading.Event | None) -> Event:
+        if interrupt is None:
+            return ""
+        if interrupt is self.frame_arrived:
+            return "frame"
+        if interrupt is self._stop:
+            return "stop"
+        raise ValueError("a sleep in lockstep can be ended by an order or by a frame only")
+
+    # --- words
+
+    def _hear(self, text: str) -> None:
+        """Take a text of the flight controller, on MAVSDK's thread."""
+        given = TurnGiven.parse(text)
+        if given is not None:
+            self._inbox.put(given)
+
+    def _give_back(self, back: TurnBack) -> None:
+        while self._next_given(0.0) is not None:
+            pass  # said again meanwhile, because this turn took long
+        self._say(back.text())
+
+    def _say(self, text: str) -> None:
+        self._said.append(text)
+        self._send(text)
+
+    def _say_again(self) -> None:
+        for text in self._said:
+            self._send(text)
+
+    def _next_given(self, timeout_s: float) -> TurnGiven | None:
+        try:
+            return self._inbox.get(block=timeout_s > 0.0, timeout=timeout_s or None)
+        except Empty:
+            return None
+
+    def _await_turn(self) -> None:
+        waited_s = 0
+        while waited_s < self.patience_s:
+            # Counted in short waits, not read off a clock: a process that was stopped has not
+            # waited.
+            given = self._next_given(1.0)
+            if given is None:
+                waited_s += 1
+            elif given.number > self._number:
+                self._take(given)
+                return
+            else:
+                self._say_again()
+        raise Abandoned(f"the flight controller gave no turn in {self.patience_s:g} s")
+
+    def _take(self, given: TurnGiven) -> None:
+        if given.order == "end":
+            raise Abandoned("the flight controller has ended the flight")
+        self._number = given.number
+        self._said.clear()
+        self._clock.sleep_until(given.time_us)
+        if given.order == "abandon":
+            self._abandon.set()
+        if given.order:
+            self._stop.set()
+        if given.frame != self.frame:
+            self.frame = given.frame
+            self.frame_arrived.set()

@@ -1,0 +1,105 @@
+"""The words by which two processes pass the turn: texts of MAVLink STATUSTEXTs.
+
+See docs/lockstep.md, "In two processes". At most 50 characters each.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal, cast
+
+Order = Literal["", "land", "abandon", "end"]
+"""What the companion is told: nothing; stop and land; there is nothing left to land; nobody
+conducts any more."""
+
+Event = Literal["", "frame", "stop"]
+"""What wakes the companion early: nothing; the next frame of the camera; an order."""
+
+NO_FRAME = -1
+
+_GIVEN = re.compile(r"F(\d+) (\d+) (-1|\d+)(?: (land|abandon|end))?")
+_BACK = re.compile(r"D(\d+)(?: (end|\d+)(?: (\d+)(?: (frame|stop))?)?)?")
+_PHASE = re.compile(r"P(\d+) (.+)")
+
+
+@dataclass(frozen=True)
+class TurnGiven:
+    """`F<number> <time_us> <frame> [order]`: the companion's turn begins."""
+
+    number: int
+    """Counts up by one."""
+    time_us: int
+    """Simulated time; it stands until the turn is given back [µs]."""
+    frame: int = NO_FRAME
+    """Sequence of the newest frame that has reached the companion."""
+    order: Order = ""
+
+    def text(self) -> str:
+        """Return it as sent."""
+        return f"F{self.number} {self.time_us} {self.frame} {self.order}".rstrip()
+
+    @classmethod
+    def parse(cls, text: str) -> TurnGiven | None:
+        """Read a text; None for any other."""
+        match = _GIVEN.fullmatch(text)
+        if match is None:
+            return None
+        number, time_us, frame, order = match.groups(default="")
+        return cls(int(number), int(time_us), int(frame), cast(Order, order))
+
+
+@dataclass(frozen=True)
+class TurnBack:
+    """`D<number> [<wake_us> [<setpoints_sent> [event]]]`, or `D<number> end`: the turn is over."""
+
+    number: int
+    """As given."""
+    wake_us: int | None = None
+    """When it wants the next turn [µs]; None: it does not say."""
+    setpoints_sent: int | None = None
+    """How many setpoints it has sent so far, repetitions not counted; None: it does not say."""
+    event: Event = ""
+    ended: bool = False
+    """There is no next turn."""
+
+    def text(self) -> str:
+        """Return it as sent."""
+        if self.ended:
+            return f"D{self.number} end"
+        words = (self.wake_us, self.setpoints_sent, self.event or None)
+        return " ".join([f"D{self.number}", *(str(word) for word in words if word is not None)])
+
+    @classmethod
+    def parse(cls, text: str) -> TurnBack | None:
+        """Read a text; None for any other."""
+        match = _BACK.fullmatch(text)
+        if match is None:
+            return None
+        number, wake_us, sent, event = match.groups()
+        return cls(
+            int(number),
+            int(wake_us) if wake_us not in (None, "end") else None,
+            int(sent) if sent is not None else None,
+            cast(Event, event or ""),
+            wake_us == "end",
+        )
+
+
+@dataclass(frozen=True)
+class Phase:
+    """`P<number> <name>`: within its turn the companion has entered a phase of its mission."""
+
+    number: int
+    """Of the turn."""
+    name: str
+
+    def text(self) -> str:
+        """Return it as sent."""
+        return f"P{self.number} {self.name}"
+
+    @classmethod
+    def parse(cls, text: str) -> Phase | None:
+        """Read a text; None for any other."""
+        match = _PHASE.fullmatch(text)
+        return None if match is None else cls(int(match[1]), match[2])
