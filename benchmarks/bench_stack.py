@@ -1,136 +1,223 @@
-"""How fast the flight controller and its vehicle run when nothing waits for the wall clock.
+"""How fast vehicle, flight controller and companion run when nothing waits for the wall clock.
 
     python benchmarks/bench_stack.py
 
-One core, no camera, no companion: a hover with 20 Hz setpoints, (a) plant and autopilot, (b) with
-the MAVLink streams of both links packed as well. Prints multiples of real time and where the time
-of a tick goes.
+On one core. (a) plant and flight controller in a hover with 20 Hz setpoints, (b) with the MAVLink
+streams of the onboard link, and of both links, packed as well, (c) whole flights in lockstep:
+real MAVSDK, depth camera, the default policy at two decisions a second. Prints multiples of real
+time, the best of three, and where the time of a tick goes.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.cli.lockstep import lockstep_plan, policies
+from airl_mav.cli.sitl import SitlCommand, check
 from airl_mav.clock import SimClock
-from airl_mav.constants import TICK_S, US_PER_S
-from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.constants import TICK_S, TICK_US, US_PER_S
+from airl_mav.harness.lockstep.digest import FlightDigest
+from airl_mav.harness.lockstep.flight import LockstepPlan, fly
+from airl_mav.harness.lockstep.link import lockstep_link
+from airl_mav.harness.lockstep.threaded import ThreadPartner
+from airl_mav.policy.actions import Policy
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.state import Mode, Setpoint
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.link import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.plant.plant import Plant
+from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 FLIGHT_S = 30.0
 REPEATS = 3
+SEEDS = (1, 2, 3, 4, 5)
 
 
-class Stopwatch:
-    """Adds up the wall time of calls."""
+class Stopwatches:
+    """Wall time by part; a part's time does not hold that of parts called from it."""
 
     def __init__(self) -> None:
-        self.seconds = 0.0
+        self.seconds: dict[str, float] = {}
+        self._nested = [0.0]
 
-    def wrap(self, call: Callable) -> Callable:
-        def timed(*arguments):
+    def measured(self, part: str, owner: type, name: str) -> Callable[[], None]:
+        """Time a method from now on; return what ends that."""
+        call = getattr(owner, name)
+        self.seconds.setdefault(part, 0.0)
+
+        def timed(*arguments: Any, **named: Any) -> Any:
+            self._nested.append(0.0)
             start = time.perf_counter()
             try:
-                return call(*arguments)
+                return call(*arguments, **named)
             finally:
-                self.seconds += time.perf_counter() - start
+                spent = time.perf_counter() - start
+                self.seconds[part] += spent - self._nested.pop()
+                self._nested[-1] += spent
 
-        return timed
+        setattr(owner, name, timed)
+        return lambda: setattr(owner, name, call)
 
-
-def airborne(vehicle: VehicleProfile) -> Simulation:
-    simulation = Simulation(
-        EpisodeSetup(vehicle, None, 1, WindSettings()), start_us=0, clock=SimClock()
-    )
-    pilot = simulation.autopilot
-    ticks(simulation, 2.0)
-    pilot.arm(force=False)
-    pilot.takeoff(2.5)
-    ticks(simulation, 8.0)
-    command(simulation)
-    pilot.set_mode(Mode.OFFBOARD)
-    return simulation
+    def reset(self) -> None:
+        """Begin anew."""
+        self.seconds = dict.fromkeys(self.seconds, 0.0)
 
 
-def ticks(simulation: Simulation, seconds: float) -> None:
-    for _ in range(round(seconds / TICK_S)):
-        simulation.tick()
+PARTS = (
+    ("plant", Plant, "step"),
+    ("sensors", SensorSuite, "sample"),
+    ("EKF", Estimator, "step"),
+    ("control, commander", BuiltinAutopilot, "step"),
+    ("MAVLink", MavlinkServer, "send"),
+    ("MAVLink", MavlinkServer, "receive"),
+    ("camera", Simulation, "capture_due"),
+    ("policy", LearnedPolicy, "act"),
+    ("MAVSDK: barrier and turns", ThreadPartner, "turn"),
+    ("MAVSDK: feeding", ThreadPartner, "send"),
+    ("fingerprint", FlightDigest, "add"),
+)
 
 
-def command(simulation: Simulation) -> None:
-    free = np.full(3, math.nan)
-    setpoint = Setpoint(free, np.array([1.0, 0.0, 0.0]), math.nan, 0.2)
-    simulation.autopilot.offer_setpoint(setpoint, simulation.time_us)
+@dataclass(frozen=True)
+class Timed:
+    simulated_s: float
+    wall_s: float
+    cpu_s: float
+    """Of all threads of this process; on a core shared with others less than the wall time."""
 
 
-def fly(simulation: Simulation, server: MavlinkServer | None) -> float:
-    """Return simulated seconds per wall second."""
-    every = round(0.05 / TICK_S)
-    n = round(FLIGHT_S / TICK_S)
-    start = time.perf_counter()
-    for i in range(n):
-        if i % every == 0:
-            command(simulation)
-        simulation.tick()
-        if server is not None:
-            server.receive(simulation.time_us)
-            server.send(simulation.time_us)
-    return FLIGHT_S / (time.perf_counter() - start)
+class Timer:
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def timed(self, simulated_s: float) -> Timed:
+        return Timed(simulated_s, time.perf_counter() - self._wall, time.process_time() - self._cpu)
 
 
 def main() -> None:
-    vehicle = load_profile("vehicles", "quad", VehicleProfile)
     console = Console()
-    table = Table("stack", "x real time (best of 3)", "tick [µs]")
-    for name, with_mavlink in (("(a) plant + autopilot", False), ("(b) + MAVLink streams", True)):
-        best = 0.0
-        for _ in range(REPEATS):
-            simulation = airborne(vehicle)
-            server = None
-            if with_mavlink:
-                links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
-                server = MavlinkServer(links, simulation.autopilot, boot_unix_us=0)
-            best = max(best, fly(simulation, server))
-            simulation.close()
-        table.add_row(name, f"{best:.1f}", f"{TICK_S / best * US_PER_S:.0f}")
+    console.print(f"core {pinned()}", highlight=False)
+    vehicle = load_vehicle("quad")
+    plan, policy = lockstep("static-obstacles")
+    flights: dict[str, Callable[[], Timed]] = {
+        "(a) plant + flight controller": lambda: hover(vehicle, ()),
+        "(b) + MAVLink, onboard link": lambda: hover(vehicle, (lockstep_link,)),
+        "(b') + MAVLink, both links": lambda: hover(vehicle, (lockstep_link, gcs_link)),
+        "(c) + MAVSDK, camera, policy": lambda: whole(plan, policy),
+    }
+    table = Table("stack", "x real time (best of 3)", "tick [µs]", "simulated s per CPU second")
+    for name, flight in flights.items():
+        flight()
+        runs = [flight() for _ in range(REPEATS)]
+        best = max(run.simulated_s / run.wall_s for run in runs)
+        per_cpu_s = max(run.simulated_s / run.cpu_s for run in runs)
+        tick_us = f"{TICK_S / best * US_PER_S:.1f}"
+        table.add_row(name, f"{best:.1f}", tick_us, f"{per_cpu_s:.1f}")
     console.print(table)
-    shares(vehicle, console)
+    shares("(b)", lambda begins: hover(vehicle, (lockstep_link,), begins), console)
+    shares("(c)", lambda _: whole(plan, policy), console)
 
 
-def shares(vehicle: VehicleProfile, console: Console) -> None:
-    """Print where the time of a tick goes, by timing each part of the same flight."""
-    simulation = airborne(vehicle)
-    plant, pilot = simulation.plant, simulation.autopilot
-    watches = {name: Stopwatch() for name in ("plant", "sensors", "estimator", "autopilot, rest")}
-    plant.sense = watches["sensors"].wrap(plant.sense)
-    plant.step = watches["plant"].wrap(plant.step)
-    estimator = pilot.estimator
-    estimator.step = watches["estimator"].wrap(estimator.step)
-    pilot.step = watches["autopilot, rest"].wrap(pilot.step)
-    start = time.perf_counter()
-    ticks(simulation, FLIGHT_S)
-    whole = time.perf_counter() - start
+def pinned() -> int:
+    """Keep to one core from now on, MAVSDK's threads too; return its number."""
+    core = max(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, {core})
+    return core
+
+
+def hover(
+    vehicle: VehicleProfile,
+    links: Sequence[Callable[[MemoryEndpoint], LinkConfig]],
+    begins: Callable[[], None] = lambda: None,
+) -> Timed:
+    """Fly slowly by setpoints; the links' frames are packed and thrown away."""
+    setup = EpisodeSetup(vehicle, None, 1, WindSettings())
+    simulation = Simulation(setup, start_us=0, clock=SimClock())
+    pilot = simulation.autopilot
+    for _ in range(round(2.0 / TICK_S)):
+        simulation.tick()
+    pilot.arm(force=False)
+    pilot.takeoff(2.5)
+    for _ in range(round(8.0 / TICK_S)):
+        simulation.tick()
+    free = np.full(3, math.nan)
+    setpoint = Setpoint(free, np.array([1.0, 0.0, 0.0]), math.nan, 0.2)
+    pilot.offer_setpoint(setpoint, simulation.time_us)
+    pilot.set_mode(Mode.OFFBOARD)
+    endpoints = [MemoryEndpoint() for _ in links]
+    server = None
+    if links:
+        opened = [link(endpoint) for link, endpoint in zip(links, endpoints, strict=True)]
+        server = MavlinkServer(opened, pilot, boot_unix_us=0)
+    every = round(0.05 / TICK_S)
+    begins()
+    timer = Timer()
+    for i in range(round(FLIGHT_S / TICK_S)):
+        if i % every == 0:
+            pilot.offer_setpoint(setpoint, simulation.time_us)
+        if server is not None:
+            server.receive(simulation.time_us)
+        simulation.tick()
+        if server is not None:
+            server.send(simulation.time_us)
+            for endpoint in endpoints:
+                endpoint.take()
+    timed = timer.timed(FLIGHT_S)
     simulation.close()
-    seconds = {name: watch.seconds for name, watch in watches.items()}
-    seconds["plant"] -= seconds["sensors"]
-    seconds["autopilot, rest"] -= seconds["estimator"]
-    seconds["recording"] = whole - sum(seconds.values())
-    table = Table("part of a tick", "µs", "share")
+    return timed
+
+
+def lockstep(policy: str) -> tuple[LockstepPlan, Callable[[int], Policy]]:
+    command = SitlCommand(policy=policy, lockstep=True)
+    setup, pilot = check(command)
+    return lockstep_plan(command, setup, pilot), policies(command, pilot.hold_s)
+
+
+def whole(plan: LockstepPlan, policy: Callable[[int], Policy]) -> Timed:
+    """Fly some episodes from boot to disarming, all that belongs to them included."""
+    simulated_us = 0
+    timer = Timer()
+    for seed in SEEDS:
+        flown = fly(plan, policy(seed), 0, seed)
+        path = flown.trajectory.time_us
+        simulated_us += int(path[-1] - path[0]) + TICK_US
+    return timer.timed(simulated_us / US_PER_S)
+
+
+def shares(title: str, flight: Callable[[Callable[[], None]], Timed], console: Console) -> None:
+    """Print where the time of a tick goes, by timing each part of the same flight.
+
+    Each call that is timed costs a fraction of a microsecond more than in the table above.
+    """
+    watches = Stopwatches()
+    ends = [watches.measured(*part) for part in PARTS]
+    try:
+        run = flight(watches.reset)
+    finally:
+        for end in reversed(ends):
+            end()
+    seconds = watches.seconds
+    seconds["the rest"] = run.wall_s - sum(seconds.values())
+    table = Table(f"{title}: part of a tick", "µs", "share")
     for name, spent in seconds.items():
-        table.add_row(
-            name, f"{1e6 * spent * TICK_S / FLIGHT_S:.1f}", f"{100 * spent / whole:.0f} %"
-        )
+        if spent > 0.0:
+            micros = US_PER_S * spent * TICK_S / run.simulated_s
+            table.add_row(name, f"{micros:.2f}", f"{100 * spent / run.wall_s:.0f} %")
     console.print(table)
 
 

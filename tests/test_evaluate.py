@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import os
 import re
 import shutil
 import signal
@@ -30,15 +31,14 @@ from airl_mav.arena.generate import generate
 from airl_mav.cli import evaluate_task
 from airl_mav.cli.evaluate import run
 from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_lockstep import plan_lockstep
 from airl_mav.cli.evaluate_task import sitl_command
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
-from airl_mav.harness import chunks
-from airl_mav.harness import evaluation as campaign
-from airl_mav.harness.chunks import Episode, save_episodes
-from airl_mav.harness.run_folder import LoadedRun, RunFolder, load
+from airl_mav.harness import chunks, evaluation_gym, run_folder
+from airl_mav.harness.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import find_policy
 from airl_mav.ports import Ports
@@ -48,6 +48,7 @@ from airl_mav.report import html
 from airl_mav.report.rebuild import rebuild
 
 EPISODES = 30
+LOCKSTEP = {"level": "lockstep"}
 DENSE: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "seed": 20}
 """Where some flights reach the goal and some do not."""
 
@@ -415,9 +416,9 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
 
 SCRIPT = """
 import sys
-from airl_mav.harness import evaluation
+from airl_mav.harness import chunks
 from airl_mav.report import html
-evaluation.CHUNK, html.MAX_PICTURED = 5, 1
+chunks.EVERY_S, chunks.MOST, html.MAX_PICTURED = 60.0, 5, 1
 from airl_mav.cli.main import main
 main()
 """
@@ -469,23 +470,24 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
 ) -> None:
     out = tmp_path / "run"
     options = {"arena": ("no-obstacles",), "episodes": 60, "out": out}
-    monkeypatch.setattr(campaign, "CHUNK", 20)
-    calls = []
+    monkeypatch.setattr(chunks, "EVERY_S", 60.0)
+    monkeypatch.setattr(chunks, "MOST", 20)
+    real, calls = RunFolder.save_episodes, []
 
-    def save(folder: RunFolder, episodes: Sequence[Episode]) -> None:
+    def save(folder: RunFolder, episodes: Sequence[FlownEpisode]) -> None:
         calls.append(len(episodes))
         if len(calls) > 1:
             # The arrays get onto the disk, the lines do not.
-            monkeypatch.setattr(chunks, "EPISODES_FILE", "lost")
-        save_episodes(folder, episodes)
+            monkeypatch.setattr(run_folder, "EPISODES_FILE", "lost")
+        real(folder, episodes)
         if len(calls) > 1:
             raise OSError("the machine is gone")
 
     with monkeypatch.context() as patched:
-        patched.setattr(campaign, "save_episodes", save)
+        patched.setattr(RunFolder, "save_episodes", save)
         with pytest.raises(OSError, match="the machine is gone"):
             evaluate("greedy", **options)
-    monkeypatch.setattr(chunks, "EPISODES_FILE", "episodes.jsonl")
+    monkeypatch.setattr(run_folder, "EPISODES_FILE", "episodes.jsonl")
     with np.load(out / "trajectories.npz") as archive:
         assert len({name.partition("/")[0] for name in archive.files}) == 40
     lines = (out / "episodes.jsonl").read_bytes()
@@ -501,7 +503,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_, text = greedy
-    monkeypatch.setattr(campaign, "fly_seeds", None)
+    monkeypatch.setattr(evaluation_gym, "fly_seeds", None)
     before = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
     code, again = evaluate("greedy", page=True, slots=3, out=run_.path, **DENSE)
     assert code == 0
@@ -572,6 +574,17 @@ def test_a_changed_arena_file_is_another_run(tmp_path: Path) -> None:
         (("greedy", "greedy"), {}, "greedy twice"),
         (("greedy",), {"arena": ("no-obstacles", "no-obstacles")}, "no-obstacles twice"),
         (("greedy",), {"level": "sitl", "speed": 100.0}, "--speed 100"),
+        (("greedy",), {"workers": 2}, "--workers 2 with --level gym"),
+        (("greedy",), {"level": "sitl", "workers": 2}, "--workers 2 with --level sitl"),
+        (("greedy",), {"tlogs": True}, "--tlogs with --level gym"),
+        (("greedy",), {"workers": 0} | LOCKSTEP, "--workers 0: accepted: 1 <= value <= 256"),
+        (("greedy",), {"workers": 257} | LOCKSTEP, "--workers 257"),
+        (("greedy",), {"speed": 0.001} | LOCKSTEP, "--speed 0.001: accepted: 0.01"),
+        (("greedy",), {"speed": 2000.0} | LOCKSTEP, "--speed 2000"),
+        (("greedy",), {"ablate": "depth"} | LOCKSTEP, "not a learned policy"),
+        (("greedy",), {"arena": ("moon",)} | LOCKSTEP, "'moon'"),
+        (("greedy",), {"hold": 11.0} | LOCKSTEP, "--hold 11"),
+        (("greedy",), {"time_limit": 0.5} | LOCKSTEP, "--time-limit 0.5"),
     ],
 )
 def test_what_cannot_be_used_is_refused_before_anything_flies(
@@ -702,6 +715,21 @@ def test_level_sitl_is_a_rehearsal_by_the_rules_of_the_card(tmp_path: Path) -> N
         "goal radius 2.5 m, hold 0.4 s"
         in evaluate_task.prepare(command, str(folder), "no-obstacles").rules
     )
+
+
+def test_level_lockstep_is_the_same_rehearsal_on_all_usable_cores(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "policy", hover_after_s=0.06)
+    options: dict[str, Any] = {"episodes": 7, "seed": 11, "level": "lockstep"}
+    for workers, wanted in ((None, len(os.sched_getaffinity(0))), (5, 5)):
+        command = EvaluateCommand((str(folder),), workers=workers, **options)
+        rehearsal = sitl_command(command, find_policy(str(folder)), str(folder), "no-obstacles")
+        assert rehearsal.lockstep
+        assert rehearsal.speed is None
+        run_, pilot = plan_lockstep(command, rehearsal)
+        assert run_.workers == wanted
+        assert run_.evaluation.seeds == tuple(range(11, 18))
+        assert (pilot.goal_radius_m, pilot.hold_s) == (2.5, 0.4)
+        assert run_.evaluation.config["watchdog"]["hover_after_s"] == 0.06
 
 
 @pytest.mark.slow

@@ -179,13 +179,13 @@ def test_kill_9_at_any_moment_loses_one_episode_at_most(tmp_path: Path) -> None:
 def test_archives_are_the_same_bytes_for_the_same_arrays(tmp_path: Path) -> None:
     arrays = {"x": np.arange(5), "y": np.ones((2, 3), np.float32)}
     for name in ("a.npz", "b.npz"):
-        add_arrays(tmp_path / name, "000/", arrays)
-        add_arrays(tmp_path / name, "001/", arrays)
+        add_arrays(tmp_path / name, {"000": arrays})
+        add_arrays(tmp_path / name, {"001": arrays})
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with np.load(tmp_path / "a.npz") as archive:
         assert archive.files == ["000/x", "000/y", "001/x", "001/y"]
         assert archive["001/y"].dtype == np.float32
-    add_arrays(tmp_path / "a.npz", "000/", {"x": np.arange(2)})
+    add_arrays(tmp_path / "a.npz", {"000": {"x": np.arange(2)}})
     with np.load(tmp_path / "a.npz") as archive:
         assert sorted(archive.files) == ["000/x", "001/x", "001/y"]
         assert archive["000/x"].tolist() == [0, 1]
@@ -193,10 +193,10 @@ def test_archives_are_the_same_bytes_for_the_same_arrays(tmp_path: Path) -> None
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
-    add_arrays(path, "000/", {"x": np.arange(5)})
+    add_arrays(path, {"000": {"x": np.arange(5)}})
     before = path.read_bytes()
     with pytest.raises(ValueError, match="Object arrays"):
-        add_arrays(path, "001/", {"x": np.arange(3), "bad": np.array([object()])})
+        add_arrays(path, {"001": {"x": np.arange(3), "bad": np.array([object()])}})
     assert path.read_bytes() == before
     replace_file(path, b"new")
     assert path.read_bytes() == b"new"

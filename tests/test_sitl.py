@@ -234,7 +234,7 @@ def test_injected_latency(tmp_path: Path) -> None:
     run = sitl(tmp_path, *pi, "--episodes", "1", "--arena", str(arena), "--speed", "3")
     archive = run.arrays("latency.npz")
     t2_us = archive["000/action_ready_us"] - archive["000/infer_start_us"]
-    assert len(t2_us) >= 8
+    assert len(t2_us) >= 6
     latency = load_computer("ras-pi-4").workloads["template-5x32"].latency
     sampler = build_sampler(latency, np.random.default_rng(1))
     drawn_us = np.array([sampler.sample_us() for _ in t2_us])

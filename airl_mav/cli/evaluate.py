@@ -14,7 +14,9 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.statistics import aggregate
+from airl_mav.harness.evaluation import run_sha256
 from airl_mav.harness.run_folder import RUN_FILE
+from airl_mav.harness.workers import GREATEST_WORKERS
 from airl_mav.policy.card import Result as CardResult
 from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
@@ -45,7 +47,7 @@ def run(command: EvaluateCommand, console: Console | None = None) -> int:
         console: Where to print; None means standard output.
 
     Returns:
-        Exit status: 0 all episodes flown, 1 a process died (sitl), 130 Ctrl-C.
+        Exit status: 0 all episodes flown, 1 a process died (sitl, lockstep), 130 Ctrl-C.
 
     Raises:
         UsageError: The input cannot be used.
@@ -69,8 +71,7 @@ def _check(command: EvaluateCommand) -> list[str]:
         raise UsageError("no policy; accepted: one or more names or folders")
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
-    if command.level == "sitl" and command.ablate is not None:
-        raise UsageError(f"--ablate {command.ablate}: accepted: with --level gym")
+    _check_level(command)
     found = [find_policy(name) for name in command.policies]
     if command.on_card:
         _check_plain(command, found)
@@ -80,6 +81,22 @@ def _check(command: EvaluateCommand) -> list[str]:
         return list(command.arena)
     trained = [None if policy.card is None else policy.card.training.arena for policy in found]
     return list(dict.fromkeys(arena or DEFAULT_ARENA for arena in trained))
+
+
+def _check_level(command: EvaluateCommand) -> None:
+    """Raise UsageError for options that the level does not have."""
+    level = command.level
+    if level == "sitl" and command.ablate is not None:
+        raise UsageError(f"--ablate {command.ablate}: accepted: with --level gym or lockstep")
+    if level != "lockstep" and command.tlogs:
+        raise UsageError(f"--tlogs with --level {level}: accepted: with --level lockstep")
+    if command.workers is None:
+        return
+    if level != "lockstep":
+        raise UsageError(
+            f"--workers {command.workers} with --level {level}: accepted: with --level lockstep"
+        )
+    check_range("--workers", command.workers, 1, GREATEST_WORKERS)
 
 
 def _check_plain(command: EvaluateCommand, policies: Sequence[PolicyInfo]) -> None:
@@ -145,8 +162,9 @@ def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
     _write_on_card(command, task, result)
     if not result.episodes:
         console.print(f"no episode was finished; {result.path}", soft_wrap=True)
-    elif command.level == "gym":
+    elif command.level != "sitl":
         report.run(report.ReportCommand(result.path), console)
+    _say_fingerprint(result, console)
     return result.code
 
 
@@ -166,11 +184,13 @@ def _fly_matrix(command: EvaluateCommand, tasks: Sequence[Task], console: Consol
         result = task.fly(root / f"{task.policy.name}-{task.arena_name}", console)
         _write_on_card(command, task, result)
         if result.episodes:
-            if command.level == "gym" and (result.new or not (result.path / REPORT_FILE).exists()):
+            shown = (result.path / REPORT_FILE).exists() and not result.new
+            if command.level != "sitl" and not shown:
                 rebuild(result.path)
             cells.append(_cell(task, result))
             write_matrix(root, facts, cells)
             _say_how_it_went(cells[-1], console)
+            _say_fingerprint(result, console)
         if code := result.code:
             break
     for view in matrix_tables(cells):
@@ -190,6 +210,12 @@ def _say_how_it_went(cell: Cell, console: Console) -> None:
     console.print(
         f"{cell.policy} in {cell.arena}: {told}", soft_wrap=True, markup=False, highlight=False
     )
+
+
+def _say_fingerprint(result: EvaluationResult, console: Console) -> None:
+    """Print one line that compares whole runs, where flights are the same every time."""
+    if not result.code and (sha256 := run_sha256(result.episodes)) is not None:
+        console.print(f"sha256 of the flights  {sha256}", soft_wrap=True, highlight=False)
 
 
 def _cell(task: Task, result: EvaluationResult) -> Cell:

@@ -32,12 +32,13 @@ class EvaluateCommand:
     seed: int = 1
     """Seed; episode i uses seed + i, with every policy and arena."""
 
-    level: Literal["gym", "sitl"] = "gym"
-    """gym: the batch twin, some hundred episodes a second. sitl: as airl-sitl flies, in real time
-    times --speed."""
+    level: Literal["gym", "lockstep", "sitl"] = "gym"
+    """gym: the batch twin, some hundred episodes a second. lockstep: as airl-sitl --lockstep flies,
+    the same every time, bit by bit, on all cores. sitl: as airl-sitl flies, in real time times
+    --speed."""
 
     ablate: Literal["depth", "velocity", "goal"] | None = None
-    """Input of the network that is made zero, at level gym. None: none."""
+    """Input of the network that is made zero, not at level sitl. None: none."""
 
     vehicle: str = "quad"
     """Vehicle profile: a shipped name, or a path to a .toml."""
@@ -47,8 +48,8 @@ class EvaluateCommand:
 
     workload: str | None = None
     """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
-    policy. None: what was measured for this very policy, or else 1 ms (gym), or what this machine
-    takes (sitl)."""
+    policy. None: what was measured for this very policy, or else 1 ms (gym, lockstep), or what this
+    machine takes (sitl)."""
 
     goal_radius: float | None = None
     """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
@@ -71,8 +72,16 @@ class EvaluateCommand:
     slots: int = 128
     """Flights at a time at level gym, >= 1. Decides the pace, not the results."""
 
-    speed: float = 1.0
-    """Level sitl: simulated seconds per wall second, 0.5 to 10."""
+    workers: int | None = None
+    """Level lockstep: processes, each with one flight at a time, 1 to 256. Decides the pace, not
+    the results. None: as many as there are usable cores."""
+
+    tlogs: bool = False
+    """Level lockstep: write the MAVLink log of every flight. Level sitl always does."""
+
+    speed: float | None = None
+    """Simulated seconds per wall second: level sitl 0.5 to 10, level lockstep 0.01 to 1000. None:
+    1, or in lockstep as fast as it goes."""
 
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports of level sitl."""

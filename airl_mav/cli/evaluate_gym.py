@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
-from pydantic import BaseModel
-
 from airl_mav.cli.common import check_range
-from airl_mav.cli.companion import CHANCE_STREAM, PilotOptions, pilot_settings
+from airl_mav.cli.companion_command import PilotOptions, chance, pilot_settings
 from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_settings import policy_part, seeds, settings
 from airl_mav.envs.evaluation import LearnedPilots, Pilots, SinglePilots
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
-from airl_mav.harness.evaluation import GymPlan
-from airl_mav.latency.injection import Injection, choose_injection
+from airl_mav.harness.evaluation import Evaluation
+from airl_mav.harness.evaluation_gym import GymPlan
+from airl_mav.latency.injection import choose_injection, without_timing
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, find_policy, load_policy
@@ -46,45 +43,35 @@ def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[
         raise UsageError(f"policy {policy}: vehicle {command.vehicle}: {reason}")
     environment = _environment(command, info, arena, vehicle.camera)
     pilots = _pilots(command, policy, environment)
-    injection = _injection(
+    injection = without_timing(
         choose_injection(computer, command.workload, policy_sha256=info.sha256, macs=info.macs),
         environment.delay.native_ms,
+        command.level,
     )
     # What cannot be flown is better found here: makes an arena, and looks at camera and hold.
     trial = Navigation(environment, 1, injection=injection)
     trial.begin([0], [command.seed])
     hover_s = environment.episode.hover_after_s
-    without = f" (its input {command.ablate!r} made zero)" if command.ablate else ""
     setup = Setup(
         level="gym",
         vehicle=Part(command.vehicle, vehicle.description),
         arena=Part(arena, trial.arena_spec.description),
-        policy=Part(info.name, f"{info.description}{without}"),
+        policy=policy_part(command, info),
         computer=Part(command.computer, computer.description),
         computer_watts=computer.watts,
         injection=injection,
         speed=None,
         between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
     )
-    config: dict[str, Any] = {
-        "command": "airl evaluate",
-        "level": "gym",
-        "policy": info.name,
-        "policy_path": policy,
-        "policy_sha256": info.sha256,
-        "ablate": command.ablate,
-        "episodes": command.episodes,
-        "seed": command.seed,
+    config = {
+        **settings(
+            command, info, policy, vehicle=vehicle, arena=trial.arena_spec, computer=computer
+        ),
         "slots": command.slots,
         "environment": environment.model_dump(mode="json"),
-        "profiles_sha256": {
-            "vehicle": _fingerprint(vehicle),
-            "arena": _fingerprint(trial.arena_spec),
-            "computer": _fingerprint(computer),
-        },
     }
-    seeds = tuple(range(command.seed, command.seed + command.episodes))
-    return GymPlan(environment, injection, setup, seeds, config, command.slots), pilots
+    evaluation = Evaluation(setup, seeds(command), config)
+    return GymPlan(evaluation, environment, injection, command.slots), pilots
 
 
 def _environment(
@@ -134,18 +121,5 @@ def _pilots(command: EvaluateCommand, policy: str, environment: EnvironmentSpec)
     loaded = load_policy(policy, hold_s, ablate=command.ablate)
     if isinstance(loaded, LearnedPolicy):
         # As the companion draws them.
-        return LearnedPilots(loaded, lambda seed: np.random.default_rng((seed, CHANCE_STREAM)))
+        return LearnedPilots(loaded, chance)
     return SinglePilots(lambda: load_policy(policy, hold_s), environment.max_speed_m_s)
-
-
-def _injection(chosen: Injection, native_ms: float) -> Injection:
-    """Return the latency with the words of a level that times nothing."""
-    if chosen.latency is not None:
-        return chosen
-    label = f"{native_ms:g} ms in every decision, as of a desktop computer"
-    return replace(chosen, origin="injected", label=label, assumed="level gym times nothing")
-
-
-def _fingerprint(profile: BaseModel) -> str:
-    """Return a digest of a profile's values: the name alone does not tell a changed one."""
-    return hashlib.sha256(profile.model_dump_json().encode()).hexdigest()

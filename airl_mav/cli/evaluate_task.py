@@ -1,29 +1,30 @@
-"""One policy in one arena, flown at level gym or sitl, with what a person sees meanwhile."""
+"""One policy in one arena, flown at any level, with what a person sees meanwhile."""
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from airl_mav.cli import report, sitl
-from airl_mav.cli.common import EXIT_INTERRUPTED
+from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
+from airl_mav.cli.episode_bar import EpisodeBar, stop_on_signals
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_gym import plan_evaluation
+from airl_mav.cli.evaluate_lockstep import plan_lockstep
 from airl_mav.clock import utc_now
-from airl_mav.envs.evaluation import Pilots
 from airl_mav.errors import UsageError
-from airl_mav.flight.judge import TIME_LIMIT_S, Outcome
+from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.evaluation import GymPlan, another_config, fly_plan, open_folder
-from airl_mav.harness.run_folder import RUN_FILE, load
+from airl_mav.harness.evaluation import Evaluation, another_config, open_folder
+from airl_mav.harness.evaluation_gym import fly_gym
+from airl_mav.harness.evaluation_lockstep import fly_lockstep
+from airl_mav.harness.run_folder import RUN_FILE, RunFolder, load
+from airl_mav.harness.workers import WorkerError
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
@@ -31,6 +32,11 @@ from companion.watchdog import WatchdogSettings
 
 SAME_IN_SITL = ("policy", "arena", "vehicle", "computer", "workload", "episodes", "seed")
 """Settings by which a finished run of level sitl is known again."""
+
+Finished = Callable[[EpisodeRecord], None]
+Say = Callable[[str], None]
+FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Finished, Say, Callable[[], bool]], None]
+"""Flies what is left into a folder that holds some episodes already, until told to stop."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +72,25 @@ class Task:
 def prepare(command: EvaluateCommand, policy: str, arena: str) -> Task:
     """Check everything that can be wrong before anything flies. Raises UsageError."""
     info = find_policy(policy)
-    if command.level == "sitl":
-        rehearsal = sitl_command(command, info, policy, arena)
+    if command.level == "gym":
+        plan, pilots = plan_evaluation(command, policy, arena)
+        episode = plan.environment.episode
+        rules = episode.goal_radius_m, episode.hold_s, episode.altitude_m, episode.time_limit_s
+
+        def in_the_twin(*where: Any) -> None:
+            folder, done, finished, _, stop = where
+            fly_gym(plan, folder, pilots, done, finished, stop)
+
+        return Task(info, arena, _in_words(*rules), partial(_fly, plan.evaluation, in_the_twin))
+    rehearsal = sitl_command(command, info, policy, arena)
+    if command.level == "lockstep":
+        run, pilot = plan_lockstep(command, rehearsal)
+        fly = partial(_fly, run.evaluation, partial(fly_lockstep, run))
+    else:
         _, pilot = sitl.check(rehearsal)
-        rules = pilot.goal_radius_m, pilot.hold_s, pilot.altitude_m, rehearsal.time_limit
-        return Task(info, arena, _in_words(*rules), partial(_fly_sitl, rehearsal))
-    plan, pilots = plan_evaluation(command, policy, arena)
-    episode = plan.environment.episode
-    rules = episode.goal_radius_m, episode.hold_s, episode.altitude_m, episode.time_limit_s
-    return Task(info, arena, _in_words(*rules), partial(_fly_gym, plan, pilots))
+        fly = partial(_fly_sitl, rehearsal)
+    rules = pilot.goal_radius_m, pilot.hold_s, pilot.altitude_m, rehearsal.time_limit
+    return Task(info, arena, _in_words(*rules), fly)
 
 
 def _in_words(radius_m: float, hold_s: float, altitude_m: float, limit_s: float) -> str:
@@ -84,48 +100,47 @@ def _in_words(radius_m: float, hold_s: float, altitude_m: float, limit_s: float)
     )
 
 
-def _fly_gym(plan: GymPlan, pilots: Pilots, out: Path | None, console: Console) -> Result:
-    """Fly what is left of a plan."""
-    setup = plan.setup
-    without = f"-no-{plan.config['ablate']}" if plan.config["ablate"] else ""
-    label = f"evaluate-{setup.policy.name}{without}-{Path(setup.arena.name).stem}"
-    folder, done = open_folder(out, label, plan)
+def _fly(evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: Console) -> Result:
+    """Fly what is left of an evaluation."""
+    setup, config = evaluation.setup, evaluation.config
+    arena = Path(setup.arena.name).stem
+    without = f"-no-{config['ablate']}" if config["ablate"] else ""
+    level = "" if setup.level == "gym" else f"-{setup.level}"
+    label = f"evaluate-{setup.policy.name}{without}-{arena}{level}"
+    folder, done = open_folder(out, label, evaluation)
+    planned = len(evaluation.seeds)
     if done:
-        console.print(
-            f"{folder.path}: {len(done)} of {len(plan.seeds)} episodes are there",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-    flown: list[EpisodeRecord] = []
-    title = f"{setup.policy.name} in {Path(setup.arena.name).stem}"
-    with EpisodeBar(console, title, len(plan.seeds)) as bar, stop_on_signals() as stop:
+        _say(console, f"{folder.path}: {len(done)} of {planned} episodes are there")
+    flown = list(done)
+    broken = False
+    title = f"{setup.policy.name} in {arena}"
+    with EpisodeBar(console, title, done, planned) as bar, stop_on_signals() as stop:
 
         def finished(record: EpisodeRecord) -> None:
             flown.append(record)
             bar.finished(record)
 
-        for record in done:
-            finished(record)
-        fly_plan(plan, folder, pilots, done, finished, stop)
-    code = 0
-    if len(flown) < len(plan.seeds):
-        console.print(
-            f"interrupted: what was flown is kept; --out {folder.path} goes on",
-            style="yellow",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-        code = EXIT_INTERRUPTED
+        try:
+            fly_rest(folder, done, finished, bar.say, stop)
+        except WorkerError as error:
+            _say(console, f"error: {error}", "red")
+            broken = True
+    if left := len(flown) < planned:
+        ended = "broken off" if broken else "interrupted"
+        _say(console, f"{ended}: what was flown is kept; --out {folder.path} goes on", "yellow")
     episodes = tuple(sorted(flown, key=lambda record: record.index))
+    code = EXIT_BROKEN if broken else EXIT_INTERRUPTED if left else 0
     return Result(folder.path, code, episodes, len(flown) - len(done))
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    console.print(text, style=style, soft_wrap=True, markup=False, highlight=False)
 
 
 def sitl_command(
     command: EvaluateCommand, policy: PolicyInfo, path: str, arena: str
 ) -> sitl.SitlCommand:
-    """Return the rehearsal that an evaluation at level sitl is."""
+    """Return the rehearsal that an evaluation at level sitl or lockstep is."""
     hover_s = command.hover_after
     if hover_s is None and policy.card is not None:
         hover_s = policy.card.hover_after_s
@@ -137,6 +152,7 @@ def sitl_command(
         workload=command.workload,
         episodes=command.episodes,
         seed=command.seed,
+        lockstep=command.level == "lockstep",
         speed=command.speed,
         goal_radius=command.goal_radius,
         time_limit=TIME_LIMIT_S if command.time_limit is None else command.time_limit,
@@ -175,64 +191,3 @@ def _check_finished(path: Path, rehearsal: sitl.SitlCommand) -> None:
             f"--out {path}: {len(run.episodes)} of {rehearsal.episodes} episodes, and level sitl "
             "cannot go on; accepted: a new folder"
         )
-
-
-class EpisodeBar:
-    """A progress bar over the episodes, with the success rate so far."""
-
-    def __init__(self, console: Console, title: str, episodes: int) -> None:
-        self._progress = Progress(
-            TextColumn(title, markup=False),
-            BarColumn(bar_width=24),
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[rate]}"),
-            console=console,
-            transient=True,
-        )
-        self._task = self._progress.add_task("episodes", total=episodes, rate="")
-        self._flown = self._reached = 0
-
-    def __enter__(self) -> EpisodeBar:
-        """Start drawing, if there is somebody to see it."""
-        if self._progress.console.is_interactive:
-            self._progress.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Stop drawing."""
-        if self._progress.console.is_interactive:
-            self._progress.stop()
-
-    def finished(self, record: EpisodeRecord) -> None:
-        """Count an episode."""
-        self._flown += 1
-        self._reached += record.outcome is Outcome.SUCCESS
-        rate = f"{100.0 * self._reached / self._flown:.1f} % reached the goal"
-        self._progress.update(self._task, completed=self._flown, rate=rate)
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C or SIGTERM has come; a second one is not waited for.
-
-    So nothing is torn: what has ended is saved before the command leaves.
-    """
-    seen: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        if seen:
-            raise KeyboardInterrupt
-        seen.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(seen)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

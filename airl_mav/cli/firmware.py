@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import signal
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena
-from airl_mav.channel import (
-    ChildChannel,
-    Failed,
-    FinishEpisode,
-    Loaded,
-    LoadEpisode,
-    Ready,
-    Saved,
-    Shutdown,
-    State,
-    Text,
-)
+from airl_mav.channel import ChildChannel, Failed, LoadEpisode, Ready, Shutdown
+from airl_mav.cli import firmware_lockstep
 from airl_mav.cli.common import (
+    EXIT_BROKEN,
     EXIT_USAGE,
     GREATEST_SEED,
     check_ports,
@@ -37,34 +26,27 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
-from airl_mav.clock import WallClock, utc_now
+from airl_mav.cli.firmware_lockstep import LockstepBench, LockstepOptions, Sockets, remote_plan
+from airl_mav.cli.firmware_service import Bench, Service, WallBench, unix_us
+from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
-from airl_mav.frames import quat_yaw
+from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from firmware_sim.autopilot.commander import Flight, Phase
-from firmware_sim.autopilot.state import Message, Mode
+from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.px4_links import px4_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
-from firmware_sim.plant.plant import Collision
 from firmware_sim.plant.wind import WindSettings
-from firmware_sim.plant.world import FLOOR
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
 
 MAX_SPEED = 100.0
 """Greatest --speed; what a host cannot keep up with is given up and reported."""
-
-TOUCHDOWN_M_S = 2.0
-"""A slower touch of the floor is a landing: PX4 comes down with 0.7 to 1.5 m/s [m/s]."""
-
-STATE_EVERY = 10
-"""The harness hears the true state every so many ticks: 25 Hz."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +62,9 @@ class FirmwareCommand:
     seed: int = 1
     """Seed of arena, sensors and wind."""
 
-    speed: float | Literal["max"] = 1.0
+    speed: float | Literal["max"] | None = None
     """Simulated seconds per wall second, > 0; max: as fast as it goes, for clients that do not
-    live by the wall clock."""
+    live by the wall clock. None: 1, or with --lockstep max."""
 
     duration: float | None = None
     """End after so much simulated time, s. None: on Ctrl-C."""
@@ -105,11 +87,30 @@ class FirmwareCommand:
     insecure: bool = False
     """Allow addresses that other machines can reach. MAVLink has no authentication here yet."""
 
+    lockstep: bool = False
+    """Simulated time waits for one companion that passes turns (airl-companion --lockstep, or any
+    program that keeps to docs/lockstep.md): the same flight every time, bit by bit. There is no
+    ground station then, and the end of the companion ends the flight."""
+
+    turns: tyro.conf.OmitArgPrefixes[LockstepOptions] = field(default_factory=LockstepOptions)
+    """Lockstep."""
+
     tlog: Path | None = None
     """Write the MAVLink log of the onboard link to this file. None: no log."""
 
     control: Literal["stdio"] | None = None
     """stdio: take requests from a harness, JSON lines on standard input. None: stand alone."""
+
+
+def check(command: FirmwareCommand) -> None:
+    """Check what can be wrong before a port is bound. Raises UsageError."""
+    check_ports(command.ports, free=True)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    if command.duration is not None:
+        check_range("--duration", command.duration, 0.0, 1e6)
+    check_wind(command.wind)
+    if command.tlog is not None and not command.tlog.parent.is_dir():
+        raise UsageError(f"--tlog {command.tlog}: no folder {command.tlog.parent}")
 
 
 def build(command: FirmwareCommand) -> Firmware:
@@ -118,14 +119,8 @@ def build(command: FirmwareCommand) -> Firmware:
     Raises:
         UsageError: An option is out of range, a port taken, an address unusable.
     """
-    check_ports(command.ports, free=True)
-    check_range("--seed", command.seed, 0, GREATEST_SEED)
-    if command.duration is not None:
-        check_range("--duration", command.duration, 0.0, 1e6)
-    check_wind(command.wind)
-    if command.tlog is not None and not command.tlog.parent.is_dir():
-        raise UsageError(f"--tlog {command.tlog}: no folder {command.tlog.parent}")
-    pacing = pacing_of(command.speed)
+    check(command)
+    pacing = pacing_of(1.0 if command.speed is None else command.speed)
     ports = command.ports
     server = px4_server(
         bind=command.bind,
@@ -142,6 +137,14 @@ def build(command: FirmwareCommand) -> Firmware:
         server.close()
         raise
     return Firmware(server, camera, pacing)
+
+
+def open_sockets(command: FirmwareCommand) -> Sockets:
+    """Bind the ports of a flight in lockstep. Raises UsageError as `build`."""
+    check(command)
+    return Sockets.open(
+        command.ports, command.bind, command.companion_host, insecure=command.insecure
+    )
 
 
 def pacing_of(speed: float | Literal["max"]) -> Pacing:
@@ -162,15 +165,11 @@ def setup(
     return EpisodeSetup(vehicle, concrete, seed, command.wind)
 
 
-def unix_us() -> int:
-    """Return the calendar time [µs since 1970], for log headers."""
-    return int(utc_now().timestamp() * US_PER_S)
-
-
 def main() -> None:
     """Entry point of `airl-firmware`."""
     command = tyro.cli(FirmwareCommand, prog="airl-firmware")
-    run_command(lambda: serve(command) if command.control else stand_alone(command))
+    alone = lockstep if command.lockstep else stand_alone
+    run_command(lambda: serve(command) if command.control else alone(command))
 
 
 def stand_alone(command: FirmwareCommand) -> int:
@@ -178,26 +177,13 @@ def stand_alone(command: FirmwareCommand) -> int:
     console = Console()
     vehicle = load_vehicle(command.vehicle)
     firmware = build(command)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    firmware.on_message = lambda m: console.print(
-        f"[{m.severity.name.lower()}] {m.text}", markup=False
-    )
+    stop = _stopped_by_signals()
+    firmware.on_message = _printer(console)
     try:
         episode = setup(command, vehicle, command.arena, command.seed, command.seed)
         warm_up(vehicle)
         firmware.load(episode, command.tlog, unix_us())
-        arena: Arena | None = episode.arena
-        console.print(
-            f"MAVSDK            udpin://{command.companion_host}:{command.ports.api_port}"
-        )
-        console.print(f"QGroundControl    UDP port {command.ports.gcs_port} (connects by itself)")
-        console.print(f"depth camera      {firmware.camera_endpoint}")
-        if arena is not None:
-            console.print(
-                f"goal              {arena.goal[0]:.1f} {arena.goal[1]:.1f} (north east, m)"
-            )
+        _print_addresses(command, firmware.camera_endpoint, episode, console)
         console.print("Ctrl-C ends it.")
         fly(firmware, stop, command.duration, console)
     finally:
@@ -228,6 +214,59 @@ def fly(
         )
 
 
+def lockstep(command: FirmwareCommand) -> int:
+    """Fly with one companion that passes turns, until it has ended."""
+    console = Console(soft_wrap=True)
+    vehicle = load_vehicle(command.vehicle)
+    plan = remote_plan(command.turns, command.speed)
+    with closing(open_sockets(command)) as sockets:
+        stop = _stopped_by_signals()
+        episode = setup(command, vehicle, command.arena, command.seed, command.seed)
+        warm_up(vehicle)
+        with closing(sockets.stage(plan, stop.is_set)) as stage:
+            stage.firmware.on_message = _printer(console)
+            started_us = stage.load(episode, command.tlog).time_us
+            _print_addresses(command, sockets.camera.endpoint, episode, console)
+            console.print("waiting for a companion that passes turns. Ctrl-C ends it.")
+            end_us = None
+            if command.duration is not None:
+                end_us = started_us + int(command.duration * US_PER_S)
+            try:
+                firmware_lockstep.fly(stage, stop, end_us, console)
+            except LockstepError as error:
+                console.print(f"error: {error}", style="red", markup=False)
+                return EXIT_BROKEN
+    return 0
+
+
+def _stopped_by_signals() -> threading.Event:
+    """Return an event that Ctrl-C sets."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _printer(console: Console) -> Callable[[Message], None]:
+    """Return what prints the autopilot's texts."""
+    return lambda m: console.print(f"[{m.severity.name.lower()}] {m.text}", markup=False)
+
+
+def _print_addresses(
+    command: FirmwareCommand, camera: str, episode: EpisodeSetup, console: Console
+) -> None:
+    """Say where to connect, and where to fly."""
+    console.print(f"MAVSDK            udpin://{command.companion_host}:{command.ports.api_port}")
+    if not command.lockstep:
+        console.print(f"QGroundControl    UDP port {command.ports.gcs_port} (connects by itself)")
+    console.print(f"depth camera      {camera}")
+    if episode.arena is not None:
+        goal = [float(metres) for metres in episode.arena.goal]
+        # In lockstep the last digit counts.
+        north, east = (repr(m) if command.lockstep else f"{m:.1f}" for m in goal)
+        console.print(f"goal              {north} {east} (north east, m)", highlight=False)
+
+
 def serve(command: FirmwareCommand) -> int:
     """Fly episodes on request of a harness."""
     channel = ChildChannel.on_stdio()
@@ -235,128 +274,30 @@ def serve(command: FirmwareCommand) -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     requests: queue.Queue[Any] = queue.Queue()
     channel.listen(requests.put, lambda: requests.put(Shutdown()))
+
+    def episode(request: LoadEpisode) -> EpisodeSetup:
+        return setup(command, vehicle, request.arena, request.arena_seed, request.seed)
+
     try:
         vehicle = load_vehicle(command.vehicle)
-        firmware = build(command)
-        warm_up(vehicle)
-    except UsageError as error:
+        # A request while the companion is waited for: the harness has given it up.
+        bench = _bench(command, broken_off=lambda: not requests.empty())
+        with closing(bench):
+            warm_up(vehicle)
+            channel.send(Ready(details={"camera": bench.camera_endpoint}))
+            Service(bench, channel, episode).run(requests)
+    except (UsageError, LockstepError) as error:
         channel.send(Failed(message=str(error)))
-        return EXIT_USAGE
-    service = _Service(command, vehicle, firmware, channel)
-    channel.send(Ready(details={"camera": firmware.camera_endpoint}))
-    try:
-        while service.handle_all(requests):
-            firmware.step()
-    except UsageError as error:
-        channel.send(Failed(message=str(error)))
-        return EXIT_USAGE
-    finally:
-        firmware.close()
+        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_BROKEN
     return 0
 
 
-def is_crash(hit: Collision, flight: Flight) -> bool:
-    """Return whether a contact ends a flight: all do but what happens on the ground.
-
-    On the way up and down that includes a gentle touch of the floor, in the modes that fly there.
-    """
-    if hit.what != FLOOR:
-        return True
-    gentle = flight.mode not in (Mode.OFFBOARD, Mode.HOLD) and hit.speed_m_s < TOUCHDOWN_M_S
-    return flight.phase is Phase.AIR and not gentle
-
-
-class _Service:
-    """Requests of the harness on a firmware."""
-
-    def __init__(
-        self,
-        command: FirmwareCommand,
-        vehicle: VehicleProfile,
-        firmware: Firmware,
-        channel: ChildChannel,
-    ) -> None:
-        self._command = command
-        self._vehicle = vehicle
-        self._firmware = firmware
-        self._channel = channel
-        self._episode = -1
-        self._record = Path()
-        self._ticks = 0
-        self._hits = 0
-        """Contacts looked at so far."""
-        self._crash: str | None = None
-        """The first thing hit in flight."""
-        self._handlers: dict[type, Callable[[Any], None]] = {
-            LoadEpisode: self._load,
-            FinishEpisode: self._finish,
-        }
-        firmware.on_tick = self._report
-        firmware.on_message = self._tell
-
-    def handle_all(self, requests: queue.Queue[Any]) -> bool:
-        """Handle what has arrived; False when it is time to end."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                request = requests.get_nowait()
-                if isinstance(request, Shutdown):
-                    return False
-                self._handlers[type(request)](request)
-        return True
-
-    def _load(self, request: LoadEpisode) -> None:
-        command = self._command
-        episode = setup(command, self._vehicle, request.arena, request.arena_seed, request.seed)
-        tlog = Path(request.tlog) if request.tlog else None
-        loaded = self._firmware.load(episode, tlog, unix_us())
-        self._episode, self._record = request.episode, Path(request.record)
-        self._hits, self._crash = 0, None
-        goal = episode.arena.goal if episode.arena is not None else np.zeros(2)
-        self._channel.send(
-            Loaded(
-                episode=request.episode,
-                time_us=loaded.time_us,
-                epoch_ns=loaded.epoch_ns,
-                slipped_us=self._firmware.slipped_us,
-                goal=(float(goal[0]), float(goal[1])),
-            )
-        )
-
-    def _finish(self, _: FinishEpisode) -> None:
-        self._firmware.save(self._record)
-        self._channel.send(Saved(path=str(self._record)))
-        self._firmware.discard()
-
-    def _report(self, simulation: Simulation) -> None:
-        self._ticks += 1
-        truth, flight = simulation.truth, simulation.autopilot.flight
-        hits = simulation.plant.collisions
-        crashes = [hit.what for hit in hits[self._hits :] if is_crash(hit, flight)]
-        self._hits = len(hits)
-        if crashes and self._crash is None:
-            self._crash = crashes[0]
-        elif self._ticks % STATE_EVERY:
-            return
-        x, y, z = (float(c) for c in truth.position)
-        self._channel.send(
-            State(
-                time_us=truth.time_us,
-                position=(x, y, z),
-                speed_m_s=float(np.linalg.norm(truth.velocity)),
-                yaw=quat_yaw(truth.quaternion),
-                battery=truth.battery_remaining,
-                collision=self._crash,
-                mode=flight.mode.name.lower(),
-                armed=flight.phase >= Phase.GROUND,
-                landed=flight.phase < Phase.AIR,
-                slipped_us=self._firmware.slipped_us,
-            )
-        )
-
-    def _tell(self, message: Message) -> None:
-        simulation = self._firmware.simulation
-        time_us = simulation.time_us if simulation is not None else 0
-        self._channel.send(Text(time_us=time_us, severity=int(message.severity), text=message.text))
+def _bench(command: FirmwareCommand, *, broken_off: Callable[[], bool]) -> Bench:
+    """Bind all ports and return what flies. Raises UsageError as `build`."""
+    if not command.lockstep:
+        return WallBench(build(command))
+    plan = remote_plan(command.turns, command.speed)
+    return LockstepBench(open_sockets(command), plan, broken_off)
 
 
 if __name__ == "__main__":

@@ -20,21 +20,23 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
-from airl_mav.cli.companion import (
+from airl_mav.cli.companion_command import (
     GREATEST_THREADS,
     PilotOptions,
     check_holding,
     hover_after_s,
     pilot_settings,
 )
+from airl_mav.envs.spec import Delay
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.harness.episode import Plan, ProcessPlan
+from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.harness.progress import RichObserver
 from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
 from airl_mav.harness.run_folder import RunFolder
-from airl_mav.latency.injection import choose_injection
+from airl_mav.latency.injection import choose_injection, without_timing
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
@@ -55,6 +57,9 @@ the referee measures the true one."""
 SLOWEST, FASTEST = 0.5, 10.0
 """Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
 (1 Hz of simulated time, 3 s allowed); faster, its 20 Hz of setpoints come near offboard loss."""
+
+LOCKSTEP_SPEEDS = 0.01, 1000.0
+"""Limits of the pace in lockstep, where nothing goes by the wall clock."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,13 @@ class SitlCommand:
     seed: int = 1
     """Seed; episode i uses seed + i for arena, sensors, wind and latency."""
 
-    speed: float = 1.0
-    """Simulated seconds per wall second, 0.5 to 10. Latencies count in simulated time."""
+    lockstep: bool = False
+    """Everything in one process on one simulated clock, MAVSDK included: the same flight every
+    time, bit by bit, as fast as it goes. Latencies are then those of the computer profile alone."""
+
+    speed: float | None = None
+    """Simulated seconds per wall second, 0.5 to 10; in lockstep 0.01 to 1000. Latencies count in
+    simulated time. None: 1, or in lockstep as fast as it goes."""
 
     goal_radius: float | None = None
     """The goal is reached closer than this, seen from above, m. None: that of the policy's card,
@@ -157,14 +167,20 @@ def run(command: SitlCommand, console: Console | None = None) -> int:
     console.print(
         f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {setup.policy.name}"
     )
-    console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
-    console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
+    if command.lockstep:
+        console.print("lockstep   one process, one simulated clock, MAVSDK on raw bytes")
+    else:
+        console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
+        console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
     code = 0
     with RichObserver(console, command.episodes) as observer:
         try:
-            with Rehearsal(plan(command, setup, pilot), folder, observer) as rehearsal:
-                rehearsal.run()
-        except RehearsalError as error:
+            if command.lockstep:
+                _rehearse_in_lockstep(command, setup, pilot, folder, observer)
+            else:
+                with Rehearsal(plan(command, setup, pilot), folder, observer) as rehearsal:
+                    rehearsal.run()
+        except (RehearsalError, LockstepError) as error:
             console.print(f"error: {error}", style="red", markup=False, highlight=False)
             code = EXIT_BROKEN
         except KeyboardInterrupt:
@@ -190,7 +206,9 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     """
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
-    check_range("--speed", command.speed, SLOWEST, FASTEST)
+    if command.speed is not None:
+        slowest, fastest = LOCKSTEP_SPEEDS if command.lockstep else (SLOWEST, FASTEST)
+        check_range("--speed", command.speed, slowest, fastest)
     check_range("--threads", command.threads, 1, GREATEST_THREADS)
     check_range("--time-limit", command.time_limit, 1.0, 3600.0)
     policy = find_policy(command.policy)
@@ -199,8 +217,9 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     check_range("--altitude", pilot.altitude_m, 0.5, 100.0)
     check_holding("--hold", pilot.hold_s, command.watchdog)
     check_wind(command.wind)
-    # The companion connects to the camera by its number: it cannot be "any free one" here.
-    check_ports(command.ports, free=False)
+    if not command.lockstep:
+        # The companion connects to the camera by its number: it cannot be "any free one" here.
+        check_ports(command.ports, free=False)
     vehicle = load_vehicle(command.vehicle)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
         raise UsageError(f"--policy {command.policy}: vehicle {command.vehicle}: {reason}")
@@ -213,15 +232,17 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
         computer, command.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
     hover_s = hover_after_s(command.watchdog, policy)
+    if command.lockstep:
+        injection = without_timing(injection, Delay().native_ms, "lockstep")
     setup = Setup(
-        level="sitl",
+        level="lockstep" if command.lockstep else "sitl",
         vehicle=Part(command.vehicle, vehicle.description),
         arena=Part(command.arena, arena.description),
         policy=Part(policy.name, policy.description),
         computer=Part(command.computer, computer.description),
         computer_watts=computer.watts,
         injection=injection,
-        speed=command.speed,
+        speed=command.speed if command.lockstep else _speed(command),
         between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
     )
     return setup, pilot
@@ -242,7 +263,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
     firmware = [
         *("--control", "stdio"),
         *("--vehicle", command.vehicle),
-        *("--speed", f"{command.speed!r}"),
+        *("--speed", f"{_speed(command)!r}"),
         # One word each: -1e-05 by itself would be taken for an option.
         *(f"--wind.north-m-s={wind.north_m_s!r}", f"--wind.east-m-s={wind.east_m_s!r}"),
         *(f"--wind.gust-m-s={wind.gust_m_s!r}", f"--wind.gust-time-s={wind.gust_time_s!r}"),
@@ -258,7 +279,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         *(("--workload", command.workload) if command.workload is not None else ()),
         *("--connect", f"udpin://{LOOPBACK}:{ports.api_port}"),
         *("--camera", f"tcp://{LOOPBACK}:{ports.camera_port}"),
-        *("--speed", f"{command.speed!r}"),
+        *("--speed", f"{_speed(command)!r}"),
         *("--hold-s", f"{pilot.hold_s!r}", "--altitude-m", f"{pilot.altitude_m!r}"),
         *("--goal-radius-m", f"{ARRIVAL_SHARE * pilot.goal_radius_m!r}"),
         *("--decision-timeout-s", f"{watchdog.decision_timeout_s!r}"),
@@ -273,9 +294,33 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         episodes=command.episodes,
         goal_radius_m=pilot.goal_radius_m,
         time_limit_s=command.time_limit,
-        speed=command.speed,
+        speed=_speed(command),
         computer_watts=setup.computer_watts,
     )
+
+
+def _speed(command: SitlCommand) -> float:
+    """Return the pace of two processes that live by the wall clock."""
+    return 1.0 if command.speed is None else command.speed
+
+
+def _rehearse_in_lockstep(
+    command: SitlCommand,
+    setup: Setup,
+    pilot: PilotSettings,
+    folder: RunFolder,
+    observer: RichObserver,
+) -> None:
+    # Imported late: two processes of their own load the simulator otherwise.
+    from airl_mav.cli.lockstep import lockstep_plan, policies
+    from airl_mav.harness.lockstep.rehearsal import rehearse
+    from firmware_sim.warm_up import warm_up
+
+    observer.waiting("loading")
+    planned = lockstep_plan(command, setup, pilot)
+    warm_up(planned.vehicle)
+    seeds = [command.seed + i for i in range(command.episodes)]
+    rehearse(planned, seeds, policies(command, pilot.hold_s), folder, observer)
 
 
 def conclude(folder: RunFolder, console: Console) -> None:

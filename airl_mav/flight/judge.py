@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from airl_mav.constants import US_PER_S
 
@@ -38,8 +39,7 @@ class Task:
     """Longest time from the start of navigation [s]."""
 
 
-@dataclass(frozen=True)
-class TruthSample:
+class TruthSample(NamedTuple):
     """What the referee sees of the true state."""
 
     time_us: int

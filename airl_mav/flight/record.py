@@ -46,6 +46,8 @@ class EpisodeRecord:
     """None when navigation never began."""
     notes: tuple[str, ...] = ()
     """What else happened: failsafes, watchdog trips."""
+    sha256: dict[str, str] | None = None
+    """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA
 
     def to_json(self) -> str:

@@ -1,83 +1,95 @@
-"""Episodes saved some at a time: at level gym they end faster than single ones can be saved.
+"""Episodes saved some at a time: they end faster than single ones can be saved.
 
-The same files and the same promise as `RunFolder.save_episode`: arrays first, then the lines that
-commit them.
+The same files and the same promise as `RunFolder.save_episodes`, by a thread of its own: who flies,
+or hands out flights, must not wait for the disk.
 """
 
 from __future__ import annotations
 
-import io
-import os
-import zipfile
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+import threading
+from types import TracebackType
 
-import numpy as np
-from numpy.typing import NDArray
+from airl_mav.clock import WallClock
+from airl_mav.constants import US_PER_S
+from airl_mav.harness.run_folder import FlownEpisode, RunFolder
 
-from airl_mav.atomic import replace_file
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import EPISODES_FILE, LATENCY_FILE, TRAJECTORIES_FILE, RunFolder
+EVERY_S = 2.0
+"""An episode waits no longer until it is saved, while the run is small [wall s]."""
 
-Arrays = Mapping[str, NDArray[Any]]
+PAUSE = 9.0
+"""The pause after a save is at least so many times as long as the save took. Adding to an archive
+copies it, so that in a run of ten thousand flights saving would otherwise take all the time."""
 
-
-@dataclass(frozen=True)
-class Episode:
-    """One episode, flown."""
-
-    record: EpisodeRecord
-    trajectory: Trajectory
-    latency: Arrays
-    """Stamps by column; see docs/run-folder.md."""
+MOST = 1000
+"""No more episodes wait to be saved."""
 
 
-def save_episodes(folder: RunFolder, episodes: Sequence[Episode]) -> None:
-    """Save episodes; on return they are on the disk."""
-    paths = {e.record.index: e.trajectory.arrays() for e in episodes}
-    _add(folder.path / TRAJECTORIES_FILE, paths)
-    _add(folder.path / LATENCY_FILE, {e.record.index: e.latency for e in episodes})
-    lines = b"".join(e.record.to_json().encode() + b"\n" for e in episodes)
-    with (folder.path / EPISODES_FILE).open("ab") as file:
-        file.write(lines)
-        file.flush()
-        os.fsync(file.fileno())
+class Saver:
+    """Saves episodes as they come. Use as a context manager: at its end all are on the disk."""
 
+    def __init__(self, folder: RunFolder) -> None:
+        self._folder = folder
+        self._changed = threading.Condition()
+        self._waiting: list[FlownEpisode] = []
+        self._ending = False
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="saver")
 
-def _add(path: Path, episodes: Mapping[int, Arrays]) -> None:
-    """Add the arrays of episodes to an archive, in place of any of theirs that are there."""
-    buffer = io.BytesIO()
-    old = path.read_bytes() if path.exists() else b""
-    if old and not _holds_any(old, episodes):
-        # As bytes: a second compression of the whole run would cost more than the flights.
-        buffer.write(old)
-        old = b""
-    with zipfile.ZipFile(buffer, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as new:
-        if old:
-            _copy_others(old, new, episodes)
-        for index, arrays in episodes.items():
-            for name, array in arrays.items():
-                with new.open(f"{index:03d}/{name}.npy", "w", force_zip64=True) as stream:
-                    np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
-    replace_file(path, buffer.getvalue())
+    def __enter__(self) -> Saver:
+        """Start."""
+        self._thread.start()
+        return self
 
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Save what is left, and raise what went wrong with saving."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify_all()
+        self._thread.join()
+        if error is None:
+            self._raise_what_broke()
 
-def _holds_any(archive: bytes, episodes: Mapping[int, Arrays]) -> bool:
-    """Return whether an archive has arrays of an episode: a kill came before its line."""
-    with zipfile.ZipFile(io.BytesIO(archive)) as old:
-        return any(_episode_of(name) in episodes for name in old.namelist())
+    def add(self, episode: FlownEpisode) -> None:
+        """Take an episode; waits when too many are waiting. Raises what went wrong with saving."""
+        with self._changed:
+            self._changed.wait_for(lambda: len(self._waiting) < MOST or self._error is not None)
+            self._raise_what_broke()
+            self._waiting.append(episode)
+            self._changed.notify_all()
 
+    def _raise_what_broke(self) -> None:
+        if self._error is not None:
+            raise self._error
 
-def _copy_others(archive: bytes, new: zipfile.ZipFile, episodes: Mapping[int, Arrays]) -> None:
-    """Copy the arrays of all other episodes."""
-    with zipfile.ZipFile(io.BytesIO(archive)) as old:
-        for member in old.infolist():
-            if _episode_of(member.filename) not in episodes:
-                new.writestr(member, old.read(member))
+    # --- the thread
 
+    def _run(self) -> None:
+        pause_s, ending = EVERY_S, False
+        try:
+            while not ending:
+                ending, episodes = self._collect(pause_s)
+                pause_s = max(EVERY_S, PAUSE * self._save(episodes))
+        except BaseException as error:  # raised where the episodes come from
+            with self._changed:
+                self._error = error
+                self._changed.notify_all()
 
-def _episode_of(name: str) -> int:
-    return int(name.partition("/")[0])
+    def _collect(self, pause_s: float) -> tuple[bool, list[FlownEpisode]]:
+        """Wait for the end of a pause; return whether no more will come, and what has come."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ending or len(self._waiting) >= MOST, pause_s)
+            episodes, self._waiting = self._waiting, []
+            self._changed.notify_all()
+            return self._ending, episodes
+
+    def _save(self, episodes: list[FlownEpisode]) -> float:
+        """Save; return how long that took [wall s]."""
+        clock = WallClock()
+        if episodes:
+            self._folder.save_episodes(episodes)
+        return clock.time_us() / US_PER_S

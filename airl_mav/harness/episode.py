@@ -16,6 +16,7 @@ from airl_mav.flight.judge import Referee
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.harness.following import Follower
 from airl_mav.harness.run_folder import TICK_LATENESS, RunFolder
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
@@ -51,16 +52,19 @@ class Episode:
     index: int
     seed: int
     loaded: Loaded
-    referee: Referee
+    follower: Follower
     stopwatch: WallClock
     wall_us: int | None = None
     """Wall time from the reset to the verdict."""
     state: State | None = None
     verdict_state: State | None = None
-    called_off: bool = False
-    """The companion has been told to end the mission."""
     ended: Ended | None = None
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def referee(self) -> Referee:
+        """The referee."""
+        return self.follower.referee
 
     @property
     def slipped_us(self) -> int:
@@ -96,32 +100,64 @@ def save_episode(
 
 
 def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeRecord:
-    referee, loaded = episode.referee, episode.loaded
-    verdict = referee.verdict or referee.abort(loaded.time_us, "no verdict")
-    state = episode.verdict_state
-    quality = None
-    if referee.navigation_us is not None and verdict.time_us >= referee.navigation_us:
-        quality = measure_quality(
-            trajectory, referee.navigation_us, verdict.time_us, plan.computer_watts
-        )
-    return EpisodeRecord(
+    state, loaded = episode.verdict_state, episode.loaded
+    return judged_record(
+        episode.referee,
+        trajectory,
         index=episode.index,
         seed=episode.seed,
         arena=plan.arena,
-        arena_seed=episode.seed,
-        outcome=verdict.outcome,
-        reason=verdict.reason,
         goal=loaded.goal,
-        goal_radius_m=plan.goal_radius_m,
-        time_limit_s=plan.time_limit_s,
         started_us=loaded.time_us,
-        navigation_us=referee.navigation_us,
-        ended_us=verdict.time_us,
+        computer_watts=plan.computer_watts,
         wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,
-        quality=quality,
         notes=tuple(episode.notes),
+    )
+
+
+def judged_record(
+    referee: Referee,
+    trajectory: Trajectory,
+    *,
+    index: int,
+    seed: int,
+    arena: str,
+    goal: tuple[float, float],
+    started_us: int,
+    computer_watts: float,
+    wall_s: float | None,
+    slipped_us: int,
+    battery_remaining: float | None,
+    notes: tuple[str, ...],
+    sha256: dict[str, str] | None = None,
+) -> EpisodeRecord:
+    """Return the record of a flight that a referee has watched; see `EpisodeRecord`."""
+    verdict = referee.verdict or referee.abort(started_us, "no verdict")
+    navigation_us = referee.navigation_us
+    quality = None
+    if navigation_us is not None and verdict.time_us >= navigation_us:
+        quality = measure_quality(trajectory, navigation_us, verdict.time_us, computer_watts)
+    return EpisodeRecord(
+        index=index,
+        seed=seed,
+        arena=arena,
+        arena_seed=seed,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        goal=goal,
+        goal_radius_m=referee.task.goal_radius_m,
+        time_limit_s=referee.task.time_limit_s,
+        started_us=started_us,
+        navigation_us=navigation_us,
+        ended_us=verdict.time_us,
+        wall_s=wall_s,
+        slipped_us=slipped_us,
+        battery_remaining=battery_remaining,
+        quality=quality,
+        notes=notes,
+        sha256=sha256,
     )
 
 

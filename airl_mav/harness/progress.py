@@ -107,6 +107,13 @@ class RichObserver:
         )
         for note in record.notes:
             self._say(f"    {note}")
+        if record.sha256 is not None:
+            self._console.print(
+                f"    sha256 {record.sha256['flight']}",
+                style="dim",
+                highlight=False,
+                soft_wrap=True,
+            )
         # Into a file or a pipe, lines must not wait for the end of the run.
         self._console.file.flush()
         if self._task is not None:

@@ -25,9 +25,10 @@ from airl_mav.channel import (
 from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
-from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample, Verdict
+from airl_mav.flight.judge import Referee, Task, TruthSample, Verdict
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.harness.episode import Episode, Plan, save_episode
+from airl_mav.harness.following import TAKEOFF_LIMIT_S, Follower, Order
 from airl_mav.harness.process import Child, Exited
 from airl_mav.harness.run_folder import RunFolder
 
@@ -41,14 +42,6 @@ REPLY_TIMEOUT_S = 30.0
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""
-
-TAKEOFF_LIMIT_S = 90.0
-"""Longest time from the reset to the start of navigation [simulated s]."""
-
-
-ARRIVAL_S = 10.0
-"""Longest time from the goal's edge to where the companion thinks the goal is [simulated s];
-then it is told to land where it is."""
 
 
 class RehearsalError(Exception):
@@ -165,7 +158,8 @@ class Rehearsal:
         )
         loaded = self._wait_for(Loaded, REPLY_TIMEOUT_S)
         task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
-        episode = Episode(index, seed, loaded, Referee(task), WallClock())
+        follower = Follower(Referee(task), loaded.time_us)
+        episode = Episode(index, seed, loaded, follower, WallClock())
         self._observer.episode(index, seed, loaded.goal)
         self._children[COMPANION].send(
             Fly(
@@ -222,30 +216,17 @@ class Rehearsal:
         return False
 
     def _see(self, episode: Episode, state: State) -> None:
-        referee = episode.referee
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
-        if referee.verdict is not None:
-            late_us = state.time_us - referee.verdict.time_us
-            if not episode.called_off and late_us > ARRIVAL_S * US_PER_S:
-                self._call_off(episode, land=state.collision is None)
-            return
-        verdict = referee.observe(
+        judged = episode.referee.verdict is not None
+        order = episode.follower.see(
             TruthSample(state.time_us, state.position, state.collision, state.battery)
         )
-        if verdict is None:
-            elapsed_s = (state.time_us - episode.loaded.time_us) / US_PER_S
-            if referee.navigation_us is None and elapsed_s > TAKEOFF_LIMIT_S:
-                verdict = referee.abort(state.time_us, "navigation never began")
-        if verdict is not None:
+        verdict = episode.referee.verdict
+        if verdict is not None and not judged:
             self._judge(episode, verdict)
-            if verdict.outcome is not Outcome.SUCCESS:
-                crashed = verdict.outcome in (Outcome.COLLISION, Outcome.BATTERY)
-                self._call_off(episode, land=not crashed)
-
-    def _call_off(self, episode: Episode, *, land: bool) -> None:
-        episode.called_off = True
-        self._children[COMPANION].send(Abort(land=land))
+        if order is not None:
+            self._children[COMPANION].send(Abort(land=order is Order.LAND))
 
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:

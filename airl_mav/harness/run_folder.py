@@ -1,4 +1,4 @@
-"""The folder a run leaves behind: written so that a kill at any moment loses one episode at most.
+"""The folder a run leaves behind: written so that a kill at any moment loses no saved episode.
 
 docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
 which is written last; arrays without a line belong to an episode that never ended.
@@ -75,6 +75,17 @@ class LoadedRun:
     episodes: tuple[EpisodeRecord, ...]
     latency: dict[int, Arrays]
     trajectories: dict[int, Trajectory]
+
+
+@dataclass(frozen=True)
+class FlownEpisode:
+    """One episode, flown."""
+
+    record: EpisodeRecord
+    trajectory: Trajectory
+    """Its true path."""
+    latency: Mapping[str, NDArray[Any]]
+    """Its raw stamps by column; see docs/run-folder.md."""
 
 
 class RunFolder:
@@ -168,17 +179,22 @@ class RunFolder:
     def save_episode(
         self, record: EpisodeRecord, trajectory: Trajectory, latency: Mapping[str, NDArray[Any]]
     ) -> None:
-        """Save an episode as it ends; on return it is on the disk.
+        """Save an episode as it ends; on return it is on the disk."""
+        self.save_episodes([FlownEpisode(record, trajectory, latency)])
 
-        Args:
-            record: Its line.
-            trajectory: Its true path.
-            latency: Its raw stamps by column; see docs/run-folder.md.
+    def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
+        """Save episodes; on return they are on the disk.
+
+        The arrays come first, then the lines that commit them.
         """
-        add_arrays(self.path / TRAJECTORIES_FILE, f"{record.index:03d}/", trajectory.arrays())
-        add_arrays(self.path / LATENCY_FILE, f"{record.index:03d}/", latency)
+        groups = {f"{episode.record.index:03d}": episode for episode in episodes}
+        add_arrays(
+            self.path / TRAJECTORIES_FILE, {g: e.trajectory.arrays() for g, e in groups.items()}
+        )
+        add_arrays(self.path / LATENCY_FILE, {g: e.latency for g, e in groups.items()})
+        lines = b"".join(episode.record.to_json().encode() + b"\n" for episode in episodes)
         with (self.path / EPISODES_FILE).open("ab") as file:
-            file.write(record.to_json().encode() + b"\n")
+            file.write(lines)
             file.flush()
             os.fsync(file.fileno())
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -37,6 +37,21 @@ class Injection:
 
 
 NOTHING_INJECTED = Injection("measured", "native speed of the machine that flew; nothing injected")
+
+
+def without_timing(chosen: Injection, native_ms: float, level: str) -> Injection:
+    """Return the latency in the words of a level that times nothing.
+
+    Args:
+        chosen: What `choose_injection` gave.
+        native_ms: t2 where nothing is injected [ms].
+        level: Name of the level.
+    """
+    if chosen.latency is not None:
+        return chosen
+    label = f"{native_ms:g} ms in every decision, as of a desktop computer"
+    assumed = f"level {level} times nothing"
+    return replace(chosen, origin="injected", label=label, assumed=assumed)
 
 
 def choose_injection(

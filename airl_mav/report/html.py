@@ -14,7 +14,7 @@ from airl_mav.atomic import replace_file
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.harness.run_folder import LoadedRun, RunInfo
 from airl_mav.report.figures import latency_figure, latency_overview, map_figure, time_figure
 from airl_mav.report.overview import overview_figure
 from airl_mav.report.summary import RunSummary, summarize_run
@@ -93,7 +93,7 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
     for picture in [*pictures, *([overview] if overview else [])]:
         replace_file(folder / f"{picture.name}.png", picture.png)
     page = (
-        _environment()
+        environment()
         .get_template("report.html.j2")
         .render(
             kind="Evaluation" if summary.modelled else "Rehearsal",
@@ -117,7 +117,7 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
             flown=len(run.episodes),
             outcome_keys={words: outcome.value for outcome, words in OUTCOME_WORDS.items()},
             configuration=json.dumps(run.info.config, indent=2, ensure_ascii=False),
-            provenance=_provenance(run),
+            provenance=provenance(run.info),
         )
     )
     path = folder / REPORT_FILE
@@ -136,7 +136,7 @@ def needs_overview(run: LoadedRun) -> bool:
     return many and bool(run.episodes)
 
 
-def _environment() -> Environment:
+def environment() -> Environment:
     """Return the template engine: everything escaped, nothing undefined passed over."""
     return Environment(
         loader=PackageLoader("airl_mav.report"),
@@ -208,9 +208,8 @@ def _headline(title: str, estimate: Estimate, scale: float, digits: int, unit: s
     return Headline(title, f"{scale * estimate.value:.{digits}f}", unit, detail)
 
 
-def _provenance(run: LoadedRun) -> list[tuple[str, str]]:
+def provenance(info: RunInfo) -> list[tuple[str, str]]:
     """Return machine, commit and versions, as (term, text)."""
-    info = run.info
     machine = dict(info.machine)
     if memory := machine.pop("memory_bytes", None):
         machine["memory"] = f"{memory / 1e9:.1f} GB"

@@ -1,0 +1,154 @@
+"""`airl ladder`: the same policy and seeds at several levels of the fidelity ladder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+
+from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_range
+from airl_mav.cli.evaluate import DEFAULT_ARENA
+from airl_mav.clock import utc_now
+from airl_mav.errors import UsageError
+from airl_mav.harness.run_folder import RUN_FILE
+from airl_mav.harness.workers import GREATEST_WORKERS
+from airl_mav.policy.registry import find_policy
+from airl_mav.ports import Ports
+from airl_mav.report.matrix import MATRIX_FILE
+
+LevelName = Literal["gym", "lockstep", "sitl"]
+
+SITL_EPISODES = 10
+"""Episodes at level sitl unless asked for: they take real time."""
+
+FACTS = ("vehicle", "computer", "workload", "seed")
+"""Options that head a ladder, beside policy and arena."""
+
+
+@dataclass(frozen=True)
+class LadderCommand:
+    """Fly the same policy and seeds at several levels of fidelity, and say what differs.
+
+    Success, flight time, distance and energy side by side, with the differences from the first
+    level on the same seeds and their 95 % intervals. The same --out goes on with what was
+    interrupted.
+    """
+
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    """A name, or a path to a folder with policy.onnx and card.json."""
+
+    arena: str | None = None
+    """Arena profile: a shipped name, or a path to a .toml. None: that which the policy was trained
+    in, or static-obstacles."""
+
+    episodes: int = 100
+    """Number of episodes at each level, >= 1."""
+
+    seed: int = 1
+    """Seed; episode i uses seed + i, at every level."""
+
+    levels: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
+    """Levels that fly, two or more; the first is the reference of the others."""
+
+    sitl_episodes: int | None = None
+    """Number of episodes at level sitl, which flies in real time times --speed; the first ones of
+    the seeds. None: 10, or --episodes if that is fewer."""
+
+    workers: int | None = None
+    """Level lockstep: processes, each with one flight at a time, 1 to 256. None: as many as there
+    are usable cores."""
+
+    speed: float = 1.0
+    """Level sitl: simulated seconds per wall second, 0.5 to 10."""
+
+    vehicle: str = "quad"
+    """Vehicle profile: a shipped name, or a path to a .toml."""
+
+    computer: str = "workstation"
+    """Computer profile to fly as: a shipped name, or a path to a .toml."""
+
+    workload: str | None = None
+    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
+    policy. None: what was measured for this very policy, or else 1 ms (gym, lockstep), or what
+    this machine takes (sitl)."""
+
+    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
+    """Ports of level sitl."""
+
+    out: Path | None = None
+    """Folder of the ladder: a run folder for each level, ladder.json and ladder.html. None:
+    runs/<UTC time>-ladder-<policy>-<arena>."""
+
+    def episodes_at(self, level: str) -> int:
+        """Return the number of episodes at a level."""
+        if level != "sitl":
+            return self.episodes
+        fewer = SITL_EPISODES if self.sitl_episodes is None else self.sitl_episodes
+        return min(fewer, self.episodes)
+
+
+def run(command: LadderCommand, console: Console | None = None) -> int:
+    """Fly the levels and show what differs.
+
+    Args:
+        command: What was asked for.
+        console: Where to print; None means standard output.
+
+    Returns:
+        Exit status: 0 all episodes flown, 1 a process died (sitl, lockstep), 130 Ctrl-C.
+
+    Raises:
+        UsageError: The input cannot be used.
+    """
+    console = console or Console()
+    arena = _check(command)
+    # Imported late: the kernels take a second to load, and a typo must not wait for them.
+    from airl_mav.cli.ladder_levels import Climb
+
+    climb = Climb(command, arena)
+    name = f"{climb.policy.name}-{Path(arena).stem}"
+    root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-ladder-{name}"
+    for file, what in ((RUN_FILE, "a single run"), (MATRIX_FILE, "a table of policies x arenas")):
+        if (root / file).exists():
+            raise UsageError(f"--out {root}: holds {what}; accepted: another folder")
+    held, code = climb.fly(root, console)
+    if len(held) > 1:
+        from airl_mav.report.ladder import build_ladder, write_ladder
+        from airl_mav.report.ladder_page import build_page
+        from airl_mav.report.ladder_terminal import print_ladder
+
+        facts: dict[str, Any] = {"policy": climb.policy.name, "arena": arena}
+        facts |= {key: getattr(command, key) for key in FACTS} | {"rules": climb.rules}
+        ladder = build_ladder(root, facts, held)
+        write_ladder(ladder)
+        print_ladder(ladder, console, build_page(ladder))
+    if code == EXIT_INTERRUPTED:
+        console.print(
+            f"interrupted: the same command with --out {root} goes on",
+            style="yellow",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
+    return code
+
+
+def _check(command: LadderCommand) -> str:
+    """Check what needs no loading; return the arena. Raises UsageError."""
+    levels = command.levels
+    if len(set(levels)) < len(levels) or len(levels) < 2:
+        told = " ".join(levels) or "nothing"
+        raise UsageError(f"--levels {told}: accepted: two or more of gym lockstep sitl, each once")
+    check_range("--episodes", command.episodes, 1, 100_000)
+    check_range("--seed", command.seed, 0, GREATEST_SEED)
+    if command.workers is not None:
+        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
+    if command.sitl_episodes is not None:
+        check_range("--sitl-episodes", command.sitl_episodes, 1, command.episodes)
+    if command.arena is not None:
+        return command.arena
+    card = find_policy(command.policy).card
+    return (None if card is None else card.training.arena) or DEFAULT_ARENA

@@ -1,0 +1,255 @@
+"""The same seeds flown twice: what differs, with its interval and its number of pairs.
+
+Pairs by seed take out what the arenas add to the spread: two runs that differ little show it after
+far fewer flights than two runs of different seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize, stats
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import BOOTSTRAP_SEED, CONFIDENCE, RESAMPLES, Estimate
+
+Pair = tuple[EpisodeRecord, EpisodeRecord]
+"""One seed: the flight of the reference, then the other one."""
+
+SAME_RATIO = 1e-12
+"""Pairs whose ratios differ by no more than this differ by rounding alone."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Which of both reached the goal, counted over seeds: McNemar's table."""
+
+    both: int
+    only_reference: int
+    only_other: int
+    neither: int
+
+    @property
+    def n(self) -> int:
+        """Number of pairs."""
+        return self.both + self.only_reference + self.only_other + self.neither
+
+
+@dataclass(frozen=True)
+class Change:
+    """A figure of two runs on the same seeds. None where there is nothing to work it out from."""
+
+    reference: float | None
+    other: float | None
+    difference: Estimate
+    """Other minus reference; its n is the number of pairs behind all three figures."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A run against a reference, by pairs of flights with the same seed."""
+
+    agreement: Agreement
+    success_rate: Change
+    """Fractions, 0 to 1, over all pairs; their difference in percentage points."""
+    flight_time_s: Change
+    """Means over the common successes, as those below; differences in percent of the reference."""
+    distance_m: Change
+    energy_j: Change
+
+
+def pair_by_seed(
+    reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]
+) -> tuple[Pair, ...]:
+    """Return the flights of the seeds that both runs hold, in the order of the reference.
+
+    An aborted flight was no test of the policy: its seed makes no pair.
+
+    Raises:
+        ValueError: A run holds a seed twice.
+    """
+    first, second = _by_seed(reference), _by_seed(other)
+    return tuple((first[seed], second[seed]) for seed in first if seed in second)
+
+
+def _by_seed(episodes: Sequence[EpisodeRecord]) -> dict[int, EpisodeRecord]:
+    flown = [episode for episode in episodes if episode.outcome is not Outcome.ABORTED]
+    by_seed = {episode.seed: episode for episode in flown}
+    if len(by_seed) != len(flown):
+        raise ValueError("a seed is there twice")
+    return by_seed
+
+
+def count_agreement(pairs: Sequence[Pair]) -> Agreement:
+    """Count which of both reached the goal."""
+    reached = [tuple(flight.outcome is Outcome.SUCCESS for flight in pair) for pair in pairs]
+    return Agreement(
+        both=reached.count((True, True)),
+        only_reference=reached.count((True, False)),
+        only_other=reached.count((False, True)),
+        neither=reached.count((False, False)),
+    )
+
+
+def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ...]:
+    """Return the quality of the pairs of which both reached the goal."""
+    return tuple(
+        (first.quality, second.quality)
+        for first, second in pairs
+        if first.outcome is second.outcome is Outcome.SUCCESS
+        and first.quality is not None
+        and second.quality is not None
+    )
+
+
+def tango(gained: int, lost: int, n: int) -> Estimate:
+    """Return the difference of two paired proportions with Tango's 95 % score interval.
+
+    The differences that McNemar's test, generalised to them, does not reject (T. Tango,
+    Equivalence test and confidence interval for the difference in proportions for the paired-sample
+    design, Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ,
+    and has a width where none does.
+
+    Args:
+        gained: Pairs of which only the other succeeded.
+        lost: Pairs of which only the reference succeeded.
+        n: All pairs.
+
+    Returns:
+        The difference other minus reference, as a fraction, -1 to 1.
+
+    Raises:
+        ValueError: More pairs differ than there are.
+    """
+    if min(gained, lost) < 0 or gained + lost > n:
+        raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
+    if n == 0:
+        return Estimate(None, None, None, 0)
+    value = (gained - lost) / n
+    z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
+    # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
+    low, high = (
+        limit
+        if value == limit
+        else float(
+            optimize.brentq(
+                lambda d, target: _score(d, gained, lost, n) - target,
+                *sorted((value, limit)),
+                args=(-limit * z,),
+                xtol=1e-12,
+            )
+        )
+        for limit in (-1.0, 1.0)
+    )
+    return Estimate(value, low, high, n)
+
+
+def _score(d: float, gained: int, lost: int, n: int) -> float:
+    """Return Tango's score statistic of a difference d, -1 to 1."""
+    away = gained - lost - n * d
+    if away == 0.0:
+        return 0.0
+    # Probability of a loss, the likeliest with a difference d: the greater root.
+    a, b, c = 2.0 * n, (2.0 * n - gained + lost) * d - gained - lost, -lost * d * (1.0 - d)
+    q = (math.sqrt(max(0.0, b * b - 4.0 * a * c)) - b) / (2.0 * a)
+    variance = n * (2.0 * q + d * (1.0 - d))
+    return away / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, away)
+
+
+def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
+    """Return by how much the mean of paired values differs, with a bootstrap 95 % interval.
+
+    Whole pairs are drawn (BCa, seeded). One pair has no interval; pairs of one ratio have one of
+    width zero.
+
+    Args:
+        reference: Values (n,), > 0.
+        other: Values (n,) of the same seeds.
+
+    Returns:
+        100 (mean of other - mean of reference) / mean of reference [%].
+
+    Raises:
+        ValueError: The values are not paired, or one of the reference is not > 0.
+    """
+    first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
+    if first.ndim != 1 or first.shape != second.shape:
+        raise ValueError(f"shapes {first.shape} and {second.shape}: must be (n,), the same")
+    if not (first > 0.0).all():
+        raise ValueError("reference: must be > 0")
+    n = first.size
+    if n == 0:
+        return Estimate(None, None, None, 0)
+    value = float(_percent(first, second))
+    if n == 1:
+        return Estimate(value, None, None, 1)
+    if np.ptp(second / first) <= SAME_RATIO:
+        return Estimate(value, value, value, n)
+    interval = stats.bootstrap(
+        (first, second),
+        _percent,
+        paired=True,
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
+        method="BCa",
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high), n)
+
+
+def _percent(
+    first: NDArray[np.float64], second: NDArray[np.float64], axis: int = -1
+) -> NDArray[np.float64]:
+    mean = first.mean(axis=axis)
+    difference: NDArray[np.float64] = 100.0 * (second.mean(axis=axis) - mean) / mean
+    return difference
+
+
+def compare(reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) -> Comparison:
+    """Compare a run with a reference on the seeds that both hold.
+
+    Raises:
+        ValueError: A run holds a seed twice.
+    """
+    pairs = pair_by_seed(reference, other)
+    agreement = count_agreement(pairs)
+    good = common_successes(pairs)
+    return Comparison(
+        agreement=agreement,
+        success_rate=_rates(agreement),
+        flight_time_s=_means([(a.flight_time_s, b.flight_time_s) for a, b in good]),
+        distance_m=_means([(a.distance_m, b.distance_m) for a, b in good]),
+        energy_j=_means([(a.energy_j, b.energy_j) for a, b in good]),
+    )
+
+
+def _rates(agreement: Agreement) -> Change:
+    """Return both rates and their difference in percentage points."""
+    n = agreement.n
+    if n == 0:
+        return Change(None, None, Estimate(None, None, None, 0))
+    d = tango(agreement.only_other, agreement.only_reference, n)
+    return Change(
+        (agreement.both + agreement.only_reference) / n,
+        (agreement.both + agreement.only_other) / n,
+        Estimate(_points(d.value), _points(d.low), _points(d.high), n),
+    )
+
+
+def _points(fraction: float | None) -> float | None:
+    return None if fraction is None else 100.0 * fraction
+
+
+def _means(values: Sequence[tuple[float, float]]) -> Change:
+    """Return both means and their difference in percent."""
+    first, second = np.array(values, np.float64).reshape(-1, 2).T
+    difference = relative_difference(first, second)
+    if not difference.n:
+        return Change(None, None, difference)
+    return Change(float(first.mean()), float(second.mean()), difference)

@@ -1,0 +1,1 @@
+"""Lockstep: plant, flight controller and companion on one simulated clock, MAVSDK in between."""

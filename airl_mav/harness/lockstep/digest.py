@@ -1,0 +1,66 @@
+"""The fingerprint of a flight: equal for equal flights, bit by bit."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.policy.actions import Action, Policy
+from airl_mav.policy.observation import Observation
+
+LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
+"""What is fingerprinted, each by itself, so that a difference shows where it began:
+
+trajectory: every tick's true state; setpoints: what the autopilot flew, and when it took effect;
+observations: what the policy saw; telemetry: the bytes of all streams to the companion; commands:
+the frames that reached the flight controller, and when.
+"""
+
+SEEN = "observations"
+"""The lane that the companion knows, when it is another process; the other one knows the rest."""
+
+_TIME = struct.Struct("<q")
+
+
+class FlightDigest:
+    """Takes in a flight as it happens."""
+
+    def __init__(self) -> None:
+        self._lanes = {name: hashlib.sha256() for name in LANES}
+
+    def add(self, lane: str, time_us: int, data: bytes) -> None:
+        """Add what happened in one of the `LANES` at a simulated time [µs]."""
+        self._lanes[lane].update(_TIME.pack(time_us) + data)
+
+    def add_setpoints(self, columns: Mapping[str, NDArray[Any]]) -> None:
+        """Add all setpoints of the flight, by column; call once, at its end."""
+        for name, values in columns.items():
+            self.add("setpoints", len(values), name.encode() + values.tobytes())
+
+    def lanes(self) -> Mapping[str, str]:
+        """Return the SHA-256 of each lane, hexadecimal."""
+        return {name: lane.hexdigest() for name, lane in self._lanes.items()}
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 of all lanes together, hexadecimal."""
+        return hashlib.sha256("".join(self.lanes().values()).encode()).hexdigest()
+
+
+class WitnessedPolicy:
+    """A policy whose observations are fingerprinted. Implements `actions.Policy`."""
+
+    def __init__(self, policy: Policy, digest: FlightDigest) -> None:
+        self._policy = policy
+        self._digest = digest
+
+    def act(self, observation: Observation) -> Action:
+        """Return the policy's action."""
+        seen = observation
+        numbers = np.array([*seen.goal, *seen.velocity, seen.roll, seen.pitch, seen.yaw])
+        self._digest.add("observations", 0, seen.depth_mm.tobytes() + numbers.tobytes())
+        return self._policy.act(observation)

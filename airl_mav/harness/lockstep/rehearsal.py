@@ -1,0 +1,70 @@
+"""A rehearsal in lockstep: N seeded episodes in this process, one run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from airl_mav.channel import Text
+from airl_mav.harness.lockstep.flight import LockstepPlan, Watching, fly
+from airl_mav.harness.rehearsal import Observer
+from airl_mav.harness.run_folder import RunFolder
+from airl_mav.harness.state import state_of
+from airl_mav.policy.actions import Policy
+from firmware_sim.autopilot.state import Message
+from firmware_sim.simulation import Simulation
+
+SHOW_EVERY = 125
+"""The observer sees the true state every so many ticks: twice a simulated second."""
+
+
+def rehearse(
+    plan: LockstepPlan,
+    seeds: list[int],
+    fresh_policy: Callable[[int], Policy],
+    folder: RunFolder,
+    observer: Observer,
+) -> None:
+    """Fly all episodes; each is saved as it ends.
+
+    Args:
+        plan: What is flown on what.
+        seeds: Of each episode, by index.
+        fresh_policy: Gives the policy as it begins a flight with a seed.
+        folder: Where everything goes.
+        observer: Who looks on.
+
+    Raises:
+        UsageError: The policy cannot use the camera; no arena can be made of a seed.
+        LockstepError: The companion hangs, or broke.
+    """
+    for index, seed in enumerate(seeds):
+        flown = fly(
+            plan,
+            fresh_policy(seed),
+            index,
+            seed,
+            tlog=folder.tlog_path(index),
+            watching=_watching(observer, index, seed),
+        )
+        folder.save_episode(flown.record, flown.trajectory, flown.latency)
+        observer.finished(flown.record)
+
+
+def _watching(observer: Observer, index: int, seed: int) -> Watching:
+    def text(message: Message, time_us: int) -> None:
+        observer.text(Text(time_us=time_us, severity=int(message.severity), text=message.text))
+
+    ticks = 0
+
+    def tick(simulation: Simulation, hit: str | None) -> None:
+        nonlocal ticks
+        ticks += 1
+        if ticks % SHOW_EVERY == 0:
+            observer.state(state_of(simulation, hit), simulation.start_us)
+
+    return Watching(
+        begin=lambda goal: observer.episode(index, seed, goal),
+        phase=observer.phase,
+        text=text,
+        tick=tick,
+    )
