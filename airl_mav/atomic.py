@@ -15,31 +15,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def add_arrays(path: Path, prefix: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Add arrays to an .npz under `prefix`, in place of any there; the file is never half-written.
+def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+    """Add groups of arrays to an .npz; the file is the old one or the whole new one.
 
-    The old archive is copied as bytes and appended to, so that adding an episode costs a copy and
-    not a second compression of the whole run.
+    The old archive is copied as bytes and appended to, so that adding costs a copy and not a second
+    compression of the whole run.
+
+    Args:
+        path: The archive; made when there is none.
+        groups: Arrays by name, by group; their keys become `<group>/<name>`. All that the archive
+            has of these groups is replaced.
     """
     partial = path.with_name(path.name + ".partial")
-    # Arrays of an episode that a kill cut off and that is flown again.
-    stale = False
-    if path.exists():
-        with zipfile.ZipFile(path) as old:
-            stale = any(name.startswith(prefix) for name in old.namelist())
+    old = path.exists()
+    if old:
+        shutil.copyfile(path, partial)
+    with _archive(partial, "a" if old else "w") as new:
+        stale = any(_group_of(name) in groups for name in new.namelist())
         if not stale:
-            shutil.copyfile(path, partial)
-    mode: Literal["a", "w"] = "a" if path.exists() and not stale else "w"
-    with zipfile.ZipFile(partial, mode, zipfile.ZIP_DEFLATED, compresslevel=1) as new:
-        if stale:
-            with zipfile.ZipFile(path) as old:
-                for member in old.infolist():
-                    if not member.filename.startswith(prefix):
-                        new.writestr(member, old.read(member))
-        for name, array in arrays.items():
-            with new.open(f"{prefix}{name}.npy", "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+            _write_groups(new, groups)
+    if stale:
+        # Arrays of an episode that a kill cut off and that is flown again.
+        with _archive(partial, "w") as new:
+            _copy_others(path, new, groups)
+            _write_groups(new, groups)
     _commit(partial, path)
+
+
+def _archive(path: Path, mode: Literal["a", "w"]) -> zipfile.ZipFile:
+    return zipfile.ZipFile(path, mode, zipfile.ZIP_DEFLATED, compresslevel=1)
+
+
+def _copy_others(
+    path: Path, new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArray[Any]]]
+) -> None:
+    """Copy what an archive has of all other groups."""
+    with zipfile.ZipFile(path) as old:
+        for member in old.infolist():
+            if _group_of(member.filename) not in groups:
+                new.writestr(member, old.read(member))
+
+
+def _write_groups(new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+    for group, arrays in groups.items():
+        for name, array in arrays.items():
+            with new.open(f"{group}/{name}.npy", "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
+
+
+def _group_of(name: str) -> str:
+    return name.partition("/")[0]
 
 
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

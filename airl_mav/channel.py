@@ -137,6 +137,8 @@ class Saved(_Line):
     type: Literal["saved"] = "saved"
     path: str
     """Of the arrays."""
+    sha256: dict[str, str] = Field(default_factory=dict)
+    """In lockstep, the fingerprint of the flight by lane; see docs/lockstep.md."""
 
 
 class Progress(_Line):
@@ -157,6 +159,8 @@ class Ended(_Line):
     notes: tuple[str, ...] = ()
     path: str
     """Of the decision log."""
+    sha256: dict[str, str] = Field(default_factory=dict)
+    """In lockstep, the fingerprint of what the policy saw; see docs/lockstep.md."""
 
 
 class Failed(_Line):
