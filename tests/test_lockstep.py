@@ -164,6 +164,18 @@ def test_pace_changes_nothing(plan: LockstepPlan, policy: Policy, reference: Flo
     assert fly(replace(plan, speed=25.0), policy, 0, SEED).record == reference.record
 
 
+def test_filterpy_flies_the_same_to_rounding(
+    plan: LockstepPlan, policy: Policy, reference: Flown
+) -> None:
+    """A whole flight on the estimator's reference: rounding stays rounding."""
+    flown = fly(replace(plan, estimator="filterpy"), policy, 0, SEED)
+    assert flown.record.outcome is Outcome.SUCCESS
+    ours, theirs = reference.trajectory, flown.trajectory
+    assert len(ours) == len(theirs)
+    np.testing.assert_allclose(ours.position, theirs.position, atol=1e-6)
+    assert reference.record.sha256 != flown.record.sha256, "another filter did fly"
+
+
 # --- latency
 
 

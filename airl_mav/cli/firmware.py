@@ -36,6 +36,7 @@ from airl_mav.ports import LOOPBACK, Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Firmware
 from firmware_sim.mavlink.px4_links import px4_server
@@ -71,6 +72,9 @@ class FirmwareCommand:
 
     wind: WindSettings = field(default_factory=WindSettings)
     """Wind; calm by default."""
+
+    estimator: FilterName = "kernel"
+    """Filter of the estimator: compiled, or filterpy's, the reference, some twenty times slower."""
 
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports."""
@@ -162,7 +166,7 @@ def setup(
     """Return the episode of an arena and its seeds. Raises UsageError for a bad profile."""
     spec = load_profile("arenas", arena, ArenaSpec)
     concrete = generate(spec, arena_seed, name=arena, vehicle_width_m=vehicle.body.width_m)
-    return EpisodeSetup(vehicle, concrete, seed, command.wind)
+    return EpisodeSetup(vehicle, concrete, seed, command.wind, command.estimator)
 
 
 def main() -> None:

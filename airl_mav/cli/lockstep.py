@@ -42,6 +42,7 @@ def lockstep_plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> L
         time_limit_s=command.time_limit,
         computer_watts=setup.computer_watts,
         speed=command.speed,
+        estimator=command.estimator,
     )
 
 

@@ -47,6 +47,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
+from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.plant.wind import WindSettings
 
 ARRIVAL_SHARE = 0.8
@@ -121,6 +122,9 @@ class SitlCommand:
 
     wind: WindSettings = field(default_factory=WindSettings)
     """Wind; calm by default."""
+
+    estimator: FilterName = "kernel"
+    """Filter of the estimator: compiled, or filterpy's, the reference, some twenty times slower."""
 
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports."""
@@ -267,6 +271,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         # One word each: -1e-05 by itself would be taken for an option.
         *(f"--wind.north-m-s={wind.north_m_s!r}", f"--wind.east-m-s={wind.east_m_s!r}"),
         *(f"--wind.gust-m-s={wind.gust_m_s!r}", f"--wind.gust-time-s={wind.gust_time_s!r}"),
+        *("--estimator", command.estimator),
         *("--api-port", f"{ports.api_port}", "--api-local-port", f"{ports.api_local_port}"),
         *("--gcs-port", f"{ports.gcs_port}", "--gcs-local-port", f"{ports.gcs_local_port}"),
         *("--camera-port", f"{ports.camera_port}"),

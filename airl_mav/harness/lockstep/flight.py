@@ -28,6 +28,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
+from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
 from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -54,6 +55,8 @@ class LockstepPlan:
     computer_watts: float
     speed: float | None = None
     """Greatest number of simulated seconds per wall second; None: as fast as it goes."""
+    estimator: FilterName = "kernel"
+    """What carries the estimator's covariance."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ class _Flight:
 
     def fly(self, index: int, tlog: Path | None) -> Flown:
         plan = self._plan
-        setup = EpisodeSetup(plan.vehicle, self._arena, self._seed, plan.wind)
+        setup = EpisodeSetup(plan.vehicle, self._arena, self._seed, plan.wind, plan.estimator)
         with Stage(
             transport_us=plan.transport_us, digest=self._digest, speed=plan.speed
         ) as self._stage:
