@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.lockstep import lockstep_plan, policies
-from airl_mav.cli.sitl import SitlCommand, check
+from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.clock import SimClock
 from airl_mav.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.harness.lockstep.digest import FlightDigest

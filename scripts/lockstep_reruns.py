@@ -117,7 +117,7 @@ def busy(processes: int) -> Iterator[None]:
 def fly(command: Reruns, flights: int) -> None:
     """Fly, and print when each flight begins and what its fingerprint is."""
     from airl_mav.cli.lockstep import lockstep_plan, policies
-    from airl_mav.cli.sitl import SitlCommand, check
+    from airl_mav.cli.sitl_command import SitlCommand, check
     from airl_mav.harness.lockstep.flight import Watching
     from airl_mav.harness.lockstep.flight import fly as fly_episode
 

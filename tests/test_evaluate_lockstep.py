@@ -27,7 +27,7 @@ from worker_jobs import PaperFlier
 from airl_mav.cli import evaluate_task, sitl
 from airl_mav.cli.evaluate import run
 from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.sitl import SitlCommand
+from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.harness.evaluation import Evaluation

@@ -25,7 +25,8 @@ from run_demo import demo_arena, demo_episode, demo_setup
 from airl_mav.cli import evaluate_task, ladder_levels, main, report
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_task import Result, Task, sitl_command
-from airl_mav.cli.ladder import LadderCommand, run
+from airl_mav.cli.ladder import run
+from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango

@@ -24,7 +24,7 @@ from processes import ROOT, running
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli import companion, companion_command, sitl
+from airl_mav.cli import companion, companion_command, sitl, sitl_command
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.errors import UsageError
@@ -329,10 +329,12 @@ def test_the_pilot_flies_as_the_card_says_unless_told_otherwise(exported: Path) 
 
 def test_sitl_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> None:
     path = str(exported / "discrete")
-    setup, pilot = sitl.check(sitl.SitlCommand(policy=path))
+    setup, pilot = sitl_command.check(sitl_command.SitlCommand(policy=path))
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.4, 2.0, 2.5)
     assert (setup.policy.name, setup.policy.description) == ("discrete", "random weights")
-    words = sitl.plan(sitl.SitlCommand(policy=path, threads=2), setup, pilot).companion.arguments
+    words = sitl.plan(
+        sitl_command.SitlCommand(policy=path, threads=2), setup, pilot
+    ).companion.arguments
     for option, value in (
         ("--policy", path),
         ("--runtime", "onnx"),
@@ -342,9 +344,9 @@ def test_sitl_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> No
         ("--goal-radius-m", "2.0"),
     ):
         assert words[words.index(option) + 1] == value
-    _, pilot = sitl.check(sitl.SitlCommand(policy=path, hold=0.7, goal_radius=4.0))
+    _, pilot = sitl_command.check(sitl_command.SitlCommand(policy=path, hold=0.7, goal_radius=4.0))
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.7, 2.0, 4.0)
-    _, pilot = sitl.check(sitl.SitlCommand(policy="greedy"))
+    _, pilot = sitl_command.check(sitl_command.SitlCommand(policy="greedy"))
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.5, 2.5, 3.0)
 
 
@@ -360,14 +362,16 @@ def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path:
         encoding="utf-8",
     )
     path = str(exported / "discrete")
-    setup, _ = sitl.check(sitl.SitlCommand(policy=path, computer=str(computer)))
+    setup, _ = sitl_command.check(sitl_command.SitlCommand(policy=path, computer=str(computer)))
     assert setup.injection.origin == "injected"
     assert "this policy as timed" in setup.injection.label
-    other, _ = sitl.check(
-        sitl.SitlCommand(policy=str(exported / "continuous"), computer=str(computer))
+    other, _ = sitl_command.check(
+        sitl_command.SitlCommand(policy=str(exported / "continuous"), computer=str(computer))
     )
     assert other.injection.origin == "measured"
-    guess, _ = sitl.check(sitl.SitlCommand(policy=path, computer="ras-pi-4", workload="estimate"))
+    guess, _ = sitl_command.check(
+        sitl_command.SitlCommand(policy=path, computer="ras-pi-4", workload="estimate")
+    )
     assert guess.injection.origin == "estimated"
 
     # The companion draws the same, under a harness; by itself it runs on that very computer.

@@ -6,12 +6,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from airl_mav.cli import sitl
 from airl_mav.cli.companion_command import chance
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_settings import policy_part, seeds, settings
 from airl_mav.cli.lockstep import lockstep_plan, policies
-from airl_mav.cli.sitl import SitlCommand
+from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.harness.evaluation import Evaluation, Job
 from airl_mav.harness.evaluation_lockstep import Fly, LockstepRun
 from airl_mav.harness.lockstep.flight import LockstepPlan, fly
@@ -84,7 +83,7 @@ def plan_lockstep(
     Raises:
         UsageError: Names the option, its value and what is accepted.
     """
-    setup, pilot = sitl.check(rehearsal)
+    setup, pilot = check(rehearsal)
     if command.ablate is not None:
         load_policy(rehearsal.policy, pilot.hold_s, ablate=command.ablate)
     policy = find_policy(rehearsal.policy)

@@ -16,6 +16,7 @@ from airl_mav.cli.episode_bar import EpisodeBar, stop_on_signals
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_gym import plan_evaluation
 from airl_mav.cli.evaluate_lockstep import plan_lockstep
+from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import TIME_LIMIT_S
@@ -87,7 +88,7 @@ def prepare(command: EvaluateCommand, policy: str, arena: str) -> Task:
         run, pilot = plan_lockstep(command, rehearsal)
         fly = partial(_fly, run.evaluation, partial(fly_lockstep, run))
     else:
-        _, pilot = sitl.check(rehearsal)
+        _, pilot = check(rehearsal)
         fly = partial(_fly_sitl, rehearsal)
     rules = pilot.goal_radius_m, pilot.hold_s, pilot.altitude_m, rehearsal.time_limit
     return Task(info, arena, _in_words(*rules), fly)
@@ -139,12 +140,12 @@ def _say(console: Console, text: str, style: str | None = None) -> None:
 
 def sitl_command(
     command: EvaluateCommand, policy: PolicyInfo, path: str, arena: str
-) -> sitl.SitlCommand:
+) -> SitlCommand:
     """Return the rehearsal that an evaluation at level sitl or lockstep is."""
     hover_s = command.hover_after
     if hover_s is None and policy.card is not None:
         hover_s = policy.card.hover_after_s
-    return sitl.SitlCommand(
+    return SitlCommand(
         vehicle=command.vehicle,
         arena=arena,
         policy=path,
@@ -163,7 +164,7 @@ def sitl_command(
     )
 
 
-def _fly_sitl(rehearsal: sitl.SitlCommand, out: Path | None, console: Console) -> Result:
+def _fly_sitl(rehearsal: SitlCommand, out: Path | None, console: Console) -> Result:
     """Rehearse, unless the folder holds that very run already; show it."""
     name = find_policy(rehearsal.policy).name
     label = f"{utc_now():%Y%m%dT%H%M%SZ}-evaluate-{name}-{Path(rehearsal.arena).stem}-sitl"
@@ -179,7 +180,7 @@ def _fly_sitl(rehearsal: sitl.SitlCommand, out: Path | None, console: Console) -
     return Result(path, code, run.episodes, len(run.episodes))
 
 
-def _check_finished(path: Path, rehearsal: sitl.SitlCommand) -> None:
+def _check_finished(path: Path, rehearsal: SitlCommand) -> None:
     """Raise UsageError unless a folder holds all episodes of a rehearsal."""
     run = load(path)
     wanted = {key: asdict(rehearsal)[key] for key in SAME_IN_SITL}

@@ -2,92 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
 from rich.console import Console
 
 from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_range
 from airl_mav.cli.evaluate import DEFAULT_ARENA
+from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.harness.run_folder import RUN_FILE
 from airl_mav.harness.workers import GREATEST_WORKERS
 from airl_mav.policy.registry import find_policy
-from airl_mav.ports import Ports
 from airl_mav.report.matrix import MATRIX_FILE
-
-LevelName = Literal["gym", "lockstep", "sitl"]
-
-SITL_EPISODES = 10
-"""Episodes at level sitl unless asked for: they take real time."""
 
 FACTS = ("vehicle", "computer", "workload", "seed")
 """Options that head a ladder, beside policy and arena."""
-
-
-@dataclass(frozen=True)
-class LadderCommand:
-    """Fly the same policy and seeds at several levels of fidelity, and say what differs.
-
-    Success, flight time, distance and energy side by side, with the differences from the first
-    level on the same seeds and their 95 % intervals. The same --out goes on with what was
-    interrupted.
-    """
-
-    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-    """A name, or a path to a folder with policy.onnx and card.json."""
-
-    arena: str | None = None
-    """Arena profile: a shipped name, or a path to a .toml. None: that which the policy was trained
-    in, or static-obstacles."""
-
-    episodes: int = 100
-    """Number of episodes at each level, >= 1."""
-
-    seed: int = 1
-    """Seed; episode i uses seed + i, at every level."""
-
-    levels: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
-    """Levels that fly, two or more; the first is the reference of the others."""
-
-    sitl_episodes: int | None = None
-    """Number of episodes at level sitl, which flies in real time times --speed; the first ones of
-    the seeds. None: 10, or --episodes if that is fewer."""
-
-    workers: int | None = None
-    """Level lockstep: processes, each with one flight at a time, 1 to 256. None: as many as there
-    are usable cores."""
-
-    speed: float = 1.0
-    """Level sitl: simulated seconds per wall second, 0.5 to 10."""
-
-    vehicle: str = "quad"
-    """Vehicle profile: a shipped name, or a path to a .toml."""
-
-    computer: str = "workstation"
-    """Computer profile to fly as: a shipped name, or a path to a .toml."""
-
-    workload: str | None = None
-    """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
-    policy. None: what was measured for this very policy, or else 1 ms (gym, lockstep), or what
-    this machine takes (sitl)."""
-
-    ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
-    """Ports of level sitl."""
-
-    out: Path | None = None
-    """Folder of the ladder: a run folder for each level, ladder.json and ladder.html. None:
-    runs/<UTC time>-ladder-<policy>-<arena>."""
-
-    def episodes_at(self, level: str) -> int:
-        """Return the number of episodes at a level."""
-        if level != "sitl":
-            return self.episodes
-        fewer = SITL_EPISODES if self.sitl_episodes is None else self.sitl_episodes
-        return min(fewer, self.episodes)
 
 
 def run(command: LadderCommand, console: Console | None = None) -> int:

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_task import SAME_IN_SITL, prepare, sitl_command
-from airl_mav.cli.ladder import LadderCommand, LevelName
+from airl_mav.cli.ladder_command import LadderCommand, LevelName
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.harness.evaluation import another_config

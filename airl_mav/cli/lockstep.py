@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from airl_mav.cli.companion_command import chance, hover_after_s
-from airl_mav.cli.sitl import ARRIVAL_SHARE, SitlCommand
+from airl_mav.cli.sitl_command import ARRIVAL_SHARE, SitlCommand
 from airl_mav.constants import US_PER_MS
 from airl_mav.envs.spec import Delay
 from airl_mav.flight.setup import Setup
@@ -21,7 +21,7 @@ from companion.pilot import PilotSettings
 
 
 def lockstep_plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> LockstepPlan:
-    """Return the plan of a checked command; `setup` and `pilot` are what `sitl.check` gave.
+    """Return the plan of a checked command; `setup` and `pilot` are what `sitl_command.check` gave.
 
     Where a machine's own time would count, the training environment's values stand.
     """

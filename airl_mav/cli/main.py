@@ -10,12 +10,13 @@ import tyro
 from airl_mav.cli import arena, evaluate, export, ladder, report, train
 from airl_mav.cli.common import run_command
 from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.ladder_command import LadderCommand
 
 Command = (
     Annotated[arena.ArenaCommand, tyro.conf.subcommand("arena", prefix_name=False)]
     | Annotated[EvaluateCommand, tyro.conf.subcommand("evaluate", prefix_name=False)]
     | Annotated[export.ExportCommand, tyro.conf.subcommand("export", prefix_name=False)]
-    | Annotated[ladder.LadderCommand, tyro.conf.subcommand("ladder", prefix_name=False)]
+    | Annotated[LadderCommand, tyro.conf.subcommand("ladder", prefix_name=False)]
     | Annotated[report.ReportCommand, tyro.conf.subcommand("report", prefix_name=False)]
     | Annotated[train.TrainCommand, tyro.conf.subcommand("train", prefix_name=False)]
 )
@@ -24,7 +25,7 @@ _RUN: dict[type[Any], Callable[[Any], int]] = {
     arena.ArenaCommand: arena.run,
     EvaluateCommand: evaluate.run,
     export.ExportCommand: export.run,
-    ladder.LadderCommand: ladder.run,
+    LadderCommand: ladder.run,
     report.ReportCommand: report.run,
     train.TrainCommand: train.run,
 }

@@ -32,6 +32,9 @@ LONGEST_REST_US = US_PER_S
 """The companion has a turn at least this often, wanted or not, so that what is sent to it fits into
 its socket's buffer even when it does not read [µs]."""
 
+KNOCK_S = 0.1
+"""Before the companion is there, a heartbeat goes out so often [wall s]."""
+
 FIRST_REPEAT_S, LAST_REPEAT_S = 0.02, 1.0
 """The turn is given again after the first, then twice that, up to the last [wall s]."""
 
@@ -95,7 +98,7 @@ class TokenPartner:
         self._heard = False
         """Whether the companion is there: before, nothing but heartbeats is sent."""
         self._backlog: list[bytes] = []
-        """All telemetry up to the end of the first turn."""
+        """All telemetry before the first turn."""
         self._number = 0
         self._rest: _Rest | None = None
         self._unseen = False
@@ -131,7 +134,7 @@ class TokenPartner:
     def send(self, frames: bytes) -> None:
         """Pass on telemetry, at once if the companion is there."""
         self._heartbeat = newest_heartbeat(frames) or self._heartbeat
-        if self._number < 2:
+        if self._number == 0:
             self._backlog.append(frames)
         if self._heard:
             self._send_frames(frames)
@@ -144,11 +147,11 @@ class TokenPartner:
             return self._asleep(self._rest)
         if not self._heard and not self._knock():
             return Turn(None)
-        # What is left from before must not fill the socket's buffer.
         over = TurnGiven(self._number, now_us)
+        self._number += 1
+        # What is left from before must not fill the socket's buffer.
         self._hear([*self._early, *self._received()], over, handle)
         self._early.clear()
-        self._number += 1
         self._phases.clear()
         given = TurnGiven(self._number, now_us, self._camera.sequence, self._order)
         back = self._exchange(given, handle)
@@ -200,16 +203,14 @@ class TokenPartner:
 
     def _knock(self) -> bool:
         """Send heartbeats until the companion answers with anything; False: broken off."""
-        while True:
-            for again_s in _repeats(LAST_REPEAT_S):
-                self._endpoint.send(self._heartbeat)
-                if self._wait(again_s) and (early := self._received()):
-                    self._early = early
-                    self._heard = True
-                    self._send_frames(b"".join(self._backlog))
-                    return True
-                if self._broken_off():
-                    return False
+        while not self._broken_off():
+            self._endpoint.send(self._heartbeat)
+            if self._wait(KNOCK_S) and (early := self._received()):
+                self._early = early
+                self._heard = True
+                self._send_frames(b"".join(self._backlog))
+                return True
+        return False
 
     def _exchange(self, given: TurnGiven, handle: Callable[[bytes], None]) -> TurnBack | None:
         """Give the turn, again and again, until it comes back; None: broken off."""
