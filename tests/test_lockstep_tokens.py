@@ -31,7 +31,7 @@ from pymavlink import mavutil
 
 from airl_mav.channel import Ended, Failed, FinishEpisode, Fly, Loaded, LoadEpisode, Ready, Saved
 from airl_mav.cli.lockstep import lockstep_plan, policies
-from airl_mav.cli.sitl import SitlCommand, check
+from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.flight.judge import Outcome
 from airl_mav.harness.lockstep.flight import LockstepPlan, Watching, fly
 from airl_mav.harness.lockstep.remote import RemotePlan, RemoteStage
@@ -46,8 +46,8 @@ pytestmark = [pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
 
 SEED, ARENA = 1, "static-obstacles"
 LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
-SHORT_S = 3.0
-"""A time limit that no flight keeps: the referee ends it with an order."""
+TOO_SHORT_S = 3.0
+"""A time limit that no flight keeps."""
 
 
 # --- the reference: one process
@@ -60,13 +60,14 @@ class Reference:
     lanes: dict[str, str]
     goal: tuple[float, float]
     outcome: Outcome
+    command: SitlCommand
     plan: LockstepPlan
     setup: EpisodeSetup
 
 
-def fly_here(seed: int, time_limit_s: float = 120.0) -> Reference:
-    command = SitlCommand(arena=ARENA, seed=seed, time_limit=time_limit_s, lockstep=True)
+def fly_here(command: SitlCommand) -> Reference:
     setup, pilot = check(command)
+    seed = command.seed
     plan = lockstep_plan(command, setup, pilot)
     goals: list[tuple[float, float]] = []
     seen: list[Any] = []
@@ -74,12 +75,12 @@ def fly_here(seed: int, time_limit_s: float = 120.0) -> Reference:
     flown = fly(plan, policies(command, pilot.hold_s)(seed), 0, seed, watching=watching)
     lanes = {name: (flown.record.sha256 or {})[name] for name in LANES}
     episode = EpisodeSetup(plan.vehicle, seen[-1]._arena, seed, plan.wind)
-    return Reference(lanes, goals[0], flown.record.outcome, plan, episode)
+    return Reference(lanes, goals[0], flown.record.outcome, command, plan, episode)
 
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    done = fly_here(SEED)
+    done = fly_here(SitlCommand(arena=ARENA, seed=SEED, lockstep=True))
     assert done.outcome is Outcome.SUCCESS
     return done
 
@@ -95,7 +96,8 @@ def firmware_words(ports: TestPorts, *options: str) -> list[str]:
 def companion_words(api: int, camera: int, reference: Reference, *options: str) -> list[str]:
     north, east = reference.goal
     return [
-        *("-m", "airl_mav.cli.companion", "--lockstep", "--seed", str(SEED)),
+        *("-m", "airl_mav.cli.companion", "--lockstep"),
+        *("--policy", reference.command.policy, "--seed", str(reference.command.seed)),
         *("--connect", f"udpin://{LOOPBACK}:{api}", "--camera", f"tcp://{LOOPBACK}:{camera}"),
         *("--goal", repr(north), repr(east)),
         *("--goal-radius-m", repr(reference.plan.pilot.goal_radius_m), *options),
@@ -155,7 +157,7 @@ def test_stopped_and_loaded_processes_fly_the_same(
 ) -> None:
     rng = random.Random()  # the point in the flight is to be another one every time
     # Slow enough for the flight to last 1.9 s at least.
-    with load(loops), both(tmp_path, reference, "--speed", "15") as (firmware, companion):
+    with load(loops), both(tmp_path, reference, "--speed", "15.0") as (firmware, companion):
         firmware.wait_for_text("arming")
         time.sleep(rng.uniform(0.0, 1.5))
         pid = firmware.pid if who == "firmware" else companion.pid
@@ -207,10 +209,20 @@ def fly_staged(stage: RemoteStage) -> dict[str, str]:
     return stage.lanes()
 
 
-def test_orders_of_the_referee_arrive_in_their_turn(tmp_path: Path) -> None:
-    """A flight that is called off in the middle of an action."""
-    reference = fly_here(SEED, SHORT_S)
-    assert reference.outcome is Outcome.TIMEOUT
+@pytest.mark.parametrize(
+    ("command", "outcome"),
+    [
+        (SitlCommand(arena=ARENA, time_limit=TOO_SHORT_S, lockstep=True), Outcome.TIMEOUT),
+        (SitlCommand(arena="crowded", policy="greedy", seed=7, lockstep=True), Outcome.COLLISION),
+    ],
+    ids=["land", "abandon"],
+)
+def test_orders_of_the_referee_arrive_in_their_turn(
+    command: SitlCommand, outcome: Outcome, reference: Reference, tmp_path: Path
+) -> None:
+    """Flights that are called off, in the middle of an action."""
+    successful, reference = reference, fly_here(command)
+    assert reference.outcome is outcome
     with (
         staged(reference, remote_plan(reference)) as (stage, ports),
         running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
@@ -219,6 +231,8 @@ def test_orders_of_the_referee_arrive_in_their_turn(tmp_path: Path) -> None:
         assert companion.wait() == 1, companion.text()
     assert "stopped" in companion.text()
     assert lanes | lanes_in(companion.text()) == reference.lanes
+    # The fingerprint tells flights apart.
+    assert all(reference.lanes[name] != successful.lanes[name] for name in LANES)
 
 
 class Relay:
@@ -279,7 +293,7 @@ def test_lost_words_do_not_change_the_flight(reference: Reference, tmp_path: Pat
 
 def test_companion_that_dies_ends_the_flight(reference: Reference, tmp_path: Path) -> None:
     ports = choose_ports()
-    words = firmware_words(ports, "--companion-timeout", "2", "--speed", "15")
+    words = firmware_words(ports, "--companion-timeout", "1", "--speed", "15.0")
     with (
         running(words, tmp_path) as firmware,
         running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
@@ -288,18 +302,18 @@ def test_companion_that_dies_ends_the_flight(reference: Reference, tmp_path: Pat
         companion.process.kill()
         assert firmware.wait() == 1
     last = firmware.text().splitlines()[-1]
-    assert re.fullmatch(r"error: the companion is gone: .* turn \d+ in 2 s", last), firmware.text()
+    assert re.fullmatch(r"error: the companion is gone: .* turn \d+ in 1 s", last), firmware.text()
     assert "Traceback" not in firmware.text()
 
 
 def test_simulator_that_dies_ends_the_companion(reference: Reference, tmp_path: Path) -> None:
     with staged(reference, remote_plan(reference)) as (stage, ports):
-        words = companion_words(ports.api, ports.camera, reference, "--connect-timeout", "3")
+        words = companion_words(ports.api, ports.camera, reference, "--connect-timeout", "2")
         with running(words, tmp_path) as companion:
             while stage.time_us < 2_000_000:
                 stage.step()
             assert companion.wait() == 1
-    assert companion.text().splitlines()[-1] == "error: the flight controller gave no turn in 3 s"
+    assert companion.text().splitlines()[-1] == "error: the flight controller gave no turn in 2 s"
 
 
 def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path: Path) -> None:
@@ -319,7 +333,7 @@ def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path:
 @pytest.mark.slow
 def test_harness_flies_episodes_from_scratch(reference: Reference, tmp_path: Path) -> None:
     """Two episodes by one pair of processes: each is the flight that its seed is alone."""
-    references = [replace(reference), fly_here(SEED + 1)]
+    references = [reference, fly_here(replace(reference.command, seed=SEED + 1))]
     ports = choose_ports()
     events: queue.Queue[Any] = queue.Queue()
     firmware_options = firmware_words(ports, "--control", "stdio", *radius(reference))[2:]
@@ -390,7 +404,7 @@ def test_harness_flies_episodes_from_scratch(reference: Reference, tmp_path: Pat
 def test_companion_of_the_documentation_flies_its_square(tmp_path: Path) -> None:
     """Nothing but pymavlink and a socket, as docs/lockstep.md prints it; twice the same."""
     text = (ROOT / "docs" / "lockstep.md").read_text(encoding="utf-8")
-    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    (program,) = re.findall(r"```python\n(import re, socket.*?)```", text, re.DOTALL)
     assert not re.search(r"airl_mav|mavsdk|companion\.", program)
     script = tmp_path / "square.py"
     script.write_text(program, encoding="utf-8")

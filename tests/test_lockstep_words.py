@@ -13,6 +13,8 @@ import pytest
 from ports import LOOPBACK
 from pymavlink.dialects.v20 import common as dialect
 
+from airl_mav.cli.firmware_lockstep import LockstepOptions, remote_plan
+from airl_mav.errors import UsageError
 from airl_mav.harness.following import Order
 from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.harness.lockstep.token_camera import TokenCamera
@@ -227,6 +229,21 @@ def test_nothing_but_heartbeats_before_the_companion_is_there() -> None:
     assert sum(1 for size in mate.datagrams if size > 100) <= 10
 
 
+def test_answers_are_not_repeated() -> None:
+    """A second COMMAND_ACK would be taken for the answer to the next command of that kind."""
+    mate = Mate()
+    mate.start()
+    answer = Encoder().pack(dialect.MAVLink_command_ack_message(400, 0))
+    with (
+        partner(mate, TokenSettings(patience_s=0.5)) as vehicle,
+        pytest.raises(LockstepError, match="the companion is gone"),
+    ):
+        vehicle.turn(NOW_US, lambda _: vehicle.send(answer))
+    kinds = mate.kinds()
+    assert kinds.count("F1 100000 -1") >= 3
+    assert kinds.count("COMMAND_ACK") == 1
+
+
 def test_wait_for_a_companion_can_be_broken_off() -> None:
     stop = threading.Event()
     with partner(Mate(), broken_off=stop.is_set) as vehicle:
@@ -262,3 +279,32 @@ def test_phases_are_told_once() -> None:
     ):
         vehicle.turn(NOW_US, lambda _: None)
     assert told == [("arming", NOW_US)]
+
+
+# --- options
+
+
+@pytest.mark.parametrize(
+    ("options", "speed", "named"),
+    [
+        (LockstepOptions(transport_ms=-1.0), None, "--transport-ms"),
+        (LockstepOptions(turn_us=0), None, "--turn-us"),
+        (LockstepOptions(turn_us=2_000_000), None, "--turn-us"),
+        (LockstepOptions(companion_timeout=0.0), None, "--companion-timeout"),
+        (LockstepOptions(goal_radius=0.0), None, "--goal-radius"),
+        (LockstepOptions(time_limit=0.0), None, "--time-limit"),
+        (LockstepOptions(), 0.01, "--speed"),
+    ],
+)
+def test_options_out_of_range_are_refused(
+    options: LockstepOptions, speed: float | None, named: str
+) -> None:
+    with pytest.raises(UsageError, match=named):
+        remote_plan(options, speed)
+
+
+@pytest.mark.parametrize(("speed", "paced"), [(None, None), ("max", None), (2.0, 2.0)])
+def test_pace_is_as_fast_as_it_goes_unless_asked(speed: Any, paced: float | None) -> None:
+    plan = remote_plan(LockstepOptions(transport_ms=7.0), speed)
+    assert plan.speed == paced
+    assert plan.transport_us == 7_000
