@@ -24,10 +24,11 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.harness.lockstep import stage as stage_module
 from airl_mav.harness.lockstep.digest import LANES
 from airl_mav.harness.lockstep.errors import LockstepError
-from airl_mav.harness.lockstep.flight import Flown, LockstepPlan, fly
+from airl_mav.harness.lockstep.flight import LockstepPlan, fly
 from airl_mav.harness.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.harness.lockstep.stage import Stage
 from airl_mav.harness.lockstep.threaded import ThreadPartner
+from airl_mav.harness.run_folder import FlownEpisode
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.policy.actions import Action, Policy
@@ -56,7 +57,7 @@ def policy() -> Policy:
 
 
 @pytest.fixture(scope="module")
-def reference(plan: LockstepPlan, policy: Policy) -> Flown:
+def reference(plan: LockstepPlan, policy: Policy) -> FlownEpisode:
     return fly(plan, policy, 0, SEED)
 
 
@@ -75,7 +76,7 @@ def busy(processes: int) -> Iterator[None]:
 # --- the same flight
 
 
-def test_the_flight_is_a_flight(reference: Flown) -> None:
+def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
     record = reference.record
     assert record.outcome is Outcome.SUCCESS
     assert record.notes == ()
@@ -86,7 +87,7 @@ def test_the_flight_is_a_flight(reference: Flown) -> None:
 
 
 def test_twenty_reruns_under_load_are_the_same(
-    plan: LockstepPlan, policy: Policy, reference: Flown
+    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
 ) -> None:
     with busy(3):
         reruns = [fly(plan, policy, 0, SEED) for _ in range(20)]
@@ -118,7 +119,9 @@ def test_without_the_barrier_reruns_differ(
     assert len(flights) > 1
 
 
-def test_other_flights_are_others(plan: LockstepPlan, policy: Policy, reference: Flown) -> None:
+def test_other_flights_are_others(
+    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
+) -> None:
     assert reference.record.sha256 is not None
     for other in (
         fly(plan, policy, 0, SEED + 1),
@@ -130,13 +133,13 @@ def test_other_flights_are_others(plan: LockstepPlan, policy: Policy, reference:
 
 
 def test_earlier_flights_leave_no_trace(
-    plan: LockstepPlan, policy: Policy, reference: Flown
+    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
 ) -> None:
     fly(plan, policy, 0, 3)
     assert fly(plan, policy, 0, SEED).record == reference.record
 
 
-def test_a_process_that_is_stopped_flies_the_same(reference: Flown) -> None:
+def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> None:
     """SIGSTOP: MAVSDK's timers run out meanwhile, by the wall clock."""
     moments = np.random.default_rng(5)
     command = [sys.executable, lockstep_kit.__file__, "4"]
@@ -160,12 +163,12 @@ def test_a_process_that_is_stopped_flies_the_same(reference: Flown) -> None:
     assert fingerprints == [reference.record.sha256["flight"]] * 4
 
 
-def test_pace_changes_nothing(plan: LockstepPlan, policy: Policy, reference: Flown) -> None:
+def test_pace_changes_nothing(plan: LockstepPlan, policy: Policy, reference: FlownEpisode) -> None:
     assert fly(replace(plan, speed=25.0), policy, 0, SEED).record == reference.record
 
 
 def test_filterpy_flies_the_same_to_rounding(
-    plan: LockstepPlan, policy: Policy, reference: Flown
+    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
 ) -> None:
     """A whole flight on the estimator's reference: rounding stays rounding."""
     flown = fly(replace(plan, estimator="filterpy"), policy, 0, SEED)

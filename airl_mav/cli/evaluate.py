@@ -13,8 +13,8 @@ from airl_mav.cli.common import GREATEST_SEED, check_range
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
+from airl_mav.flight.record import run_sha256
 from airl_mav.flight.statistics import aggregate
-from airl_mav.harness.evaluation import run_sha256
 from airl_mav.harness.run_folder import RUN_FILE
 from airl_mav.harness.workers import GREATEST_WORKERS
 from airl_mav.policy.card import Result as CardResult

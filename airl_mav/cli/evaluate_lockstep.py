@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from airl_mav.cli.companion_command import chance
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_settings import policy_part, seeds, settings
 from airl_mav.cli.lockstep import lockstep_plan, policies
@@ -16,8 +14,6 @@ from airl_mav.harness.evaluation_lockstep import Fly, LockstepRun
 from airl_mav.harness.lockstep.flight import LockstepPlan, fly
 from airl_mav.harness.run_folder import FlownEpisode, RunFolder
 from airl_mav.harness.workers import GREATEST_WORKERS
-from airl_mav.policy.actions import Policy
-from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.provenance import usable_cores
@@ -50,22 +46,13 @@ class LockstepFlier:
     def start(self, tlogs: RunFolder | None) -> Fly:
         """Load everything; see `evaluation_lockstep.Flier`."""
         warm_up(self.plan.vehicle)
-        fresh_policy = self._policies()
+        fresh_policy = policies(self.rehearsal, self.hold_s, self.ablate)
 
         def fly_one(job: Job) -> FlownEpisode:
             tlog = None if tlogs is None else tlogs.tlog_path(job.index)
-            flown = fly(self.plan, fresh_policy(job.seed), job.index, job.seed, tlog=tlog)
-            return FlownEpisode(flown.record, flown.trajectory, flown.latency)
+            return fly(self.plan, fresh_policy(job.seed), job.index, job.seed, tlog=tlog)
 
         return fly_one
-
-    def _policies(self) -> Callable[[int], Policy]:
-        """Return what gives the policy as it begins a flight with a seed."""
-        if self.ablate is None:
-            return policies(self.rehearsal, self.hold_s)
-        loaded = load_policy(self.rehearsal.policy, self.hold_s, ablate=self.ablate)
-        assert isinstance(loaded, LearnedPolicy)  # noqa: S101 (others have no inputs to ablate)
-        return lambda seed: loaded.with_generator(chance(seed))
 
 
 def plan_lockstep(

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -21,7 +20,7 @@ from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.evaluation import Evaluation, another_config, open_folder
+from airl_mav.harness.evaluation import Evaluation, Watch, another_config, open_folder
 from airl_mav.harness.evaluation_gym import fly_gym
 from airl_mav.harness.evaluation_lockstep import fly_lockstep
 from airl_mav.harness.run_folder import RUN_FILE, RunFolder, load
@@ -34,10 +33,8 @@ from companion.watchdog import WatchdogSettings
 SAME_IN_SITL = ("policy", "arena", "vehicle", "computer", "workload", "episodes", "seed")
 """Settings by which a finished run of level sitl is known again."""
 
-Finished = Callable[[EpisodeRecord], None]
-Say = Callable[[str], None]
-FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Finished, Say, Callable[[], bool]], None]
-"""Flies what is left into a folder that holds some episodes already, until told to stop."""
+FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]
+"""Flies what is left into a folder that holds some episodes already."""
 
 
 @dataclass(frozen=True)
@@ -77,12 +74,8 @@ def prepare(command: EvaluateCommand, policy: str, arena: str) -> Task:
         plan, pilots = plan_evaluation(command, policy, arena)
         episode = plan.environment.episode
         rules = episode.goal_radius_m, episode.hold_s, episode.altitude_m, episode.time_limit_s
-
-        def in_the_twin(*where: Any) -> None:
-            folder, done, finished, _, stop = where
-            fly_gym(plan, folder, pilots, done, finished, stop)
-
-        return Task(info, arena, _in_words(*rules), partial(_fly, plan.evaluation, in_the_twin))
+        fly = partial(_fly, plan.evaluation, partial(fly_gym, plan, pilots))
+        return Task(info, arena, _in_words(*rules), fly)
     rehearsal = sitl_command(command, info, policy, arena)
     if command.level == "lockstep":
         run, pilot = plan_lockstep(command, rehearsal)
@@ -122,7 +115,7 @@ def _fly(evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: C
             bar.finished(record)
 
         try:
-            fly_rest(folder, done, finished, bar.say, stop)
+            fly_rest(folder, done, Watch(finished, bar.say, stop))
         except WorkerError as error:
             _say(console, f"error: {error}", "red")
             broken = True

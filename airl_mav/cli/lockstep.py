@@ -46,8 +46,16 @@ def lockstep_plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> L
     )
 
 
-def policies(command: SitlCommand, hold_s: float) -> Callable[[int], Policy]:
-    """Return what gives the policy as it begins a flight with a seed: nothing remembered."""
+def policies(
+    command: SitlCommand, hold_s: float, ablate: str | None = None
+) -> Callable[[int], Policy]:
+    """Return what gives the policy as it begins a flight with a seed: nothing remembered.
+
+    Args:
+        command: What was asked for.
+        hold_s: How long an action is held [s].
+        ablate: Input of the network that is made zero; None: none.
+    """
 
     def load(seed: int) -> Policy:
         return load_policy(
@@ -56,6 +64,7 @@ def policies(command: SitlCommand, hold_s: float) -> Callable[[int], Policy]:
             runtime=command.runtime,
             threads=command.threads,
             rng=chance(seed),
+            ablate=ablate,
         )
 
     loaded = load(command.seed)

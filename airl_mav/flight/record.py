@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 from pydantic import TypeAdapter, ValidationError
@@ -70,6 +72,21 @@ class EpisodeRecord:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
             raise ValueError(f"{field} = {first['input']!r}: {first['msg']}") from None
+
+
+def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
+    """Return the fingerprint of a run: equal when all its flights are equal, bit by bit.
+
+    Returns:
+        SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index, each a
+        line with its newline; None when there is none of a flight.
+    """
+    lines = []
+    for record in sorted(episodes, key=lambda record: record.index):
+        if record.sha256 is None:
+            return None
+        lines.append(f"{record.sha256['flight']}\n")
+    return hashlib.sha256("".join(lines).encode()).hexdigest() if lines else None
 
 
 _ADAPTER = TypeAdapter(EpisodeRecord)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +41,18 @@ class Evaluation:
         """Return what is left to be flown when some episodes are done."""
         there = {record.index for record in done}
         return [Job(index, seed) for index, seed in enumerate(self.seeds) if index not in there]
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who looks on while an evaluation flies."""
+
+    finished: Callable[[EpisodeRecord], None] = field(default=lambda _: None)
+    """Is told of each episode as it ends."""
+    say: Callable[[str], None] = field(default=lambda _: None)
+    """Is told, in words, what a person should know."""
+    stop: Callable[[], bool] = field(default=lambda: False)
+    """Asked again and again; True ends it all, with what has ended kept."""
 
 
 def open_folder(
@@ -87,18 +98,3 @@ def _flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{key}"] = value
     return flat
-
-
-def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
-    """Return the fingerprint of a run: equal when all its flights are equal, bit by bit.
-
-    Returns:
-        SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index, each a
-        line with its newline; None when there is none of a flight.
-    """
-    lines = []
-    for record in sorted(episodes, key=lambda record: record.index):
-        if record.sha256 is None:
-            return None
-        lines.append(f"{record.sha256['flight']}\n")
-    return hashlib.sha256("".join(lines).encode()).hexdigest() if lines else None

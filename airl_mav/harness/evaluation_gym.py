@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from airl_mav.arena.geometry import Arena, Shape
@@ -16,7 +16,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.harness.chunks import Saver
-from airl_mav.harness.evaluation import Evaluation
+from airl_mav.harness.evaluation import Evaluation, Watch
 from airl_mav.harness.run_folder import FlownEpisode, RunFolder
 from airl_mav.latency.injection import Injection
 
@@ -34,22 +34,16 @@ class GymPlan:
 
 
 def fly_gym(
-    plan: GymPlan,
-    folder: RunFolder,
-    pilots: Pilots,
-    done: Sequence[EpisodeRecord],
-    finished: Callable[[EpisodeRecord], None],
-    stop: Callable[[], bool] = lambda: False,
+    plan: GymPlan, pilots: Pilots, folder: RunFolder, done: Sequence[EpisodeRecord], watch: Watch
 ) -> None:
     """Fly what is left of a plan, and save it.
 
     Args:
         plan: The plan.
-        folder: Where everything goes.
         pilots: Who decides.
+        folder: Where everything goes.
         done: Episodes that lie there already.
-        finished: Is told of each episode as it ends.
-        stop: Asked before each decision; True ends it all, with what has ended kept.
+        watch: Who looks on; may stop it before each decision.
 
     Raises:
         UsageError: No arena can be made of a seed; what was flown before is kept.
@@ -61,10 +55,10 @@ def fly_gym(
     trace = Trace(slots)
     navigation = Navigation(plan.environment, slots, injection=plan.injection, trace=trace)
     with Saver(folder) as saver:
-        for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=stop):
+        for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=watch.stop):
             episode = _episode(plan, navigation, trace, slot, flown, index_of[flown.seed])
             saver.add(episode)
-            finished(episode.record)
+            watch.finished(episode.record)
 
 
 def _episode(

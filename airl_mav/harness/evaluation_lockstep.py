@@ -9,7 +9,7 @@ from typing import Protocol
 
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.harness.chunks import Saver
-from airl_mav.harness.evaluation import Evaluation, Job
+from airl_mav.harness.evaluation import Evaluation, Job, Watch
 from airl_mav.harness.run_folder import FlownEpisode, RunFolder
 from airl_mav.harness.workers import Workers
 
@@ -41,12 +41,7 @@ class LockstepRun:
 
 
 def fly_lockstep(
-    run: LockstepRun,
-    folder: RunFolder,
-    done: Sequence[EpisodeRecord],
-    finished: Callable[[EpisodeRecord], None],
-    lost: Callable[[str], None],
-    stop: Callable[[], bool] = lambda: False,
+    run: LockstepRun, folder: RunFolder, done: Sequence[EpisodeRecord], watch: Watch
 ) -> None:
     """Fly what is left of a run, and save it.
 
@@ -54,9 +49,7 @@ def fly_lockstep(
         run: The run.
         folder: Where everything goes.
         done: Episodes that lie there already.
-        finished: Is told of each episode as it ends.
-        lost: Is told, in words, of each worker that was lost; its flight begins again.
-        stop: Asked several times a second; True ends it all, with what has ended kept.
+        watch: Who looks on; hears of workers that were lost, and may stop it at any time.
 
     Raises:
         UsageError: No arena can be made of a seed; what was flown before is kept.
@@ -64,9 +57,9 @@ def fly_lockstep(
     """
     start = partial(run.flier.start, folder if run.tlogs else None)
     workers: Workers[Job, FlownEpisode] = Workers(
-        start, run.workers, name=lambda job: f"seed {job.seed}", lost=lost
+        start, run.workers, name=lambda job: f"seed {job.seed}", lost=watch.say
     )
     with Saver(folder) as saver, workers:
-        for episode in workers.do(run.evaluation.jobs(done), stop):
+        for episode in workers.do(run.evaluation.jobs(done), watch.stop):
             saver.add(episode)
-            finished(episode.record)
+            watch.finished(episode.record)

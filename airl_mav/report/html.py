@@ -96,7 +96,7 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
         environment()
         .get_template("report.html.j2")
         .render(
-            kind="Evaluation" if summary.modelled else "Rehearsal",
+            kind="Evaluation" if summary.modelled or "command" in run.info.config else "Rehearsal",
             run=run.info,
             folder=run.path.name,
             badges=[
@@ -110,7 +110,7 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
             latency=latency_table(summary),
             quality=quality_table(summary),
             episodes=episodes_table(run, MAX_LISTED),
-            real_time=None if summary.modelled else real_time_table(run, summary),
+            real_time=real_time_table(run, summary) if summary.timed else None,
             latency_pictures=latency_pictures,
             overview=overview,
             flights=flights,

@@ -15,9 +15,8 @@ from airl_mav.atomic import replace_file
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate, aggregate
-from airl_mav.harness.evaluation import run_sha256
 from airl_mav.harness.run_folder import LoadedRun, RunInfo, load
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples

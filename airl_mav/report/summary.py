@@ -60,6 +60,8 @@ class RunSummary:
     real_time: RealTime
     modelled: bool
     """Times come from a model and were not measured: level gym."""
+    timed: bool
+    """The flights lived by the wall clock: not gym, not lockstep."""
 
     @property
     def shown_stages(self) -> tuple[Stage, ...]:
@@ -79,6 +81,7 @@ def summarize_run(run: LoadedRun) -> RunSummary:
         quality=aggregate(run.episodes),
         real_time=_real_time(run, stages),
         modelled=run.info.setup.level == "gym",
+        timed=run.info.setup.level not in ("gym", "lockstep"),
     )
 
 

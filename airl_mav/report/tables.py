@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.setup import Part
 from airl_mav.flight.statistics import Estimate
 from airl_mav.harness.run_folder import EPISODES_FILE, LoadedRun
@@ -86,6 +86,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
         ("level", setup.level),
         ("speed", pace),
         ("between commands", setup.between_commands),
+        ("sha256 of the flights", run_sha256(run.episodes) or ""),
     ]
     return tuple((term, text) for term, text in rows if text)
 

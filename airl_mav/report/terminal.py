@@ -58,7 +58,7 @@ def print_report(run: LoadedRun, console: Console, report: Path | None = None) -
     console.print()
     console.print(facts)
     views = [latency_table(summary), episodes_table(run, MAX_LISTED), quality_table(summary)]
-    if not summary.modelled:
+    if summary.timed:
         views.append(real_time_table(run, summary))
     for view in views:
         console.print()

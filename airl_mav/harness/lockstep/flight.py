@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from airl_mav.arena.generate import generate
 from airl_mav.flight.judge import Referee, Task, Verdict
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.episode import join_stamps, judged_record
 from airl_mav.harness.following import Follower, Order
 from airl_mav.harness.lockstep.digest import FlightDigest, WitnessedPolicy
 from airl_mav.harness.lockstep.judging import Judge
 from airl_mav.harness.lockstep.stage import Stage
+from airl_mav.harness.run_folder import FlownEpisode
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.policy.actions import Policy
@@ -59,16 +57,6 @@ class LockstepPlan:
     """What carries the estimator's covariance."""
 
 
-@dataclass(frozen=True)
-class Flown:
-    """One episode, flown."""
-
-    record: EpisodeRecord
-    trajectory: Trajectory
-    latency: Mapping[str, NDArray[Any]]
-    """Stamps and estimates by column; see docs/run-folder.md."""
-
-
 @dataclass
 class Watching:
     """Who looks on. All calls come from the conductor's thread, or while it waits."""
@@ -91,7 +79,7 @@ def fly(
     *,
     tlog: Path | None = None,
     watching: Watching | None = None,
-) -> Flown:
+) -> FlownEpisode:
     """Fly one episode; the same plan, policy and seed give the same flight, bit by bit.
 
     Args:
@@ -127,7 +115,7 @@ class _Flight:
         self._judge = Judge(self._follower, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
-    def fly(self, index: int, tlog: Path | None) -> Flown:
+    def fly(self, index: int, tlog: Path | None) -> FlownEpisode:
         plan = self._plan
         setup = EpisodeSetup(plan.vehicle, self._arena, self._seed, plan.wind, plan.estimator)
         with Stage(
@@ -186,7 +174,7 @@ class _Flight:
     def _hear(self, message: Message) -> None:
         self._watching.text(message, self._stage.conductor.clock.time_us())
 
-    def _flown(self, index: int, simulation: Simulation) -> Flown:
+    def _flown(self, index: int, simulation: Simulation) -> FlownEpisode:
         result = self._result
         assert result is not None  # noqa: S101 (nothing broke)
         referee = self._follower.referee
@@ -219,4 +207,4 @@ class _Flight:
             notes=result.notes,
             sha256={"flight": self._digest.hexdigest(), **self._digest.lanes()},
         )
-        return Flown(record, trajectory, latency)
+        return FlownEpisode(record, trajectory, latency)

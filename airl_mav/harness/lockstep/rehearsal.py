@@ -46,7 +46,7 @@ def rehearse(
             tlog=folder.tlog_path(index),
             watching=_watching(observer, index, seed),
         )
-        folder.save_episode(flown.record, flown.trajectory, flown.latency)
+        folder.save_episodes([flown])
         observer.finished(flown.record)
 
 
