@@ -14,6 +14,8 @@ from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
 
+from airl_mav.clock import WallClock
+from airl_mav.constants import US_PER_S
 from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.harness.lockstep.frames import newest_heartbeat
 from airl_mav.harness.lockstep.turns import Turn
@@ -29,6 +31,12 @@ PATIENCE_S = 60
 
 PING_AGAIN_S = 0.1
 """A barrier's PING is repeated after so long without an answer [wall s]."""
+
+GREATEST_GAP_US = 2 * US_PER_S
+"""A longer time between two looks was no waiting: the process was stopped [µs of wall time]."""
+
+HEARTBEAT_S = 1.0
+"""The newest heartbeat is repeated so often in a long turn [wall s]."""
 
 _PING: int = dialect.MAVLINK_MSG_ID_PING
 
@@ -98,31 +106,38 @@ class ThreadPartner:
         self._barriers += 1
         ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
         wanted = number.to_bytes(4, "little")
-        for _ in range(round(PATIENCE_S / PING_AGAIN_S)):
-            # MAVSDK answers no PING of a vehicle that it has only just heard of: ask again then.
-            # A second answer is passed over.
-            self._feed(ping)
+        waited = Patience()
+        again_s = 0.0
+        while (so_far_s := waited.so_far_s()) < PATIENCE_S:
+            if so_far_s >= again_s:
+                # MAVSDK answers no PING of a vehicle that it has only just heard of: ask again
+                # then. A second answer is passed over.
+                self._feed(ping)
+                again_s = so_far_s + PING_AGAIN_S
             with suppress(Empty):
-                while True:
-                    item = self._inbox.get(timeout=PING_AGAIN_S)
-                    if not isinstance(item, bytes):
-                        raise LockstepError("the companion gave back a turn that it did not have")
-                    if _is_ping(item) and item[18:22] == wanted:
-                        return
-                    handle(item)
+                item = self._inbox.get(timeout=PING_AGAIN_S)
+                if not isinstance(item, bytes):
+                    raise LockstepError("the companion gave back a turn that it did not have")
+                if _is_ping(item) and item[18:22] == wanted:
+                    return
+                handle(item)
         raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
 
     def _work(self, handle: Callable[[bytes], None]) -> Turn:
         """Wait for the end of the companion's turn."""
-        # Counted in short waits, not read off a clock: a process that was stopped has not waited.
-        for _ in range(PATIENCE_S):
+        waited = Patience()
+        heartbeat_s = HEARTBEAT_S
+        while waited.so_far_s() < PATIENCE_S:
             with suppress(Empty):
-                while isinstance(item := self._inbox.get(timeout=1.0), bytes):
-                    handle(item)
-                return item
-            # MAVSDK gives a vehicle up after 3 s without a heartbeat, by the wall clock, and then
-            # finds no autopilot to connect to.
-            self._feed(self._heartbeat)
+                item = self._inbox.get(timeout=HEARTBEAT_S)
+                if not isinstance(item, bytes):
+                    return item
+                handle(item)
+            if waited.so_far_s() >= heartbeat_s:
+                # MAVSDK gives a vehicle up after 3 s without a heartbeat, by the wall clock, and
+                # then finds no autopilot to connect to.
+                self._feed(self._heartbeat)
+                heartbeat_s += HEARTBEAT_S
         raise LockstepError(f"the companion hangs: its turn did not end in {PATIENCE_S} s")
 
     @property
@@ -150,6 +165,22 @@ class ThreadPartner:
         except BaseException as error:  # handed to whoever conducts
             self.error = error
         self._inbox.put(Turn(None))
+
+
+class Patience:
+    """Adds up wall time in which somebody waited; a process that is stopped does not wait."""
+
+    def __init__(self) -> None:
+        self._clock = WallClock()
+        self._seen_us = 0
+        self._waited_us = 0
+
+    def so_far_s(self) -> float:
+        """Return what has been waited [s]. To be asked more often than `GREATEST_GAP_US`."""
+        now_us = self._clock.time_us()
+        self._waited_us += min(now_us - self._seen_us, GREATEST_GAP_US)
+        self._seen_us = now_us
+        return self._waited_us / US_PER_S
 
 
 def _is_ping(frame: bytes) -> bool:
