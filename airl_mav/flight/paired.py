@@ -134,20 +134,21 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     value = (gained - lost) / n
     z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
     # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
-    low, high = (
-        limit
-        if value == limit
-        else float(
-            optimize.brentq(
-                lambda d, target: _score(d, gained, lost, n) - target,
-                *sorted((value, limit)),
-                args=(-limit * z,),
-                xtol=1e-12,
-            )
-        )
-        for limit in (-1.0, 1.0)
-    )
+    low, high = (_where_score(gained, lost, n, value, limit, -limit * z) for limit in (-1.0, 1.0))
     return Estimate(value, low, high, n)
+
+
+def _where_score(
+    gained: int, lost: int, n: int, value: float, limit: float, target: float
+) -> float:
+    """Return the difference between the estimate and a limit at which the score is `target`."""
+    if value == limit:
+        return limit
+    low, high = sorted((value, limit))
+    found = optimize.brentq(
+        lambda difference: _score(difference, gained, lost, n) - target, low, high, xtol=1e-12
+    )
+    return float(found)
 
 
 def _score(d: float, gained: int, lost: int, n: int) -> float:
