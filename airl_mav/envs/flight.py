@@ -19,7 +19,7 @@ from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.contact import NOTHING, clearance, touches
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
 from airl_mav.kernels import kernel
-from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
@@ -67,26 +67,6 @@ def advance(
 
 
 @kernel
-def _airframe(row: NDArray[np.float64]) -> Airframe:
-    """Return a row of `Fleet.airframe` by its names."""
-    return Airframe(
-        row[0],
-        row[1],
-        row[2],
-        row[3],
-        row[4],
-        row[5],
-        row[6],
-        row[7],
-        row[8],
-        row[9],
-        row[10],
-        row[11],
-        row[12],
-    )
-
-
-@kernel
 def _contact(
     arenas: ArenaBatch, i: int, position: Vec, time_us: int, vehicle: Vehicle
 ) -> tuple[float, int]:
@@ -114,7 +94,7 @@ def _fly(
     rules: Rules,
     weights: Filters,
 ) -> None:
-    airframe, gains, pack = _airframe(fleet.airframe[i]), vehicle.gains, vehicle.pack
+    airframe, gains, pack = airframe_of(fleet.airframe[i]), vehicle.gains, vehicle.pack
     goal_north, goal_east = arenas.goal[i, 0], arenas.goal[i, 1]
     battery = fleet.battery[i]
     p = (fleet.position[i, 0], fleet.position[i, 1], fleet.position[i, 2])
