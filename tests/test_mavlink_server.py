@@ -237,6 +237,7 @@ def test_a_log_has_both_lanes_in_the_order_of_sending(tmp_path: Path) -> None:
             server.send(autopilot.time_us)
     log = mavutil.mavlink_connection(str(tmp_path / "a.tlog"))
     logged = list(iter(log.recv_msg, None))
+    log.close()
     ours = [bytes(m.get_msgbuf()) for m in logged if m.get_srcSystem() == 1]
     assert ours == endpoint.take()
     assert len(logged) - len(ours) == 500
