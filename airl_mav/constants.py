@@ -29,6 +29,7 @@ EARTH_RADIUS_M: Final = 6_371_000.0
 ZERO_CELSIUS_K: Final = 273.15
 """0 °C [K]."""
 
+MS_PER_S: Final = 1_000
 US_PER_MS: Final = 1_000
 US_PER_S: Final = 1_000_000
 """Microseconds in a second."""

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import brentq
 
-from airl_mav.latency.samplers import EmpiricalSampler, FixedSampler, LatencySampler, build_sampler
+from airl_mav.latency.samplers import ReplaySampler, FixedSampler, LatencySampler, build_sampler
 from airl_mav.profiles.computer import Latency
 
 N = 20_000
@@ -92,4 +92,4 @@ def test_impossible_samplers_are_refused() -> None:
     with pytest.raises(ValueError, match=">= 0"):
         FixedSampler(-1)
     with pytest.raises(ValueError, match="no samples"):
-        EmpiricalSampler([], np.random.default_rng(0))
+        ReplaySampler([], np.random.default_rng(0))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import threading
 from itertools import accumulate, count
+from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import Frame, depth_to_z16
@@ -22,6 +24,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.errors import UsageError
 from airl_mav.latency.injection import choose_injection
+from airl_mav.latency.source import parse_latency
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.profiles.arena import ArenaSpec
@@ -182,7 +185,7 @@ def draws_of(seed: int, n: int) -> list[int]:
 def test_latencies_are_those_that_the_companion_draws() -> None:
     """... of every slot for itself, past the blocks they are drawn in, and after a new start."""
     injection = choose_injection(load_computer("ras-pi-4"), "template-7x32")
-    draws = DelayDraws(3, injection, 1000)
+    draws = DelayDraws(3, [injection], 1000)
     decision = np.zeros(3, np.int64)
     taken: list[list[int]] = [[], [], []]
     for i, seed in enumerate((4, 5, 6)):
@@ -243,6 +246,73 @@ class Eyes:
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
         return self.latest()
+
+
+TRACE = "lognormal:300ms,40ms"
+
+
+@pytest.mark.parametrize("sources", [(TRACE,), (TRACE, "150ms", "workstation/template-5x32")])
+def test_latencies_go_on_from_a_saved_state(sources: tuple[str, ...], tmp_path: Path) -> None:
+    """Replayed traces remember where they are; in the middle of a block, and of an episode."""
+    file = tmp_path / "trace.txt"
+    file.write_text("\n".join(str(100 + k) for k in range(97)))
+    injections = [parse_latency(source) for source in (*sources, str(file))]
+
+    def fresh() -> DelayDraws:
+        return DelayDraws(4, injections, 1000)
+
+    first, second = fresh(), fresh()
+    for i, seed in enumerate((3, 1, 4)):  # the fourth slot never begins
+        first.begin(i, seed)
+    decision = np.zeros(4, np.int64)
+    for _ in range(BLOCK + 9):
+        first.take(decision)
+        decision += 1
+    second.set_state(first.get_state())
+    for _ in range(3 * BLOCK):
+        assert np.array_equal(first.take(decision)[:3], second.take(decision)[:3])
+        decision += 1
+
+
+def test_of_several_sources_each_episode_draws_one() -> None:
+    draws = DelayDraws(300, [parse_latency("100ms"), parse_latency("200ms")], 1000)
+    for i in range(300):
+        draws.begin(i, 1_000_000 + i)
+    first = draws.take(np.zeros(300, np.int64))
+    assert set(first.tolist()) == {100_000, 200_000}
+    # 300 fair coins: five standard deviations.
+    assert abs(np.count_nonzero(first == 100_000) - 150) < 5 * 8.7
+    for k in range(1, 70):
+        assert np.array_equal(draws.take(np.full(300, k)), first)
+
+
+def test_another_draw_is_another_sequence_of_the_same_distribution() -> None:
+    injection = parse_latency(TRACE)
+    taken = []
+    for draw in (0, 0, 1):
+        draws = DelayDraws(1, [injection], 1000, draw=draw)
+        draws.begin(0, 5)
+        taken.append([int(draws.take(np.array([k]))[0]) for k in range(2000)])
+    assert taken[0] == taken[1]
+    assert not set(taken[0][:20]) & set(taken[2][:20])
+    assert scipy.stats.ks_2samp(taken[0], taken[2]).pvalue > 1e-4
+
+
+def test_one_arena_for_all_episodes() -> None:
+    navigation = Navigation(spec_with(arena="static-obstacles"), 2, arena_seed=77)
+    navigation.begin([0, 1], [1, 2])
+    first, second = navigation.arenas
+    assert first is not None and second is not None
+    alone = Navigation(spec_with(arena="static-obstacles"), 1)
+    alone.begin([0], [77])
+    assert alone.arenas[0] is not None
+    for arena in (first, second):
+        assert np.array_equal(arena.goal, alone.arenas[0].goal)
+        assert np.array_equal(arena.obstacles.center, alone.arenas[0].obstacles.center)
+    # What chance decides in the flight stays each episode's own.
+    truth, told = navigation.truth(), navigation.kinematics()
+    assert np.array_equal(truth.position[0], truth.position[1])
+    assert not np.array_equal(told.velocity[0], told.velocity[1])
 
 
 def test_decides_when_the_pilot_decides() -> None:

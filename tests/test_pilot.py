@@ -20,7 +20,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.clock import Clock, SimClock, WallClock
 from airl_mav.constants import US_PER_S
-from airl_mav.latency.samplers import EmpiricalSampler, FixedSampler, LatencySampler
+from airl_mav.latency.samplers import ReplaySampler, FixedSampler, LatencySampler
 from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from companion.camera import ReceivedFrame
@@ -193,8 +193,8 @@ def test_every_stamp_is_where_it_belongs(
 def test_latencies_are_drawn_one_a_decision() -> None:
     clock = SimClock()
     samples = [100_000, 200_000, 300_000, 400_000]
-    latency = EmpiricalSampler(samples, np.random.default_rng(4))
-    expected = EmpiricalSampler(samples, np.random.default_rng(4))
+    latency = ReplaySampler(samples, np.random.default_rng(4))
+    expected = ReplaySampler(samples, np.random.default_rng(4))
     flight = Flight(clock, Script(*[forward()] * 12), latency=latency)
     flight.fly()
     t2 = flight.column("action_ready_us") - flight.column("infer_start_us")

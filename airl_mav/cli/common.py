@@ -35,6 +35,13 @@ def check_range(option: str, value: float, low: float, high: float) -> None:
         raise UsageError(f"{option} {value:.10g}: accepted: {low:g} <= value <= {high:.10g}")
 
 
+def check_draws(latency_seed: int, arena_seed: int | None) -> None:
+    """Raise UsageError for seeds that are none."""
+    check_range("--latency-seed", latency_seed, 0, GREATEST_SEED)
+    if arena_seed is not None:
+        check_range("--arena-seed", arena_seed, 0, GREATEST_SEED)
+
+
 def check_ports(ports: Ports, *, free: bool) -> None:
     """Check the port numbers.
 

@@ -20,12 +20,12 @@ from airl_mav.cli.common import (
 )
 from airl_mav.clock import Clock
 from airl_mav.errors import UsageError
-from airl_mav.latency.injection import Injection, choose_injection
-from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.injection import Injection
+from airl_mav.latency.samplers import LatencySampler, latency_generator
+from airl_mav.latency.source import select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
-from airl_mav.profiles.computer import load_computer
 from companion.camera import ZmqFrameSource
 from companion.link import MavsdkLink
 from companion.pilot import PilotSettings
@@ -86,6 +86,14 @@ class CompanionCommand:
     """Workload of the computer profile whose latency t2 is injected; estimate: scaled to this
     policy. None: nothing is injected."""
 
+    latency: str | None = None
+    """Latency t2 to inject, in place of --workload: 150ms, lognormal:396ms,20ms (mean, standard
+    deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured latencies, one a line in
+    ms, which are replayed in their order. None: as --computer and --workload say."""
+
+    latency_seed: int = 0
+    """Other draws of the same latency in the same flight; 0: those of its own seed."""
+
     lockstep: bool = False
     """Take turns with a simulator that waits for this program (airl-firmware --lockstep):
     simulated time moves only while it sleeps, and every flight of a seed is the same."""
@@ -123,6 +131,7 @@ def check(command: CompanionCommand) -> PilotSettings:
     """
     check_range("--speed", command.speed, 0.1, 100.0)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_range("--latency-seed", command.latency_seed, 0, GREATEST_SEED)
     check_range("--connect-timeout", command.connect_timeout, 0.1, 3600.0)
     for metres in command.goal:
         check_range("--goal", metres, -10_000.0, 10_000.0)
@@ -206,14 +215,15 @@ def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
 
 def sampler(command: CompanionCommand, seed: int) -> LatencySampler | None:
     """Return where t2 is drawn from. Raises UsageError for an unknown computer or workload."""
-    return injection(command).sampler(np.random.default_rng(seed))
+    return injection(command).sampler(latency_generator(seed, command.latency_seed))
 
 
 def injection(command: CompanionCommand) -> Injection:
     """Return the latency to fly with. Raises UsageError for an unknown computer or workload."""
     policy = find_policy(command.policy)
-    return choose_injection(
-        load_computer(command.computer),
+    return select_injection(
+        command.latency,
+        command.computer,
         command.workload,
         # Alone it runs on the computer that it flies on: what was measured there is no addition.
         # In lockstep no computer's own time counts.

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from airl_mav.atomic import save_arrays
 from airl_mav.channel import (
     Abort,
@@ -42,6 +40,7 @@ from airl_mav.cli.companion_command import (
 )
 from airl_mav.clock import WallClock
 from airl_mav.errors import UsageError
+from airl_mav.latency.samplers import latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from companion.conducted import Abandoned
@@ -60,7 +59,7 @@ def serve(command: CompanionCommand) -> int:
     try:
         pilot = check(command)
     except UsageError as error:
-        channel.send(Failed(message=str(error)))
+        channel.send(Failed(message=str(error), usage=True))
         return EXIT_USAGE
     clock = WallClock(command.speed)
 
@@ -88,8 +87,9 @@ def serve(command: CompanionCommand) -> int:
             while not isinstance(request := requests.get(), Shutdown):
                 channel.send(fly(request))
     except (UsageError, LinkError, Abandoned) as error:
-        channel.send(Failed(message=str(error)))
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_BROKEN
+        usage = isinstance(error, UsageError)
+        channel.send(Failed(message=str(error), usage=usage))
+        return EXIT_USAGE if usage else EXIT_BROKEN
     return 0
 
 
@@ -123,7 +123,7 @@ def _missions(
                 pilot_settings=pilot,
                 watchdog_settings=bounds,
                 guard=ThreadGuard(clock),
-                latency=t2.sampler(np.random.default_rng(request.latency_seed)),
+                latency=t2.sampler(latency_generator(request.latency_seed, command.latency_seed)),
             )
             return _ended(result, request, {})
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from airl_mav.cli import report
-from airl_mav.cli.common import GREATEST_SEED, check_range
+from airl_mav.cli.common import GREATEST_SEED, check_draws, check_range
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from airl_mav.cli.evaluate_task import Result as EvaluationResult
     from airl_mav.cli.evaluate_task import Task
 
-SHARED = ("level", "vehicle", "computer", "workload", "ablate", "episodes", "seed")
+SHARED = ("level", "vehicle", "computer", "workload", "latency", "ablate", "episodes", "seed")
 """Options that head a table: the same for all of it."""
 
 DEFAULT_ARENA = "static-obstacles"
@@ -71,6 +71,7 @@ def _check(command: EvaluateCommand) -> list[str]:
         raise UsageError("no policy; accepted: one or more names or folders")
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_draws(command.latency_seed, command.arena_seed)
     _check_level(command)
     found = [find_policy(name) for name in command.policies]
     if command.on_card:
@@ -101,7 +102,16 @@ def _check_level(command: EvaluateCommand) -> None:
 
 def _check_plain(command: EvaluateCommand, policies: Sequence[PolicyInfo]) -> None:
     """Raise UsageError for results that are not the policies' own."""
-    for option in ("ablate", "workload", "goal_radius", "time_limit", "hold", "hover_after"):
+    for option in (
+        "ablate",
+        "workload",
+        "latency",
+        "arena_seed",
+        "goal_radius",
+        "time_limit",
+        "hold",
+        "hover_after",
+    ):
         if (value := getattr(command, option)) is not None:
             raise UsageError(
                 f"--on-card with --{option.replace('_', '-')} {value}: accepted: without it"

@@ -32,6 +32,9 @@ class EvaluateCommand:
     seed: int = 1
     """Seed; episode i uses seed + i, with every policy and arena."""
 
+    arena_seed: int | None = None
+    """Every episode in the arena, and with the goal, of this one seed. None: of its own."""
+
     level: Literal["gym", "lockstep", "sitl"] = "gym"
     """gym: the batch twin, some hundred episodes a second. lockstep: as airl-sitl --lockstep flies,
     the same every time, bit by bit, on all cores. sitl: as airl-sitl flies, in real time times
@@ -50,6 +53,14 @@ class EvaluateCommand:
     """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
     policy. None: what was measured for this very policy, or else 1 ms (gym, lockstep), or what this
     machine takes (sitl)."""
+
+    latency: str | None = None
+    """Latency t2 to inject, in place of --workload: 150ms, lognormal:396ms,20ms (mean, standard
+    deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured latencies, one a line in
+    ms, which are replayed in their order. None: as --computer and --workload say."""
+
+    latency_seed: int = 0
+    """Other draws of the same latency on the same episodes; 0: those of the episodes' own seeds."""
 
     goal_radius: float | None = None
     """The goal is reached closer than this, seen from above, m. None: that of the policy's card,

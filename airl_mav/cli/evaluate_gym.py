@@ -16,7 +16,8 @@ from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.harness.evaluation import Evaluation
 from airl_mav.harness.evaluation_gym import GymPlan
-from airl_mav.latency.injection import choose_injection, without_timing
+from airl_mav.latency.injection import without_timing
+from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, find_policy, load_policy
@@ -44,12 +45,18 @@ def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[
     environment = _environment(command, info, arena, vehicle.camera)
     pilots = _pilots(command, policy, environment)
     injection = without_timing(
-        choose_injection(computer, command.workload, policy_sha256=info.sha256, macs=info.macs),
+        select_injection(
+            command.latency,
+            command.computer,
+            command.workload,
+            policy_sha256=info.sha256,
+            macs=info.macs,
+        ),
         environment.delay.native_ms,
         command.level,
     )
     # What cannot be flown is better found here: makes an arena, and looks at camera and hold.
-    trial = Navigation(environment, 1, injection=injection)
+    trial = Navigation(environment, 1, injection=injection, arena_seed=command.arena_seed)
     trial.begin([0], [command.seed])
     hover_s = environment.episode.hover_after_s
     setup = Setup(
@@ -65,13 +72,27 @@ def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[
     )
     config = {
         **settings(
-            command, info, policy, vehicle=vehicle, arena=trial.arena_spec, computer=computer
+            command,
+            info,
+            policy,
+            vehicle=vehicle,
+            arena=trial.arena_spec,
+            computer=computer,
+            **({} if injection.latency is None else {"latency": injection.latency}),
         ),
         "slots": command.slots,
         "environment": environment.model_dump(mode="json"),
     }
     evaluation = Evaluation(setup, seeds(command), config)
-    return GymPlan(evaluation, environment, injection, command.slots), pilots
+    plan = GymPlan(
+        evaluation,
+        environment,
+        injection,
+        command.slots,
+        latency_draw=command.latency_seed,
+        arena_seed=command.arena_seed,
+    )
+    return plan, pilots
 
 
 def _environment(
@@ -110,7 +131,11 @@ def _environment(
                 "hover_after_s": hover_s,
                 "altitude_m": pilot.altitude_m,
             },
-            "delay": {"computer": command.computer, "workload": command.workload},
+            "delay": {
+                "computer": command.computer,
+                "workload": command.workload,
+                "latency": () if command.latency is None else (command.latency,),
+            },
         },
     )
 

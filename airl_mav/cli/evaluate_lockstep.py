@@ -29,6 +29,8 @@ OF_THE_PLAN = (
     "transport_us",
     "goal_radius_m",
     "time_limit_s",
+    "latency_draw",
+    "arena_seed",
 )
 """What is written down, beside the values of the profiles: all that decides a flight."""
 
@@ -86,6 +88,7 @@ def plan_lockstep(
             vehicle=plan.vehicle,
             arena=plan.arena,
             computer=computer,
+            **({} if setup.injection.latency is None else {"latency": setup.injection.latency}),
         ),
         **{key: getattr(rehearsal, key) for key in OF_THE_COMMAND},
         **{key: value for key, value in asdict(plan).items() if key in OF_THE_PLAN},

@@ -32,6 +32,9 @@ def settings(
         "ablate": command.ablate,
         "episodes": command.episodes,
         "seed": command.seed,
+        "latency": command.latency,
+        "latency_seed": command.latency_seed,
+        "arena_seed": command.arena_seed,
         "profiles_sha256": {kind: _fingerprint(profile) for kind, profile in profiles.items()},
     }
 

@@ -30,7 +30,18 @@ from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
 from companion.watchdog import WatchdogSettings
 
-SAME_IN_SITL = ("policy", "arena", "vehicle", "computer", "workload", "episodes", "seed")
+SAME_IN_SITL = (
+    "policy",
+    "arena",
+    "vehicle",
+    "computer",
+    "workload",
+    "latency",
+    "latency_seed",
+    "arena_seed",
+    "episodes",
+    "seed",
+)
 """Settings by which a finished run of level sitl is known again."""
 
 FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]
@@ -144,6 +155,9 @@ def sitl_command(
         policy=path,
         computer=command.computer,
         workload=command.workload,
+        latency=command.latency,
+        latency_seed=command.latency_seed,
+        arena_seed=command.arena_seed,
         episodes=command.episodes,
         seed=command.seed,
         lockstep=command.level == "lockstep",

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_range
+from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_draws, check_range
 from airl_mav.cli.evaluate import DEFAULT_ARENA
 from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.clock import utc_now
@@ -17,7 +17,7 @@ from airl_mav.harness.workers import GREATEST_WORKERS
 from airl_mav.policy.registry import find_policy
 from airl_mav.report.matrix import MATRIX_FILE
 
-FACTS = ("vehicle", "computer", "workload", "seed")
+FACTS = ("vehicle", "computer", "workload", "latency", "seed")
 """Options that head a ladder, beside policy and arena."""
 
 
@@ -75,6 +75,7 @@ def _check(command: LadderCommand) -> str:
         raise UsageError(f"--levels {told}: accepted: two or more of gym lockstep sitl, each once")
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_draws(command.latency_seed, command.arena_seed)
     if command.workers is not None:
         check_range("--workers", command.workers, 1, GREATEST_WORKERS)
     if command.sitl_episodes is not None:

@@ -38,6 +38,9 @@ class LadderCommand:
     seed: int = 1
     """Seed; episode i uses seed + i, at every level."""
 
+    arena_seed: int | None = None
+    """Every episode in the arena, and with the goal, of this one seed. None: of its own."""
+
     levels: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
     """Levels that fly, two or more; the first is the reference of the others."""
 
@@ -62,6 +65,14 @@ class LadderCommand:
     """Workload of the computer profile whose latency t2 is injected; estimate: scaled to the
     policy. None: what was measured for this very policy, or else 1 ms (gym, lockstep), or what
     this machine takes (sitl)."""
+
+    latency: str | None = None
+    """Latency t2 to inject, in place of --workload: 150ms, lognormal:396ms,20ms (mean, standard
+    deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured latencies, one a line in
+    ms, which are replayed in their order. None: as --computer and --workload say."""
+
+    latency_seed: int = 0
+    """Other draws of the same latency on the same episodes; 0: those of the episodes' own seeds."""
 
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports of level sitl."""

@@ -43,6 +43,8 @@ def lockstep_plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> L
         computer_watts=setup.computer_watts,
         speed=command.speed,
         estimator=command.estimator,
+        latency_draw=command.latency_seed,
+        arena_seed=command.arena_seed,
     )
 
 

@@ -10,6 +10,7 @@ import tyro
 from airl_mav.arena.generate import generate
 from airl_mav.cli.common import (
     GREATEST_SEED,
+    check_draws,
     check_ports,
     check_range,
     check_wind,
@@ -25,7 +26,8 @@ from airl_mav.envs.spec import Delay
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
-from airl_mav.latency.injection import choose_injection, without_timing
+from airl_mav.latency.injection import without_timing
+from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
@@ -78,11 +80,22 @@ class SitlCommand:
     """Workload of the computer profile whose latency t2 is injected; estimate: scaled to this
     policy. None: what was measured for this very policy, or else what this machine takes."""
 
+    latency: str | None = None
+    """Latency t2 to inject, in place of --workload: 150ms, lognormal:396ms,20ms (mean, standard
+    deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured latencies, one a line in
+    ms, which are replayed in their order. None: as --computer and --workload say."""
+
+    latency_seed: int = 0
+    """Other draws of the same latency on the same episodes; 0: those of the episodes' own seeds."""
+
     episodes: int = 3
     """Number of episodes, >= 1."""
 
     seed: int = 1
     """Seed; episode i uses seed + i for arena, sensors, wind and latency."""
+
+    arena_seed: int | None = None
+    """Every episode in the arena, and with the goal, of this one seed. None: of its own."""
 
     lockstep: bool = False
     """Everything in one process on one simulated clock, MAVSDK included: the same flight every
@@ -133,6 +146,7 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     """
     check_range("--episodes", command.episodes, 1, 100_000)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
+    check_draws(command.latency_seed, command.arena_seed)
     if command.speed is not None:
         slowest, fastest = LOCKSTEP_SPEEDS if command.lockstep else (SLOWEST, FASTEST)
         check_range("--speed", command.speed, slowest, fastest)
@@ -153,10 +167,15 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     # The companion loads it again: what cannot be run is better found here.
     load_policy(command.policy, pilot.hold_s, runtime=command.runtime, threads=command.threads)
     arena = load_profile("arenas", command.arena, ArenaSpec)
-    generate(arena, command.seed, name=command.arena, vehicle_width_m=vehicle.body.width_m)
+    first = command.seed if command.arena_seed is None else command.arena_seed
+    generate(arena, first, name=command.arena, vehicle_width_m=vehicle.body.width_m)
     computer = load_computer(command.computer)
-    injection = choose_injection(
-        computer, command.workload, policy_sha256=policy.sha256, macs=policy.macs
+    injection = select_injection(
+        command.latency,
+        command.computer,
+        command.workload,
+        policy_sha256=policy.sha256,
+        macs=policy.macs,
     )
     hover_s = hover_after_s(command.watchdog, policy)
     if command.lockstep:

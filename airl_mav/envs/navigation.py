@@ -20,8 +20,9 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.constants import TICK_US, US_PER_S
+from airl_mav.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.envs.arenas import batch_of, put_arena
+from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws, Stream, stream
 from airl_mav.envs.exposure import Cameras
 from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
@@ -32,7 +33,7 @@ from airl_mav.envs.state import State, join, part_of, restore, take
 from airl_mav.envs.telemetry import Telemetry
 from airl_mav.envs.trace import Trace
 from airl_mav.errors import UsageError
-from airl_mav.latency.injection import Injection, choose_injection
+from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import (
     Encoded,
@@ -42,12 +43,9 @@ from airl_mav.policy.layouts import (
 )
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import Camera, VehicleProfile, load_vehicle
-
-US_PER_MS = 1000
 
 
 @dataclass(frozen=True)
@@ -79,6 +77,8 @@ class Navigation:
         n: int,
         *,
         injection: Injection | None = None,
+        latency_draw: int = 0,
+        arena_seed: int | None = None,
         trace: Trace | None = None,
     ) -> None:
         """Load what the environment is made of.
@@ -87,6 +87,8 @@ class Navigation:
             spec: The environment.
             n: Number of vehicles.
             injection: Where t2 comes from; None: what `spec.delay` says.
+            latency_draw: 0, or another number for other draws of the same latency.
+            arena_seed: Of the arena and goal of all episodes; None: each one's own seed.
             trace: Records the flights; None records nothing, and changes nothing.
 
         Raises:
@@ -109,9 +111,8 @@ class Navigation:
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
-        if injection is None:
-            injection = choose_injection(load_computer(spec.delay.computer), spec.delay.workload)
-        self.injection = injection
+        self.injections = injections_of(spec.delay) if injection is None else (injection,)
+        self._arena_seed = arena_seed
         self._trace = trace
         parameters = parameter_values(self.vehicle.parameters)
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__)
@@ -131,7 +132,9 @@ class Navigation:
         self._batch = batch_of([])
         self._decision = np.zeros(n, np.int64)
         self._extra_us = np.zeros(n, np.int64)
-        self._delays = DelayDraws(n, self.injection, round(spec.delay.native_ms * US_PER_MS))
+        self._delays = DelayDraws(
+            n, self.injections, round(spec.delay.native_ms * US_PER_MS), draw=latency_draw
+        )
         randomisation = spec.randomisation
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table)
@@ -290,7 +293,7 @@ class Navigation:
     def _arena(self, seed: int, zone: int | None) -> Arena:
         return generate(
             self.arena_spec,
-            seed,
+            seed if self._arena_seed is None else self._arena_seed,
             name=Path(self.spec.arena).stem,
             vehicle_width_m=self.vehicle.body.width_m,
             zone=zone,

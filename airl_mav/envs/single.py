@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.constants import US_PER_S
+from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.picture import Picture, View, Window
@@ -63,7 +64,7 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise UsageError(f"render_mode = {render_mode!r}: accepted: None, {', '.join(modes)}")
-        self.environment = spec_of(spec, knobs)
+        self.environment = bounded(spec_of(spec, knobs))
         self.navigation = Navigation(self.environment, 1)
         self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
         self.action_space = action_space(self.environment.action_spec)

@@ -64,10 +64,15 @@ class Delay(ProfileModel):
 
     computer: str = Field(default="workstation", description="computer profile to fly as")
     workload: str | None = Field(
-        default=None, description="workload whose t2 is drawn; left out: native_ms"
+        default=None, description="workload whose t2 is drawn; left out: latency, or native_ms"
+    )
+    latency: tuple[str, ...] = Field(
+        default=(),
+        description="sources of t2 as --latency takes them, in place of computer and workload; of "
+        "several, each episode draws one",
     )
     native_ms: float = quantity(
-        "t2 when no workload is chosen: inference on a desktop computer",
+        "t2 when neither is chosen: inference on a desktop computer",
         "ms",
         ge=0,
         le=60_000,
@@ -82,6 +87,33 @@ class Delay(ProfileModel):
         ge=0,
         le=1000,
         default=4.0,
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Delay:
+        if self.latency and self.workload is not None:
+            raise ValueError(f"latency: with workload = {self.workload!r}: accepted: one of them")
+        return self
+
+
+class SafeVelocity(ProfileModel):
+    """Actions no faster than the vehicle can stop for what it sees, deciding as late as it does.
+
+    `latency.safe_velocity` has the formula.
+    """
+
+    sensing_distance_m: float = quantity(
+        "how far ahead the policy takes notice of an obstacle; the paper gives none",
+        "m",
+        gt=0,
+        le=1000,
+    )
+    max_acceleration_m_s2: float | None = quantity(
+        "greatest deceleration; left out: what tilt limit and thrust of the vehicle permit",
+        "m/s²",
+        gt=0,
+        le=1000,
+        default=None,
     )
 
 
@@ -137,6 +169,9 @@ class EnvironmentSpec(ProfileModel):
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
     delay: Delay = Field(default_factory=Delay, description="how late decisions are")
+    safe_velocity: SafeVelocity | None = Field(
+        default=None, description="bound max_speed_m_s by the safe velocity; left out: do not"
+    )
     randomisation: Randomisation = Field(
         default_factory=Randomisation, description="what is drawn with every episode"
     )

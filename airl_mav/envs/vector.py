@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from airl_mav.envs.curriculum import CurriculumState
+from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import Happened, rewards
@@ -74,7 +75,7 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
                 f"render_mode = {render_mode!r}: n at a time draw no picture; accepted: None, or "
                 "make a single environment"
             )
-        self.environment = spec_of(spec, knobs)
+        self.environment = bounded(spec_of(spec, knobs))
         self.navigation = Navigation(self.environment, num_envs)
         self.num_envs = num_envs
         self.single_observation_space = observation_space(self.navigation.observation)

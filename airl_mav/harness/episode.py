@@ -43,6 +43,12 @@ class Plan:
     time_limit_s: float
     speed: float
     computer_watts: float
+    arena_seed: int | None = None
+    """Of the arena of all episodes; None: each one's own seed."""
+
+    def arena_seed_of(self, seed: int) -> int:
+        """Return the seed of the arena of an episode."""
+        return seed if self.arena_seed is None else self.arena_seed
 
 
 @dataclass
@@ -107,6 +113,7 @@ def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeReco
         index=episode.index,
         seed=episode.seed,
         arena=plan.arena,
+        arena_seed=plan.arena_seed_of(episode.seed),
         goal=loaded.goal,
         started_us=loaded.time_us,
         computer_watts=plan.computer_watts,
@@ -124,6 +131,7 @@ def judged_record(
     index: int,
     seed: int,
     arena: str,
+    arena_seed: int,
     goal: tuple[float, float],
     started_us: int,
     computer_watts: float,
@@ -143,7 +151,7 @@ def judged_record(
         index=index,
         seed=seed,
         arena=arena,
-        arena_seed=seed,
+        arena_seed=arena_seed,
         outcome=verdict.outcome,
         reason=verdict.reason,
         goal=goal,

@@ -31,6 +31,10 @@ class GymPlan:
     """Where t2 is drawn from."""
     slots: int
     """Flights at a time; decides nothing."""
+    latency_draw: int = 0
+    """See `samplers.latency_generator`."""
+    arena_seed: int | None = None
+    """Of the arena of all episodes; None: each one's own seed."""
 
 
 def fly_gym(
@@ -53,7 +57,14 @@ def fly_gym(
         return
     slots = min(plan.slots, len(index_of))
     trace = Trace(slots)
-    navigation = Navigation(plan.environment, slots, injection=plan.injection, trace=trace)
+    navigation = Navigation(
+        plan.environment,
+        slots,
+        injection=plan.injection,
+        latency_draw=plan.latency_draw,
+        arena_seed=plan.arena_seed,
+        trace=trace,
+    )
     with Saver(folder) as saver:
         for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=watch.stop):
             episode = _episode(plan, navigation, trace, slot, flown, index_of[flown.seed])
@@ -74,7 +85,7 @@ def _episode(
         index=index,
         seed=flown.seed,
         arena=plan.environment.arena,
-        arena_seed=flown.seed,
+        arena_seed=flown.seed if plan.arena_seed is None else plan.arena_seed,
         outcome=outcome,
         reason=_reason(outcome, flights, slot, arena, rules.time_limit_s),
         goal=(float(arena.goal[0]), float(arena.goal[1])),

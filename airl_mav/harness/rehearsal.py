@@ -150,7 +150,7 @@ class Rehearsal:
             LoadEpisode(
                 episode=index,
                 arena=plan.arena,
-                arena_seed=seed,
+                arena_seed=plan.arena_seed_of(seed),
                 seed=seed,
                 tlog=str(folder.tlog_path(index).absolute()),
                 record=str(record_path.absolute()),

@@ -87,7 +87,7 @@ def choose_injection(
         known = ", ".join([*computer.workloads, ESTIMATE])
         raise UsageError(f"workload = {workload!r}: accepted for this computer: {known}")
     work = computer.workloads[workload]
-    label = f"as if {computer.description} ran {workload} ({_moments(work.latency)})"
+    label = f"as if {computer.description} ran {workload} ({moments(work.latency)})"
     return Injection("injected", label, work.source, work.assumed, work.latency)
 
 
@@ -102,7 +102,7 @@ def _estimate(computer: ComputerProfile, macs: int | None) -> Injection:
     )
     factor = macs / work.network.macs
     latency = _scaled(work, factor)
-    label = f"estimated from {name} on {computer.description} ({_moments(latency)})"
+    label = f"estimated from {name} on {computer.description} ({moments(latency)})"
     assumed = f"latency proportional to multiply-accumulates, x {factor:.3g}"
     if work.assumed:
         assumed = f"{assumed}; {work.assumed}"
@@ -124,8 +124,8 @@ def _scaled(work: Workload, factor: float) -> Latency:
     )
 
 
-def _moments(latency: Latency) -> str:
-    """Return mean and spread as text."""
+def moments(latency: Latency) -> str:
+    """Return mean and spread of a latency as text."""
     if latency.samples_ms is not None:
         samples = np.array(latency.samples_ms)
         return f"{len(samples)} samples, {samples.mean():.3g} ± {samples.std():.2g} ms"

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from airl_mav.constants import US_PER_MS
 from airl_mav.profiles.computer import Latency
 
+LATENCY_STREAM = 2
+"""Second word of the seed of other latencies than an episode's own."""
+
 
 class LatencySampler(Protocol):
     """A source of latencies."""
@@ -71,19 +74,37 @@ class TruncatedNormalSampler:
         return round(latency_us)
 
 
-class EmpiricalSampler:
-    """Measured latencies, drawn independently with replacement."""
+class ReplaySampler:
+    """Measured latencies in the order they were measured, round and round, from a random place.
+
+    The order keeps what a histogram loses: slow decisions come in runs (another process, a hot
+    processor). Every sample is equally likely at every decision, and neighbours stay neighbours:
+    the circular block bootstrap (Politis & Romano 1992) with one block a flight.
+    """
 
     def __init__(self, samples_us: ArrayLike, rng: np.random.Generator) -> None:
-        """Take the measured latencies (n,) [µs], n >= 1."""
+        """Take the measured latencies (n,) [µs], n >= 1, in their order."""
         self._samples_us: NDArray[np.int64] = np.asarray(samples_us, np.int64)
         if not self._samples_us.size:
             raise ValueError("no samples to draw from")
-        self._rng = rng
+        self._next = int(rng.integers(self._samples_us.size))
 
     def sample_us(self) -> int:
         """Return the next latency [µs]."""
-        return int(self._samples_us[self._rng.integers(len(self._samples_us))])
+        latency_us = int(self._samples_us[self._next])
+        self._next = (self._next + 1) % self._samples_us.size
+        return latency_us
+
+
+def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:
+    """Return the generator that an episode's latencies come from, the same at every level.
+
+    Args:
+        seed: Of the episode.
+        draw: 0, or another number for other latencies of the same distribution in an episode that
+            is otherwise the same.
+    """
+    return np.random.default_rng((seed, LATENCY_STREAM, draw) if draw else seed)
 
 
 def build_sampler(latency: Latency, rng: np.random.Generator) -> LatencySampler:
@@ -99,7 +120,7 @@ def build_sampler(latency: Latency, rng: np.random.Generator) -> LatencySampler:
     if latency.distribution == "samples":
         if latency.samples_ms is None:
             raise ValueError(f"samples_file {latency.samples_file} not read: use load_computer")
-        return EmpiricalSampler(np.rint(np.array(latency.samples_ms) * US_PER_MS), rng)
+        return ReplaySampler(np.rint(np.array(latency.samples_ms) * US_PER_MS), rng)
     mean_us = (latency.mean_ms or 0.0) * US_PER_MS
     std_us = (latency.std_ms or 0.0) * US_PER_MS
     if not std_us:

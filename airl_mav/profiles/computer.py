@@ -50,7 +50,8 @@ class Latency(ProfileModel):
 
     `fixed`: always `mean_ms`. `lognormal`: `min_ms` plus a log-normal, with `mean_ms` and `std_ms`
     those of the sum. `normal-truncated`: a normal of `mean_ms` and `std_ms`, cut off below
-    `min_ms` (so its own mean lies a little higher). `samples`: measured values, drawn again.
+    `min_ms` (so its own mean lies a little higher). `samples`: measured values, replayed in their
+    order.
     """
 
     distribution: Distribution
@@ -135,12 +136,25 @@ def _with_samples(latency: Latency, folder: Path) -> Latency:
     """Replace `samples_file`, relative to `folder`, by the values that it holds."""
     if latency.samples_file is None:
         return latency
-    path = folder / latency.samples_file
+    samples = read_samples(folder / latency.samples_file, "samples_file")
+    return latency.model_copy(update={"samples_ms": samples, "samples_file": None})
+
+
+def read_samples(path: Path, option: str) -> tuple[float, ...]:
+    """Read a text file of measured latencies in their order: one a line in ms, # for remarks.
+
+    Args:
+        path: The file.
+        option: The option or field that names it, for messages.
+
+    Raises:
+        UsageError: It cannot be read, is empty, or holds anything but latencies in (0, 60000] ms.
+    """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         values = np.array([float(text) for line in lines if (text := line.split("#")[0].strip())])
     except OSError as error:
-        raise UsageError(f"{path}: samples_file: {error.strerror}") from None
+        raise UsageError(f"{path}: {option}: {error.strerror}") from None
     except ValueError as error:
         raise UsageError(f"{path}: {error}; accepted: one latency a line, ms") from None
     if not values.size:
@@ -149,5 +163,4 @@ def _with_samples(latency: Latency, folder: Path) -> Latency:
     outside = values[~((values > 0) & (values <= LONGEST_MS))]
     if outside.size:
         raise UsageError(f"{path}: {outside[0]:g}: accepted: 0 < value <= {LONGEST_MS:g} ms")
-    samples = tuple(float(value) for value in values)
-    return latency.model_copy(update={"samples_ms": samples, "samples_file": None})
+    return tuple(float(value) for value in values)

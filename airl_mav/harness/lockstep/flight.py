@@ -19,7 +19,7 @@ from airl_mav.harness.lockstep.judging import Judge
 from airl_mav.harness.lockstep.stage import Stage
 from airl_mav.harness.run_folder import FlownEpisode
 from airl_mav.latency.injection import Injection
-from airl_mav.latency.samplers import FixedSampler
+from airl_mav.latency.samplers import FixedSampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -55,6 +55,10 @@ class LockstepPlan:
     """Greatest number of simulated seconds per wall second; None: as fast as it goes."""
     estimator: FilterName = "kernel"
     """What carries the estimator's covariance."""
+    latency_draw: int = 0
+    """See `samplers.latency_generator`."""
+    arena_seed: int | None = None
+    """Of the arena of all episodes; None: each one's own seed."""
 
 
 @dataclass
@@ -103,8 +107,12 @@ class _Flight:
     def __init__(self, plan: LockstepPlan, policy: Policy, seed: int, watching: Watching) -> None:
         self._plan, self._policy, self._seed = plan, policy, seed
         self._watching = watching
+        self._arena_seed = seed if plan.arena_seed is None else plan.arena_seed
         self._arena = generate(
-            plan.arena, seed, name=plan.arena_name, vehicle_width_m=plan.vehicle.body.width_m
+            plan.arena,
+            self._arena_seed,
+            name=plan.arena_name,
+            vehicle_width_m=plan.vehicle.body.width_m,
         )
         self._goal = (float(self._arena.goal[0]), float(self._arena.goal[1]))
         self._digest = FlightDigest()
@@ -135,7 +143,7 @@ class _Flight:
     def _program(self) -> None:
         plan, stage = self._plan, self._stage
         check_camera(self._policy, stage.camera, self._stop)
-        latency = plan.injection.sampler(np.random.default_rng(self._seed))
+        latency = plan.injection.sampler(latency_generator(self._seed, plan.latency_draw))
         self._result = fly_mission(
             stage.link,
             stage.camera,
@@ -198,6 +206,7 @@ class _Flight:
             index=index,
             seed=self._seed,
             arena=self._plan.arena_name,
+            arena_seed=self._arena_seed,
             goal=self._goal,
             started_us=self._follower.started_us,
             computer_watts=self._plan.computer_watts,

@@ -1,0 +1,98 @@
+"""How late the decisions of an environment are, and how fast it may fly because of that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from airl_mav.constants import MS_PER_S
+from airl_mav.envs.spec import Delay, EnvironmentSpec
+from airl_mav.latency.injection import Injection, choose_injection
+from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity
+from airl_mav.latency.source import longest_ms, parse_latency
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.vehicle.rotor import N_ROTORS
+
+
+@dataclass(frozen=True)
+class SpeedBound:
+    """The safe velocity of an environment, and what went into it."""
+
+    latency_s: float
+    """T: frame exposed -> motors reflect it, at the longest t2 [s]."""
+    sensing_distance_m: float
+    max_acceleration_m_s2: float
+    safe_velocity_m_s: float
+    asked_m_s: float
+    """Fastest action without the bound [m/s]."""
+
+    @property
+    def max_speed_m_s(self) -> float:
+        """Fastest action."""
+        return min(self.asked_m_s, self.safe_velocity_m_s)
+
+    def in_words(self) -> str:
+        """Return one line for people, also where the bound changes nothing."""
+        facts = (
+            f"safe velocity {self.safe_velocity_m_s:.2f} m/s (latency {self.latency_s:.3f} s, "
+            f"sensing distance {self.sensing_distance_m:g} m, "
+            f"deceleration {self.max_acceleration_m_s2:.2f} m/s²)"
+        )
+        if self.safe_velocity_m_s < self.asked_m_s:
+            share = self.max_speed_m_s / self.asked_m_s
+            return f"{facts}: actions scaled by {share:.3f}, from {self.asked_m_s:g} m/s"
+        return f"{facts}: above the fastest action, {self.asked_m_s:g} m/s: nothing is scaled"
+
+
+def injections_of(delay: Delay) -> tuple[Injection, ...]:
+    """Return where t2 comes from, one source or more. Raises UsageError for a wrong one."""
+    if delay.latency:
+        option = "environment.delay.latency"
+        return tuple(parse_latency(source, option) for source in delay.latency)
+    return (choose_injection(load_computer(delay.computer), delay.workload),)
+
+
+def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
+    """Return the safe velocity that an environment asks for; None: it asks for none.
+
+    The latency is the longest of all its sources, with transport and link.
+
+    Raises:
+        UsageError: A profile or a source of latency cannot be used.
+    """
+    asked, delay = spec.safe_velocity, spec.delay
+    if asked is None:
+        return None
+    t2_ms = max(
+        delay.native_ms if source.latency is None else longest_ms(source.latency)
+        for source in injections_of(delay)
+    )
+    low_high = spec.randomisation.extra_delay_ms
+    latency_s = (delay.transport_ms + t2_ms + low_high[1] + delay.link_ms) / MS_PER_S
+    acceleration = asked.max_acceleration_m_s2
+    if acceleration is None:
+        vehicle = load_vehicle(spec.vehicle)
+        acceleration = max_acceleration(
+            N_ROTORS * vehicle.rotor.thrust_max_n,
+            vehicle.body.mass_kg,
+            parameter_values(vehicle.parameters)["MPC_TILTMAX_AIR"],
+        )
+    return SpeedBound(
+        latency_s=latency_s,
+        sensing_distance_m=asked.sensing_distance_m,
+        max_acceleration_m_s2=acceleration,
+        safe_velocity_m_s=safe_velocity(latency_s, asked.sensing_distance_m, acceleration),
+        asked_m_s=spec.max_speed_m_s,
+    )
+
+
+def bounded(spec: EnvironmentSpec) -> EnvironmentSpec:
+    """Return an environment with its fastest action bounded by its safe velocity, if it asks.
+
+    Bounding again changes nothing. Raises UsageError as `speed_bound`.
+    """
+    bound = speed_bound(spec)
+    if bound is None or bound.max_speed_m_s == spec.max_speed_m_s:
+        return spec
+    return spec.model_copy(update={"max_speed_m_s": bound.max_speed_m_s})

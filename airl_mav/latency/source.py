@@ -1,0 +1,132 @@
+"""Latency sources in words: what `--latency` takes.
+
+`150ms` (fixed), `lognormal:396ms,20ms` and `normal:396ms,20ms` (mean, standard deviation; a third
+number is the least), `COMPUTER/WORKLOAD` (an entry of a computer profile), or a path to a text file
+of measured latencies, one a line in ms, which are replayed in their order.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from airl_mav.errors import UsageError
+from airl_mav.latency.injection import Injection, choose_injection, moments
+from airl_mav.profiles.computer import LONGEST_MS, Latency, load_computer, read_samples
+from airl_mav.profiles.loading import explain, list_profiles
+
+ACCEPTED = (
+    "150ms, lognormal:396ms,20ms, normal:396ms,20ms, COMPUTER/WORKLOAD, "
+    "or a file of latencies, one a line in ms"
+)
+
+Z_999 = 3.0902323061678132
+"""99.9 % quantile of the standard normal distribution."""
+
+_DISTRIBUTIONS = {"lognormal": "lognormal", "normal": "normal-truncated"}
+_TIME = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(us|µs|ms|s)")
+_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3}
+
+
+def select_injection(
+    source: str | None,
+    computer: str,
+    workload: str | None,
+    *,
+    policy_sha256: str | None = None,
+    macs: int | None = None,
+    option: str = "--latency",
+) -> Injection:
+    """Choose the latency that a policy flies with: a source in words, or as a computer.
+
+    Args:
+        source: See above; None: as `choose_injection` has it.
+        computer: Computer profile to fly as: a name, or a path.
+        workload: See `choose_injection`.
+        policy_sha256: See `choose_injection`.
+        macs: See `choose_injection`.
+        option: What the source is called in messages.
+
+    Raises:
+        UsageError: There is no such source, computer or workload, or both are given.
+    """
+    if source is None:
+        return choose_injection(
+            load_computer(computer), workload, policy_sha256=policy_sha256, macs=macs
+        )
+    if workload is not None:
+        raise UsageError(f"{option} {source} with --workload {workload}: accepted: one of them")
+    return parse_latency(source, option)
+
+
+def parse_latency(text: str, option: str = "--latency") -> Injection:
+    """Return the latency that a source in words stands for.
+
+    Args:
+        text: See above.
+        option: What it is called in messages.
+
+    Raises:
+        UsageError: Names the option, what was given and what is accepted.
+    """
+    path = Path(text)
+    if path.is_file():
+        latency = Latency(distribution="samples", samples_ms=read_samples(path, option))
+        label = f"replayed from {path.name} ({moments(latency)})"
+        return Injection("injected", label, f"{path}", latency=latency)
+    kind, colon, values = text.partition(":")
+    if colon and kind in _DISTRIBUTIONS:
+        return _parametric(kind, values, text, option)
+    if (fixed_ms := _milliseconds(text)) is not None:
+        latency = _latency({"distribution": "fixed", "mean_ms": fixed_ms}, text, option)
+        return Injection("injected", f"{fixed_ms:g} ms in every decision", latency=latency)
+    computer, slash, workload = text.rpartition("/")
+    if slash and (computer in list_profiles("computers") or computer.endswith(".toml")):
+        return choose_injection(load_computer(computer), workload)
+    raise UsageError(f"{option} {text}: accepted: {ACCEPTED}")
+
+
+def longest_ms(latency: Latency) -> float:
+    """Return the longest latency that is reckoned with [ms].
+
+    Of samples the greatest; a distribution without an end is cut at its 99.9 % quantile.
+    """
+    if latency.samples_ms is not None:
+        return max(latency.samples_ms)
+    mean_ms, std_ms = latency.mean_ms or 0.0, latency.std_ms or 0.0
+    if latency.distribution == "lognormal" and std_ms:
+        over_ms = mean_ms - latency.min_ms
+        variance = math.log1p((std_ms / over_ms) ** 2)
+        scale = math.log(over_ms) - 0.5 * variance
+        return latency.min_ms + math.exp(scale + Z_999 * math.sqrt(variance))
+    return mean_ms + Z_999 * std_ms
+
+
+def _parametric(kind: str, values: str, text: str, option: str) -> Injection:
+    """Return a distribution given by its moments."""
+    numbers = [_milliseconds(value) for value in values.split(",")]
+    given = [number for number in numbers if number is not None]
+    if len(given) != len(numbers) or not 2 <= len(given) <= 3:
+        raise UsageError(f"{option} {text}: accepted: {kind}:MEAN,SD[,LEAST], each with its unit")
+    fields = dict(zip(("mean_ms", "std_ms", "min_ms"), given, strict=False))
+    latency = _latency({"distribution": _DISTRIBUTIONS[kind], **fields}, text, option)
+    return Injection("injected", f"{kind}, {moments(latency)}", latency=latency)
+
+
+def _latency(fields: dict[str, object], text: str, option: str) -> Latency:
+    try:
+        return Latency.model_validate(fields)
+    except ValidationError as error:
+        raise UsageError(f"{option} {text}: {explain(error, Latency)}") from None
+
+
+def _milliseconds(text: str) -> float | None:
+    """Return a time with its unit in ms, None when it is none."""
+    found = _TIME.fullmatch(text.strip())
+    if found is None:
+        return None
+    value_ms = float(found[1]) * _MS[found[2]]
+    return value_ms if value_ms <= LONGEST_MS else math.inf
