@@ -21,7 +21,7 @@ from airl_mav.envs.draws import BLOCK, DelayDraws
 from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.errors import UsageError
 from airl_mav.latency.injection import choose_injection
 from airl_mav.latency.source import parse_latency
@@ -299,7 +299,7 @@ def test_another_draw_is_another_sequence_of_the_same_distribution() -> None:
 
 
 def test_one_arena_for_all_episodes() -> None:
-    navigation = Navigation(spec_with(arena="static-obstacles"), 2, arena_seed=77)
+    navigation = Navigation(spec_of(None, {"arena": "static-obstacles"}), 2, arena_seed=77)
     navigation.begin([0, 1], [1, 2])
     first, second = navigation.arenas
     assert first is not None and second is not None
