@@ -11,6 +11,7 @@ from airl_mav.cli import arena, evaluate, export, ladder, report, train
 from airl_mav.cli.common import run_command
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.ladder_command import LadderCommand
+from airl_mav.cli.train_command import TrainCommand
 
 Command = (
     Annotated[arena.ArenaCommand, tyro.conf.subcommand("arena", prefix_name=False)]
@@ -18,7 +19,7 @@ Command = (
     | Annotated[export.ExportCommand, tyro.conf.subcommand("export", prefix_name=False)]
     | Annotated[LadderCommand, tyro.conf.subcommand("ladder", prefix_name=False)]
     | Annotated[report.ReportCommand, tyro.conf.subcommand("report", prefix_name=False)]
-    | Annotated[train.TrainCommand, tyro.conf.subcommand("train", prefix_name=False)]
+    | Annotated[TrainCommand, tyro.conf.subcommand("train", prefix_name=False)]
 )
 
 _RUN: dict[type[Any], Callable[[Any], int]] = {
@@ -27,7 +28,7 @@ _RUN: dict[type[Any], Callable[[Any], int]] = {
     export.ExportCommand: export.run,
     LadderCommand: ladder.run,
     report.ReportCommand: report.run,
-    train.TrainCommand: train.run,
+    TrainCommand: train.run,
 }
 
 

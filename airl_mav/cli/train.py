@@ -5,12 +5,9 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
-import tyro
-from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -20,57 +17,12 @@ from airl_mav.cli.common import (
     check_range,
     check_train_installed,
 )
+from airl_mav.cli.train_command import TrainCommand
+from airl_mav.cli.train_environment import environment_of
 from airl_mav.envs.delay import bounded, injections_of, speed_bound
-from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.errors import UsageError
-from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import explain, load_profile
+from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.store import Evaluation, TrainingFolder
-
-
-@dataclass(frozen=True)
-class TrainCommand:
-    """Train a policy; the best weights are exported as policy.onnx with their card."""
-
-    config: tyro.conf.Positional[str] = "static-obstacles"
-    """Training configuration: a shipped name, or a path to a .toml."""
-
-    out: Path | None = None
-    """Folder of the run. None: runs/train-<config>."""
-
-    seed: int | None = None
-    """Seed of weights, exploration and episodes. None: the configuration's."""
-
-    computer: str | None = None
-    """Decide as late as this computer in training: a shipped profile, or a path to a .toml; takes
-    --workload. None: the configuration's."""
-
-    workload: str | None = None
-    """Workload of that computer whose latency t2 is drawn in every decision; estimate is not
-    accepted: the network is not there yet. None: the configuration's."""
-
-    latency: tuple[str, ...] = ()
-    """Sources of t2 in place of computer and workload, as airl evaluate takes them: 150ms,
-    lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE. Of several, each episode draws one: latency
-    randomisation over several computers. None given: the configuration's."""
-
-    sensing_distance: float | None = None
-    """Scale the actions to the safe velocity: the vehicle, deciding as late as its longest latency,
-    stops within so many metres. None: the configuration's, or no scaling."""
-
-    max_acceleration: float | None = None
-    """Greatest deceleration for the safe velocity, m/s²; takes --sensing-distance. None: what the
-    vehicle's tilt limit and thrust permit."""
-
-    steps: int | None = None
-    """Decisions of all vehicles together. None: the configuration's."""
-
-    name: str | None = None
-    """Name of the policy on its card. None: the configuration's."""
-
-    resume: bool = False
-    """Go on with the run in --out from its newest checkpoint; begin it when there is none."""
 
 
 def run(command: TrainCommand, console: Console | None = None) -> int:
@@ -134,7 +86,7 @@ def run(command: TrainCommand, console: Console | None = None) -> int:
 def _config(command: TrainCommand) -> TrainingConfig:
     """Load the configuration and put the command line's values into it."""
     config = load_profile("training", command.config, TrainingConfig)
-    config = config.model_copy(update={"environment": _environment(command, config)})
+    config = config.model_copy(update={"environment": environment_of(command, config.environment)})
     changes: dict[str, int] = {}
     if command.seed is not None:
         check_range("--seed", command.seed, 0, GREATEST_SEED)
@@ -143,41 +95,6 @@ def _config(command: TrainCommand) -> TrainingConfig:
         check_range("--steps", command.steps, 1, 10**10)
         changes["steps"] = command.steps
     return config.model_copy(update=changes)
-
-
-def _environment(command: TrainCommand, config: TrainingConfig) -> EnvironmentSpec:
-    """Return the environment with the command line's latency and bound on the speed."""
-    delay: dict[str, Any] = {}
-    if command.computer is not None:
-        if command.workload is None:
-            known = ", ".join(load_computer(command.computer).workloads)
-            raise UsageError(f"--computer {command.computer}: takes --workload: {known}")
-        delay = {"computer": command.computer, "workload": command.workload}
-    elif command.workload is not None:
-        raise UsageError(f"--workload {command.workload}: accepted: with --computer")
-    if command.latency:
-        if delay:
-            raise UsageError("--latency with --computer: accepted: one of them")
-        delay = {"latency": command.latency}
-    safe: dict[str, Any] = {}
-    if command.sensing_distance is not None:
-        safe["sensing_distance_m"] = command.sensing_distance
-        if command.max_acceleration is not None:
-            safe["max_acceleration_m_s2"] = command.max_acceleration
-    elif command.max_acceleration is not None:
-        raise UsageError("--max-acceleration: accepted: with --sensing-distance")
-    values = config.environment.model_dump(exclude_unset=True)
-    if delay:
-        others = values.get("delay", {})
-        for key in ("computer", "workload", "latency"):
-            others.pop(key, None)
-        values["delay"] = others | delay
-    if safe:
-        values["safe_velocity"] = safe
-    try:
-        return EnvironmentSpec.model_validate(values)
-    except ValidationError as error:
-        raise UsageError(f"{explain(error, EnvironmentSpec)}") from None
 
 
 class TrainingProgress:
