@@ -56,6 +56,10 @@ class Result(ProfileModel):
 
     arena: str = Field(description="arena profile")
     level: Level = Field(description="rung of the fidelity ladder")
+    latency: str | None = Field(
+        default=None,
+        description="source of t2 as --latency takes it; none: as fast as a desktop computer",
+    )
     episodes: int = quantity("episodes flown", "1", ge=1)
     seed: Count = Field(description="seed of the first episode; each has the next")
     success_rate: float = quantity("share of episodes that reached the goal", "1", ge=0, le=1)
@@ -187,17 +191,21 @@ def write_card(folder: Path, card: PolicyCard) -> None:
 
 
 def add_result(folder: Path, result: Result) -> PolicyCard:
-    """Write a result onto a card, in place of an earlier one of the same arena and level.
+    """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
 
     Raises:
         UsageError: See `read_card`.
     """
     card = read_card(folder)
-    others = [r for r in card.results if (r.arena, r.level) != (result.arena, result.level)]
-    results = tuple(sorted([*others, result], key=lambda r: (r.level, r.arena)))
+    others = [each for each in card.results if _conditions(each) != _conditions(result)]
+    results = tuple(sorted([*others, result], key=_conditions))
     card = card.model_copy(update={"results": results})
     write_card(folder, card)
     return card
+
+
+def _conditions(result: Result) -> tuple[str, str, str]:
+    return result.level, result.arena, result.latency or ""
 
 
 def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
