@@ -168,6 +168,8 @@ class Failed(_Line):
 
     type: Literal["failed"] = "failed"
     message: str
+    usage: bool = False
+    """The input cannot be used: to start again would not help."""
 
 
 Request = Annotated[

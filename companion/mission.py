@@ -18,12 +18,18 @@ from airl_mav.policy.actions import CameraBound, Policy
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.link import STOP, LinkError, MavsdkLink
-from companion.pilot import FRAME_WAIT_S, Pilot, PilotSettings
+from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 
 ARM_TIMEOUT_S = 20.0
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
+LINK_LOST = "link lost"
+"""Why a mission ended: the flight controller was no longer heard."""
+
+CAMERA_SILENT = "camera silent"
+"""Why a mission ended: the watchdog saw that no frame came."""
+
 FRAME_TIMEOUT_S = 5.0
 """How long a camera may take to show a first frame [wall s]."""
 
@@ -33,7 +39,7 @@ class MissionResult:
     """How a mission ended."""
 
     reason: str
-    """goal reached, stopped, link lost, watchdog, or what was refused or failed."""
+    """goal reached, stopped, link lost, camera silent, watchdog, or what was refused or failed."""
     notes: tuple[str, ...]
     """What the watchdog did, what went wrong on the way down."""
     log: DecisionLog
@@ -96,7 +102,9 @@ def fly_mission(
         reason = "stopped"
     elif lost:
         # The watchdog may have been the first to notice.
-        reason = "link lost"
+        reason = LINK_LOST
+    elif reason == "watchdog" and watchdog.culprit == WAITING:
+        reason = CAMERA_SILENT
     notes = list(watchdog.notes)
     if abandon.is_set() or lost:
         # A lost link may be lost one way only: MAVSDK must not go on repeating the last setpoint

@@ -24,6 +24,9 @@ from companion.watchdog import Watchdog
 FRAME_WAIT_S = 0.1
 """How long one wait for a frame lasts before the other conditions are looked at [s]."""
 
+WAITING = "waiting for a frame"
+"""What the pilot tells the watchdog that it is at."""
+
 
 @dataclass(frozen=True)
 class PilotSettings:
@@ -89,7 +92,7 @@ class Pilot:
                 return "link lost"
             if self._watchdog.left_offboard:
                 return "watchdog"
-            self._watchdog.doing("waiting for a frame")
+            self._watchdog.doing(WAITING)
             received = self._frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
             if received is None:
                 continue

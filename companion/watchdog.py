@@ -45,6 +45,8 @@ class Watchdog:
         """What it had to do, in words."""
         self.left_offboard = False
         """The mission is over: the flight controller holds."""
+        self.culprit: str | None = None
+        """What the pilot was at when offboard was left."""
         self._link = link
         self._clock = clock
         self._settings = settings
@@ -96,6 +98,7 @@ class Watchdog:
             try:
                 if now_us >= self._leave_us and not self.left_offboard:
                     self.left_offboard = True
+                    self.culprit = self._activity
                     self._note("left offboard", now_us)
                     self._link.leave_offboard()
                 elif now_us >= self._overdue_us and not self._stopped:

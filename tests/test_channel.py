@@ -242,8 +242,8 @@ def test_child_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_exit_in_words() -> None:
-    assert str(Exited(3)) == "exit code 3"
-    assert str(Exited(-9)) == "killed by signal 9"
+    assert str(Exited(3)) == "exit status 3"
+    assert str(Exited(-9)) == "SIGKILL"
 
 
 def test_messages_are_immutable() -> None:

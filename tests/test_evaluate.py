@@ -342,9 +342,10 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
     for absent in ("Real time", "tick lateness", "setpoints never accepted", "MAVSDK"):
         assert absent not in page.words
         assert absent not in text
-    # Seven stages, all flights, a map and a time figure for each flight that is pictured.
+    # Seven stages and their timeline, energy, all flights, the worst in space; a map and a time
+    # figure for each flight that is pictured.
     assert html.MAX_PICTURED < EPISODES
-    assert page.images == 7 + 1 + 2 * html.MAX_PICTURED
+    assert page.images == 7 + 4 + 2 * html.MAX_PICTURED
     assert f"Pictures of {html.MAX_PICTURED} of {EPISODES} flights" in page.words
     pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
     assert pictured >= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}

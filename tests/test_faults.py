@@ -157,42 +157,44 @@ def nothing_half_written(run: Path) -> None:
 
 def test_killed_companion_lets_the_failsafe_land(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "2") as run:
-        children = run.find_children("firmware", "companion")
-        ground.wait_flying(2.0, run)
-        os.kill(children["companion"], signal.SIGKILL)
-        assert run.wait() == 1
-        run.no_child_left()
-    assert "the companion process died: killed by signal 9" in run.text()
-    assert "Traceback" not in run.text()
-    log = read_tlog(tmp_path / "run" / "flight-000.tlog")
+    with firmware(tmp_path, ports) as vehicle:
+        with companion(tmp_path, ports) as pilot:
+            ground.wait_flying(2.0, vehicle, pilot)
+            pilot.process.kill()
+        wait_until(lambda: ground.heard("Failsafe activated"), "the failsafe")
+        ground.wait_down()
+        vehicle.process.terminate()
+        assert vehicle.wait() == 0
+    log = read_tlog(tmp_path / "flight.tlog")
     assert LOSS_S[0] <= loss_to_failsafe(log) <= LOSS_S[1]
     assert time_of_text(log, "Landing detected") > time_of_text(log, "Failsafe activated")
-    (episode,) = load(tmp_path / "run").episodes
-    assert episode.outcome == "aborted"
-    assert "companion process died" in episode.reason
-    assert any("Failsafe activated" in note for note in episode.notes)
-    assert any("Disarmed by landing" in note for note in episode.notes)
-    path = load(tmp_path / "run").trajectories[0]
-    assert abs(path.position[-1, 2]) < 0.3
-    assert path.position[:, 2].min() < -1.0
-    nothing_half_written(tmp_path / "run")
+    assert max(height for _, _, height in ground.track) > 1.0
+    assert ground.height < 0.3
 
 
-def test_killed_firmware_ends_the_run(tmp_path: Path, ground: Ground) -> None:
+@pytest.mark.parametrize("victim", ["companion", "firmware"])
+def test_a_flight_that_loses_a_process_is_flown_again(
+    tmp_path: Path, ground: Ground, victim: str
+) -> None:
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports) as run:
+    with sitl(tmp_path, ports, "--episodes", "1", goal_m=15.0) as run:
         children = run.find_children("firmware", "companion")
-        ground.wait_flying(3.0, run)
-        os.kill(children["firmware"], signal.SIGKILL)
-        assert run.wait(30.0) == 1
+        ground.wait_flying(1.5, run)
+        os.kill(children[victim], signal.SIGKILL)
+        run.wait_for_text(f"flight 000, seed 1 begins again: the {victim} died \\(SIGKILL\\)")
+        for pid in children.values():
+            wait_until(lambda pid=pid: not is_running(pid), "both to end")
+        assert run.wait() == 0
         run.no_child_left()
-    assert "the firmware process died: killed by signal 9" in run.text()
     assert "Traceback" not in run.text()
+    (episode,) = load(tmp_path / "run").episodes
+    assert episode.outcome == "success"
+    (note,) = episode.notes
+    assert note.startswith(f"flown again: the {victim} died (SIGKILL)")
+    # What becomes of a vehicle without its companion is seen through first.
+    landed = "Failsafe activated" in note and "Disarmed by landing" in note
+    assert landed == (victim == "companion")
     nothing_half_written(tmp_path / "run")
-    # Its last second aside, the log of the flight is there.
-    log = read_tlog(tmp_path / "run" / "flight-000.tlog")
-    assert time_of_text(log, "Takeoff detected") - log[0][0] > 1.0
 
 
 def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> None:
@@ -218,7 +220,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
         assert run.wait(40.0) == 130
         run.no_child_left()
     text = run.text()
-    assert "interrupted: what was flown is kept" in text
+    assert f"interrupted: what was flown is kept; --out {tmp_path / 'run'} goes on" in text
     assert "Traceback" not in text
     # The report of what was finished.
     assert "Quality of flight" in text
@@ -464,7 +466,7 @@ def test_silent_camera_is_named(tmp_path: Path, ground: Ground) -> None:
             text = pilot.text()
             assert "velocity zeroed (waiting for a frame" in text
             assert "left offboard (waiting for a frame" in text
-            assert "watchdog; " in text
+            assert "camera silent; " in text
             assert ground.heard("Disarmed by landing")
     finally:
         silent.set()
@@ -549,7 +551,9 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     """1 s: long for the simulation, short for MAVSDK's heartbeats and the watchdog."""
     stopped_s = 1.0
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "1", goal_m=25.0) as run:
+    # The watchdog counts simulated time: a busy host would let it be first now and then.
+    patient = ("--decision-timeout-s", "6", "--leave-after-s", "6")
+    with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
         before = ground.track[-1][0]
@@ -558,9 +562,10 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
         frozen = ground.track[-1][0]
         os.kill(children["firmware"], signal.SIGCONT)
         wait_until(lambda: ground.track[-1][0] > frozen, "time to go on")
-        # The clock goes on where it stood: nothing is caught up with.
-        assert frozen - before < 1000
-        assert ground.track[-1][0] - frozen < 1000
+        # The clock goes on where it stood: nothing is caught up with. (This listener may have been
+        # a moment behind when it was stopped.)
+        assert frozen - before < 0.5e3 * SPEED * stopped_s
+        assert next(t for t, _, _ in list(ground.track) if t > frozen) - frozen < 1000
         assert run.wait() == 0
         run.no_child_left()
     done = load(tmp_path / "run")
@@ -583,7 +588,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
 
 
 def test_long_stopped_firmware_ends_in_a_defined_way(tmp_path: Path, ground: Ground) -> None:
-    """3 s is what MAVSDK allows between heartbeats; the watchdog may be first. No crash."""
+    """3 s is what MAVSDK allows between heartbeats; the watchdog may be first. Flown again."""
     ports = choose_ports(ground.port)
     with sitl(tmp_path, ports, "--episodes", "1", goal_m=25.0) as run:
         children = run.find_children("firmware", "companion")
@@ -596,8 +601,9 @@ def test_long_stopped_firmware_ends_in_a_defined_way(tmp_path: Path, ground: Gro
     (episode,) = load(tmp_path / "run").episodes
     assert "Traceback" not in run.text()
     assert code == 0
-    assert episode.outcome == "aborted"
-    assert episode.reason in ("link lost", "watchdog")
+    assert episode.outcome == "success"
+    lost = r"flown again: firmware and companion lost each other \((link lost|camera silent)\)"
+    assert re.fullmatch(lost, episode.notes[0])
 
 
 # --- garbage on the wire

@@ -7,7 +7,9 @@ The two processes are stood in for, so that events come in exactly the order tha
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +34,11 @@ from airl_mav.channel import (
 from airl_mav.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Part, Setup
-from airl_mav.harness import rehearsal
+from airl_mav.harness import crew, rehearsal
+from airl_mav.harness.crew import COMPANION, FIRMWARE
 from airl_mav.harness.episode import Plan, ProcessPlan
 from airl_mav.harness.process import Exited
-from airl_mav.harness.rehearsal import COMPANION, FIRMWARE, Rehearsal, RehearsalError
+from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
 from airl_mav.harness.run_folder import RunFolder, load
 from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stamps import DecisionLog
@@ -79,9 +82,12 @@ class Stage:
         self.scripts = list(scripts)
         self.events: queue.Queue[Item] | None = None
         self.children: dict[str, FakeChild] = {}
+        """The newest of each."""
+        self.all: list[FakeChild] = []
         self.on_abort: Callable[[Abort], list[Item]] = lambda _: [ended("stopped")]
         self.saves = True
-        self.ready: list[Item] = [(FIRMWARE, Ready()), (COMPANION, Ready())]
+        self.starts: list[list[Item]] = []
+        """What is said at each start; both are ready when nothing is left of it."""
 
     def put(self, *items: Item) -> None:
         assert self.events is not None
@@ -89,7 +95,8 @@ class Stage:
             self.events.put(item)
 
     def requests(self, name: str, kind: type) -> list[Any]:
-        return [r for r in self.children[name].requests if isinstance(r, kind)]
+        children = [child for child in self.all if child.name == name]
+        return [r for child in children for r in child.requests if isinstance(r, kind)]
 
 
 class FakeChild:
@@ -97,14 +104,17 @@ class FakeChild:
 
     stage: Stage
 
-    def __init__(self, name: str, *arguments: Any) -> None:
+    def __init__(self, name: str, *arguments: Any, keeps: Sequence[int]) -> None:
+        assert keeps == (7,)
         self.name, self.ending, self.stopped, self.log = name, False, 0, Path(f"{name}.log")
         self.requests: list[Any] = []
         stage = self.stage
         stage.events = arguments[-1]
         stage.children[name] = self
-        if len(stage.children) == 2:
-            stage.put(*stage.ready)
+        stage.all.append(self)
+        if name == COMPANION:
+            ready: list[Item] = [(FIRMWARE, Ready()), (COMPANION, Ready())]
+            stage.put(*(stage.starts.pop(0) if stage.starts else ready))
 
     def send(self, request: Any) -> None:
         self.requests.append(request)
@@ -177,6 +187,7 @@ class Silent:
     def __init__(self) -> None:
         self.records: list[EpisodeRecord] = []
         self.texts: list[str] = []
+        self.losses: list[str] = []
 
     def waiting(self, what: str) -> None: ...
     def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None: ...
@@ -189,14 +200,17 @@ class Silent:
     def finished(self, record: EpisodeRecord) -> None:
         self.records.append(record)
 
+    def lost(self, what: str) -> None:
+        self.losses.append(what)
+
 
 class Run:
     """One rehearsal on a stage."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
         FakeChild.stage = stage
-        monkeypatch.setattr(rehearsal, "Child", FakeChild)
-        monkeypatch.setattr(rehearsal, "REPLY_TIMEOUT_S", 0.3)
+        monkeypatch.setattr(crew, "Child", FakeChild)
+        monkeypatch.setattr(crew, "REPLY_TIMEOUT_S", 0.3)
         part = Part("x")
         setup = Setup("sitl", part, part, part, part, 2.0, NOTHING_INJECTED, 1.0, "persist")
         self.folder = RunFolder.create(folder / "run", "test", {}, setup=setup)
@@ -205,15 +219,18 @@ class Run:
         process = ProcessPlan("nothing", [])
         self.plan = Plan(process, process, "corridor", 5, len(stage.scripts), 3.0, 60.0, 1.0, 2.0)
 
-    def fly(self) -> list[EpisodeRecord]:
-        with Rehearsal(self.plan, self.folder, self.observer) as flown:
-            flown.run()
+    def fly(self, episodes: int | None = None, done: Collection[int] = ()) -> list[EpisodeRecord]:
+        if episodes is not None:
+            self.plan = replace(self.plan, episodes=episodes)
+        with Rehearsal(self.plan, self.folder, self.observer, keeps=(7,)) as flown:
+            flown.run(done)
+        assert all(child.stopped for child in self.stage.all)
         return self.observer.records
 
 
 @pytest.fixture
 def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
-    return lambda *scripts: Run(tmp_path, monkeypatch, Stage(*scripts))
+    return lambda *scripts, folder="": Run(tmp_path / folder, monkeypatch, Stage(*scripts))
 
 
 FLOWN: Script = [
@@ -239,7 +256,6 @@ def test_two_good_episodes(play: Callable[..., Run]) -> None:
     stage = run.stage
     assert stage.requests(COMPANION, Abort) == []
     assert [r.latency_seed for r in stage.requests(COMPANION, Fly)] == [5, 6]
-    assert all(child.stopped for child in stage.children.values())
     assert [e.index for e in load(run.folder.path).episodes] == [0, 1]
     assert not list(run.folder.path.glob(".*"))
 
@@ -353,28 +369,58 @@ def test_decisions_are_joined_with_the_setpoints(play: Callable[..., Run]) -> No
     assert not list(run.folder.path.glob(".*"))
 
 
+def test_what_is_there_is_not_flown(play: Callable[..., Run]) -> None:
+    run = play(FLOWN)
+    (record,) = run.fly(3, done={0, 2})
+    assert (record.index, record.seed) == (1, 6)
+    assert [request.episode for request in run.stage.requests(FIRMWARE, LoadEpisode)] == [1]
+
+
+def test_nothing_is_started_when_there_is_nothing_to_fly(play: Callable[..., Run]) -> None:
+    run = play()
+    assert run.fly(2, done={0, 1}) == []
+    assert run.stage.all == []
+
+
 # --- somebody dies
 
+DIED: Item = (COMPANION, Exited(-9))
 
-def test_dead_companion_is_saved_as_aborted(play: Callable[..., Run]) -> None:
+
+def test_a_flight_that_lost_its_companion_is_flown_again(play: Callable[..., Run]) -> None:
+    """By two new processes, once the failsafe has been seen through."""
     run = play(
+        FLOWN,
         [
             phase("navigating", 2.0),
             at(3.0, 1.0),
-            (COMPANION, Exited(-9)),
+            DIED,
             (FIRMWARE, Text(time_us=START_US + 4_100_000, severity=2, text="Failsafe activated")),
             at(5.0, 1.0),
             at(8.0, 1.0, armed=False),
         ],
         FLOWN,
+        FLOWN,
     )
-    with pytest.raises(RehearsalError, match="the companion process died: killed by signal 9"):
-        run.fly()
-    (record,) = run.observer.records
-    assert record.outcome == "aborted"
-    assert record.ended_us == START_US + 3_000_000
-    assert record.notes == ("autopilot at 5.10 s: Failsafe activated",)
-    assert all(child.stopped for child in run.stage.children.values())
+    records = run.fly(3)
+    assert [(r.index, r.seed, r.outcome.value) for r in records] == [
+        (0, 5, "success"),
+        (1, 6, "success"),
+        (2, 7, "success"),
+    ]
+    told = "the companion died (SIGKILL); autopilot at 5.10 s: Failsafe activated"
+    assert [r.notes for r in records] == [(), (f"flown again: {told}",), ()]
+    (loss,) = run.observer.losses
+    assert loss.startswith(f"flight 001, seed 6 begins again: {told}; log: companion.log")
+    assert loss.endswith("last words")
+    assert run.observer.texts == ["Failsafe activated"]
+    # A line each, the same seed and files both times.
+    assert [e.index for e in load(run.folder.path).episodes] == [0, 1, 2]
+    loads = run.stage.requests(FIRMWARE, LoadEpisode)
+    assert [request.seed for request in loads] == [5, 6, 6, 7]
+    assert loads[1] == loads[2]
+    assert [child.name for child in run.stage.all] == 2 * [FIRMWARE, COMPANION]
+    assert not list(run.folder.path.glob(".*"))
 
 
 def test_companion_that_fails_and_then_exits_is_one_fault(play: Callable[..., Run]) -> None:
@@ -388,52 +434,98 @@ def test_companion_that_fails_and_then_exits_is_one_fault(play: Callable[..., Ru
             (FIRMWARE, Text(time_us=START_US, severity=2, text="Failsafe activated")),
             at(3.0, armed=False),
         ],
+        FLOWN,
     )
-    with pytest.raises(RehearsalError, match="companion: no flight controller heard"):
-        run.fly()
-    (record,) = run.observer.records
-    assert len(record.notes) == 1, record.notes
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    (note,) = record.notes
+    assert note.startswith("flown again: the companion gave up: no flight controller heard; auto")
 
 
-def test_dead_firmware_ends_at_once(play: Callable[..., Run]) -> None:
-    run = play([at(1.0), (FIRMWARE, Exited(-11))], FLOWN)
-    with pytest.raises(RehearsalError, match="the firmware process died: killed by signal 11"):
-        run.fly()
-    assert run.observer.records == []
-    assert run.stage.requests(FIRMWARE, FinishEpisode) == []
-
-
-def test_failed_firmware_is_not_waited_for(play: Callable[..., Run]) -> None:
-    run = play([at(1.0), (FIRMWARE, Failed(message="no such thing")), (FIRMWARE, Exited(2))])
-    with pytest.raises(RehearsalError, match="firmware: no such thing"):
-        run.fly()
-    assert run.stage.requests(FIRMWARE, FinishEpisode) == []
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        (Exited(-11), "the firmware died (SIGSEGV)"),
+        (Exited(3), "the firmware died (exit status 3)"),
+        (Failed(message="no such thing"), "the firmware gave up: no such thing"),
+    ],
+)
+def test_a_lost_firmware_is_not_waited_for(
+    play: Callable[..., Run], end: Exited | Failed, told: str
+) -> None:
+    run = play([at(1.0), (FIRMWARE, end)], FLOWN)
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    assert record.notes == (f"flown again: {told}",)
+    assert len(run.stage.requests(FIRMWARE, FinishEpisode)) == 1
 
 
 def test_firmware_that_dies_under_the_failsafe(play: Callable[..., Run]) -> None:
-    run = play([at(1.0), (COMPANION, Exited(1)), at(2.0), (FIRMWARE, Exited(-9))])
-    with pytest.raises(RehearsalError, match="the companion process died: exit code 1"):
-        run.fly()
-    assert run.stage.requests(FIRMWARE, FinishEpisode) == []
+    run = play([at(1.0), (COMPANION, Exited(1)), at(2.0), (FIRMWARE, Exited(-9))], FLOWN)
+    (record,) = run.fly(1)
+    assert record.notes == (
+        "flown again: the companion died (exit status 1); the firmware died (SIGKILL)",
+    )
 
 
-def test_success_and_then_a_dead_companion_is_a_success_and_an_error(
-    play: Callable[..., Run],
-) -> None:
-    run = play([*FLOWN[:-1], (COMPANION, Exited(-9)), at(12.0, 8.0, armed=False)])
-    with pytest.raises(RehearsalError, match="the companion process died"):
-        run.fly()
-    (record,) = run.observer.records
+def test_a_flight_without_its_decisions_is_none(play: Callable[..., Run]) -> None:
+    """At the goal, but the companion dies on the way down and its log with it."""
+    run = play([*FLOWN[:-1], DIED, at(12.0, 8.0, armed=False)], FLOWN)
+    (record,) = run.fly(1)
     assert record.outcome == "success"
+    assert record.notes == ("flown again: the companion died (SIGKILL)",)
+    assert len(load(run.folder.path).episodes) == 1
+
+
+@pytest.mark.parametrize("reason", ["link lost", "camera silent"])
+def test_processes_that_lost_each_other_fly_again(play: Callable[..., Run], reason: str) -> None:
+    run = play([phase("navigating", 2.0), at(3.0, 1.0), ended(reason, "watchdog at 3 s")], FLOWN)
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    assert record.notes == (f"flown again: firmware and companion lost each other ({reason})",)
+    assert len(run.stage.all) == 4
+
+
+@pytest.mark.parametrize("reason", ["watchdog", "policy failed: RuntimeError: out of ideas"])
+def test_what_a_policy_does_is_not_flown_again(play: Callable[..., Run], reason: str) -> None:
+    (record,) = play([phase("navigating", 2.0), at(3.0, 1.0), ended(reason)]).fly(1)
+    assert (record.outcome, record.reason, record.notes) == ("aborted", reason, ())
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        [at(1.0), DIED, at(2.0, armed=False)],
+        [at(1.0), (FIRMWARE, Exited(-9))],
+        [at(1.0), ended("link lost")],
+    ],
+)
+def test_a_flight_that_is_lost_every_time_ends_the_run(
+    play: Callable[..., Run], script: Script
+) -> None:
+    run = play(FLOWN, script, script, script, FLOWN)
+    with pytest.raises(RehearsalError, match="flight 001, seed 6: lost 3 times; at last "):
+        run.fly(3)
+    assert len(run.observer.losses) == 2
+    # What was flown before is kept, nothing of the lost ones.
+    assert [record.index for record in run.observer.records] == [0]
+    assert [e.index for e in load(run.folder.path).episodes] == [0]
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_losses_are_counted_by_flight(play: Callable[..., Run]) -> None:
+    lost: Script = [at(1.0), (FIRMWARE, Exited(-9))]
+    records = play(lost, lost, FLOWN, lost, lost, FLOWN).fly(2)
+    assert [len(record.notes) for record in records] == [2, 2]
 
 
 def test_ended_but_never_saved(play: Callable[..., Run]) -> None:
-    run = play(FLOWN)
+    run = play(FLOWN, FLOWN, FLOWN)
     run.stage.saves = False
     with pytest.raises(RehearsalError, match="gave up waiting for the event 'Saved'"):
-        run.fly()
+        run.fly(1)
     assert run.observer.records == []
-    assert all(child.stopped for child in run.stage.children.values())
+    assert all(child.stopped for child in run.stage.all)
 
 
 def test_companion_that_never_answers_is_ended(
@@ -442,30 +534,66 @@ def test_companion_that_never_answers_is_ended(
     """Hung for good: its end is what makes the flight controller's failsafe act."""
     for name in ("TAKEOFF_LIMIT_S", "WRAP_UP_S"):
         monkeypatch.setattr(rehearsal, name, 0.1)
-    run = play([at(0.05), phase("navigating", 0.06), at(0.08)])
-    run.plan = Plan(**{**vars(run.plan), "time_limit_s": 1.0})
-    with pytest.raises(RehearsalError, match="gave up waiting for the flight"):
-        run.fly()
-    (record,) = run.observer.records
-    assert record.outcome == "aborted"
-    assert run.stage.children[COMPANION].stopped >= 1
-    assert any("the vehicle to come down" in note for note in record.notes)
+    run = play([at(0.05), phase("navigating", 0.06), at(0.08)], FLOWN)
+    run.plan = replace(run.plan, time_limit_s=1.0)
+    (record,) = run.fly(1)
+    (note,) = record.notes
+    assert re.fullmatch(
+        "flown again: gave up waiting for the flight after 1 s; "
+        "gave up waiting for the vehicle to come down after 0 s",
+        note,
+    )
 
 
 @pytest.mark.parametrize("name", [FIRMWARE, COMPANION])
 def test_refusal_at_the_start_is_a_usage_error(play: Callable[..., Run], name: str) -> None:
     run = play(FLOWN)
-    run.stage.ready = [(FIRMWARE, Ready()), (name, Failed(message="port 1 is taken"))]
+    refused: Item = (name, Failed(message="port 1 is taken", usage=True))
+    run.stage.starts = [[(FIRMWARE, Ready()), refused]]
     with pytest.raises(UsageError, match="port 1 is taken"):
         run.fly()
-    assert all(child.stopped for child in run.stage.children.values())
+    assert len(run.stage.all) == 2
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_refusal_in_flight_is_a_usage_error_too(play: Callable[..., Run]) -> None:
+    """Not again: the same input is refused the same way."""
+    run = play(FLOWN, [(COMPANION, Failed(message="cannot use this camera", usage=True))])
+    with pytest.raises(UsageError, match="cannot use this camera"):
+        run.fly()
+    assert [record.index for record in run.observer.records] == [0]
+    assert len(run.stage.all) == 2
+    assert all(child.stopped for child in run.stage.all)
 
 
 def test_death_at_the_start(play: Callable[..., Run]) -> None:
     run = play(FLOWN)
-    run.stage.ready = [(FIRMWARE, Ready()), (COMPANION, Exited(1))]
-    with pytest.raises(RehearsalError, match=r"companion process died: exit code 1(.|\n)*last w"):
+    died: list[Item] = [(FIRMWARE, Ready()), (COMPANION, Exited(1))]
+    run.stage.starts = [died, died]
+    (record,) = run.fly()
+    assert record.notes == 2 * ("flown again: the companion died (exit status 1)",)
+    run = play(FLOWN, folder="again")
+    run.stage.starts = [died, died, died]
+    with pytest.raises(RehearsalError, match=r"companion died \(exit status 1\)(.|\n)*last words"):
         run.fly()
+
+
+def test_interrupt_while_a_new_crew_starts(
+    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = play([at(1.0), (FIRMWARE, Exited(-9))])
+    real = FakeChild.__init__
+
+    def interrupted(child: FakeChild, name: str, *words: Any, **more: Any) -> None:
+        if len(run.stage.all) == 3:
+            raise KeyboardInterrupt
+        real(child, name, *words, **more)
+
+    monkeypatch.setattr(FakeChild, "__init__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.fly()
+    assert len(run.stage.all) == 3
+    assert all(child.stopped for child in run.stage.all)
 
 
 def test_second_interrupt_kills(play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch) -> None:

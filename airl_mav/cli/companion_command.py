@@ -19,6 +19,7 @@ from airl_mav.cli.common import (
     check_range,
 )
 from airl_mav.clock import Clock
+from airl_mav.cpu_quota import check_permitted
 from airl_mav.errors import UsageError
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
@@ -72,6 +73,10 @@ class CompanionCommand:
 
     threads: int = 1
     """Threads of one inference."""
+
+    cpu_quota: float | None = None
+    """Hold this program to so many percent of one core, for real, by a Linux control group; 1 to
+    6400. None: no limit."""
 
     connect: str = "udpin://127.0.0.1:14540"
     """MAVSDK connection to the flight controller: udpin://HOST:PORT or serial://DEVICE:BAUD."""
@@ -136,6 +141,11 @@ def check(command: CompanionCommand) -> PilotSettings:
     for metres in command.goal:
         check_range("--goal", metres, -10_000.0, 10_000.0)
     check_range("--threads", command.threads, 1, GREATEST_THREADS)
+    check_quota(
+        command.cpu_quota,
+        lockstep=command.lockstep,
+        injected=injection(command).latency is not None,
+    )
     pilot = pilot_settings(command.pilot, find_policy(command.policy))
     check_range("--goal-radius-m", pilot.goal_radius_m, 0.1, 50.0)
     check_range("--altitude-m", pilot.altitude_m, 0.5, 100.0)
@@ -145,6 +155,19 @@ def check(command: CompanionCommand) -> PilotSettings:
         raise UsageError(f"--log {command.log}: no folder {command.log.parent}")
     sampler(command, command.seed)
     return pilot
+
+
+def check_quota(percent: float | None, *, lockstep: bool, injected: bool) -> None:
+    """Check a limit on the processor. Raises UsageError when it is not permitted, or no use."""
+    if percent is None:
+        return
+    if lockstep or injected:
+        option = "--lockstep" if lockstep else "an injected latency"
+        raise UsageError(
+            f"--cpu-quota {percent:g} with {option}: accepted: without, where this program's own "
+            "time counts"
+        )
+    check_permitted(percent)
 
 
 def pilot_settings(options: PilotOptions, policy: PolicyInfo) -> PilotSettings:

@@ -39,6 +39,7 @@ from airl_mav.cli.companion_command import (
     watchdog_settings,
 )
 from airl_mav.clock import WallClock
+from airl_mav.cpu_quota import held_to
 from airl_mav.errors import UsageError
 from airl_mav.latency.samplers import latency_generator
 from airl_mav.policy.actions import Policy
@@ -82,7 +83,10 @@ def serve(command: CompanionCommand) -> int:
     channel.listen(handle, lambda: os._exit(EXIT_BROKEN))
     missions = _missions_in_lockstep if command.lockstep else _missions
     try:
-        with missions(command, pilot, clock, stop, abandon, channel) as fly:
+        with (
+            held_to(command.cpu_quota),
+            missions(command, pilot, clock, stop, abandon, channel) as fly,
+        ):
             channel.send(Ready())
             while not isinstance(request := requests.get(), Shutdown):
                 channel.send(fly(request))

@@ -11,6 +11,7 @@ from rich.console import Console
 from airl_mav.cli import report
 from airl_mav.cli.common import GREATEST_SEED, check_draws, check_range
 from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.report_command import ReportCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.record import run_sha256
@@ -53,19 +54,19 @@ def run(command: EvaluateCommand, console: Console | None = None) -> int:
         UsageError: The input cannot be used.
     """
     console = console or Console()
-    arenas = _check(command)
+    arenas = check_evaluation(command)
     # Imported late: the kernels take a second to load, and a typo must not wait for them.
     from airl_mav.cli.evaluate_task import prepare
 
     tasks = [prepare(command, policy, arena) for policy in command.policies for arena in arenas]
     for policy in {task.policy.name: task.policy for task in tasks}.values():
-        _warn_of_known_seeds(command, policy, console)
+        warn_of_known_seeds(command, policy, console)
     if len(tasks) == 1:
         return _fly_one(command, tasks[0], console)
     return _fly_matrix(command, tasks, console)
 
 
-def _check(command: EvaluateCommand) -> list[str]:
+def check_evaluation(command: EvaluateCommand) -> list[str]:
     """Check what all tasks share; return the arenas. Raises UsageError."""
     if not command.policies:
         raise UsageError("no policy; accepted: one or more names or folders")
@@ -104,8 +105,6 @@ def _check_plain(command: EvaluateCommand, policies: Sequence[PolicyInfo]) -> No
     """Raise UsageError for results that are not the policies' own."""
     for option in (
         "ablate",
-        "workload",
-        "latency",
         "arena_seed",
         "goal_radius",
         "time_limit",
@@ -131,6 +130,7 @@ def _write_on_card(command: EvaluateCommand, task: Task, result: EvaluationResul
         CardResult(
             arena=task.arena_name,
             level=command.level,
+            latency=command.latency or _workload(command),
             episodes=len(result.episodes),
             seed=command.seed,
             success_rate=quality.success_rate.value or 0.0,
@@ -141,6 +141,13 @@ def _write_on_card(command: EvaluateCommand, task: Task, result: EvaluationResul
     )
 
 
+def _workload(command: EvaluateCommand) -> str | None:
+    """Return the workload that was flown as, as a source of latency."""
+    if command.workload is None:
+        return None
+    return f"{command.computer}/{command.workload}"
+
+
 def _check_names(option: str, names: Sequence[str]) -> None:
     """Raise UsageError when two of them would share a row, a column and a folder."""
     for name in names:
@@ -148,7 +155,7 @@ def _check_names(option: str, names: Sequence[str]) -> None:
             raise UsageError(f"{option}: {name} twice; accepted: each name once")
 
 
-def _warn_of_known_seeds(command: EvaluateCommand, policy: PolicyInfo, console: Console) -> None:
+def warn_of_known_seeds(command: EvaluateCommand, policy: PolicyInfo, console: Console) -> None:
     """Say so when a policy may know the episodes from its training."""
     training = None if policy.card is None else policy.card.training
     if training is None or training.first_arena_seed is None:
@@ -172,8 +179,8 @@ def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
     _write_on_card(command, task, result)
     if not result.episodes:
         console.print(f"no episode was finished; {result.path}", soft_wrap=True)
-    elif command.level != "sitl":
-        report.run(report.ReportCommand(result.path), console)
+    else:
+        report.run(ReportCommand(result.path), console)
     _say_fingerprint(result, console)
     return result.code
 
@@ -195,7 +202,7 @@ def _fly_matrix(command: EvaluateCommand, tasks: Sequence[Task], console: Consol
         _write_on_card(command, task, result)
         if result.episodes:
             shown = (result.path / REPORT_FILE).exists() and not result.new
-            if command.level != "sitl" and not shown:
+            if not shown:
                 rebuild(result.path)
             cells.append(_cell(task, result))
             write_matrix(root, facts, cells)

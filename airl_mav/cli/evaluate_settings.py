@@ -35,7 +35,7 @@ def settings(
         "latency": command.latency,
         "latency_seed": command.latency_seed,
         "arena_seed": command.arena_seed,
-        "profiles_sha256": {kind: _fingerprint(profile) for kind, profile in profiles.items()},
+        "profiles_sha256": {kind: fingerprint(profile) for kind, profile in profiles.items()},
     }
 
 
@@ -50,6 +50,6 @@ def policy_part(command: EvaluateCommand, policy: PolicyInfo) -> Part:
     return Part(policy.name, f"{policy.description}{without}")
 
 
-def _fingerprint(profile: BaseModel) -> str:
+def fingerprint(profile: BaseModel) -> str:
     """Return a digest of a profile's values: the name alone does not tell a changed one."""
     return hashlib.sha256(profile.model_dump_json().encode()).hexdigest()

@@ -3,46 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
-from airl_mav.cli import report, sitl
+from airl_mav.cli import sitl
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.cli.episode_bar import EpisodeBar, stop_on_signals
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_gym import plan_evaluation
 from airl_mav.cli.evaluate_lockstep import plan_lockstep
 from airl_mav.cli.sitl_command import SitlCommand, check
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.evaluation import Evaluation, Watch, another_config, open_folder
+from airl_mav.harness.evaluation import Evaluation, Watch, open_folder
 from airl_mav.harness.evaluation_gym import fly_gym
 from airl_mav.harness.evaluation_lockstep import fly_lockstep
-from airl_mav.harness.run_folder import RUN_FILE, RunFolder, load
+from airl_mav.harness.lock import locked
+from airl_mav.harness.run_folder import RunFolder, load
 from airl_mav.harness.workers import WorkerError
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
 from companion.watchdog import WatchdogSettings
-
-SAME_IN_SITL = (
-    "policy",
-    "arena",
-    "vehicle",
-    "computer",
-    "workload",
-    "latency",
-    "latency_seed",
-    "arena_seed",
-    "episodes",
-    "seed",
-)
-"""Settings by which a finished run of level sitl is known again."""
 
 FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]
 """Flies what is left into a folder that holds some episodes already."""
@@ -106,7 +92,14 @@ def _in_words(radius_m: float, hold_s: float, altitude_m: float, limit_s: float)
 
 
 def _fly(evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: Console) -> Result:
-    """Fly what is left of an evaluation."""
+    """Fly what is left of an evaluation, alone in its folder."""
+    with locked(out, partial(_say, console)) if out is not None else nullcontext():
+        return _fly_alone(evaluation, fly_rest, out, console)
+
+
+def _fly_alone(
+    evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: Console
+) -> Result:
     setup, config = evaluation.setup, evaluation.config
     arena = Path(setup.arena.name).stem
     without = f"-no-{config['ablate']}" if config["ablate"] else ""
@@ -172,30 +165,10 @@ def sitl_command(
 
 
 def _fly_sitl(rehearsal: SitlCommand, out: Path | None, console: Console) -> Result:
-    """Rehearse, unless the folder holds that very run already; show it."""
-    name = find_policy(rehearsal.policy).name
-    label = f"{utc_now():%Y%m%dT%H%M%SZ}-evaluate-{name}-{Path(rehearsal.arena).stem}-sitl"
-    path = out or Path("runs") / label
-    if (path / RUN_FILE).exists():
-        _check_finished(path, rehearsal)
-        report.run(report.ReportCommand(path), console)
-        return Result(path, 0, load(path).episodes, 0)
-    code = sitl.run(replace(rehearsal, out=path), console)
-    run = load(path)
-    if run.episodes:
+    """Rehearse what is left."""
+    name, arena = find_policy(rehearsal.policy).name, Path(rehearsal.arena).stem
+    flown = sitl.fly(replace(rehearsal, out=out), console, f"evaluate-{name}-{arena}-sitl")
+    run = load(flown.path)
+    if flown.new:
         write_overview(run, pictured_arenas(run))
-    return Result(path, code, run.episodes, len(run.episodes))
-
-
-def _check_finished(path: Path, rehearsal: SitlCommand) -> None:
-    """Raise UsageError unless a folder holds all episodes of a rehearsal."""
-    run = load(path)
-    wanted = {key: asdict(rehearsal)[key] for key in SAME_IN_SITL}
-    held = {key: run.info.config.get(key) for key in SAME_IN_SITL}
-    if (difference := another_config(held, wanted)) is not None:
-        raise UsageError(f"--out {path}: holds a run with {difference}; accepted: a new folder")
-    if len(run.episodes) < rehearsal.episodes:
-        raise UsageError(
-            f"--out {path}: {len(run.episodes)} of {rehearsal.episodes} episodes, and level sitl "
-            "cannot go on; accepted: a new folder"
-        )
+    return Result(flown.path, flown.code, run.episodes, flown.new)

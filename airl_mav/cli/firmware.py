@@ -291,8 +291,9 @@ def serve(command: FirmwareCommand) -> int:
             channel.send(Ready(details={"camera": bench.camera_endpoint}))
             Service(bench, channel, episode).run(requests)
     except (UsageError, LockstepError) as error:
-        channel.send(Failed(message=str(error)))
-        return EXIT_USAGE if isinstance(error, UsageError) else EXIT_BROKEN
+        usage = isinstance(error, UsageError)
+        channel.send(Failed(message=str(error), usage=usage))
+        return EXIT_USAGE if usage else EXIT_BROKEN
     return 0
 
 

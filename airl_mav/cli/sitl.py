@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import signal
-from dataclasses import asdict
-from typing import NoReturn
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NoReturn
 
 import tyro
+from pydantic import BaseModel
 from rich.console import Console
 
 from airl_mav.cli.common import (
@@ -14,16 +19,31 @@ from airl_mav.cli.common import (
     EXIT_INTERRUPTED,
     run_command,
 )
+from airl_mav.cli.evaluate_settings import fingerprint
 from airl_mav.cli.sitl_command import ARRIVAL_SHARE, SitlCommand, check, wall_speed
+from airl_mav.cpu_quota import remove_left
 from airl_mav.errors import UsageError
 from airl_mav.flight.setup import Setup
 from airl_mav.harness.episode import Plan, ProcessPlan
+from airl_mav.harness.evaluation import Evaluation, Job, open_folder
+from airl_mav.harness.lock import locked
 from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.harness.progress import RichObserver
 from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
-from airl_mav.harness.run_folder import RunFolder
+from airl_mav.harness.run_folder import RUN_FILE, RunFolder
+from airl_mav.policy.registry import find_policy
 from airl_mav.ports import LOOPBACK
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import load_vehicle
 from companion.pilot import PilotSettings
+
+LEAVES_RESULTS_ALONE = ("ports",)
+"""Settings that may change when a run is taken up again."""
+
+LEAVES_LOCKSTEP_ALONE = ("ports", "speed")
+"""The same in lockstep. Paced by the wall clock, what this machine takes counts --speed times."""
 
 
 def main() -> None:
@@ -32,64 +52,156 @@ def main() -> None:
     run_command(lambda: run(command))
 
 
+@dataclass(frozen=True)
+class Flown:
+    """What a rehearsal has come to."""
+
+    path: Path
+    """Its run folder."""
+    code: int
+    """Exit status."""
+    new: int
+    """How many episodes were flown now."""
+
+
 def run(command: SitlCommand, console: Console | None = None) -> int:
-    """Fly all episodes and write the report.
+    """Fly what is left of the episodes and write the report.
 
     Args:
         command: What was asked for.
         console: Where to print; None means standard output.
 
     Returns:
-        Exit status: 0 all episodes flown, 1 a process died, 130 Ctrl-C.
+        Exit status: 0 all episodes flown, 1 an episode was lost too often, 130 Ctrl-C.
 
     Raises:
-        UsageError: The input cannot be used; nothing was flown.
+        UsageError: The input cannot be used.
     """
     console = console or Console()
+    flown = fly(command, console)
+    conclude(flown.path, console)
+    return flown.code
+
+
+def fly(command: SitlCommand, console: Console, label: str | None = None) -> Flown:
+    """Fly what is left of the episodes.
+
+    Args:
+        command: What was asked for.
+        console: Where to print.
+        label: Name of the run, and of its folder when none was asked for; None: after the policy.
+
+    Raises:
+        UsageError: The input cannot be used; what was flown before is kept.
+    """
     setup, pilot = check(command)
-    signal.signal(signal.SIGTERM, _interrupt)
-    folder = RunFolder.create(
-        command.out,
-        f"sitl-{setup.policy.name}",
-        # As flown: what was left open is filled in.
-        asdict(command)
-        | {
-            "hold": pilot.hold_s,
-            "altitude": pilot.altitude_m,
-            "goal_radius": pilot.goal_radius_m,
-        },
-        setup=setup,
-        seeds=[command.seed + i for i in range(command.episodes)],
+    evaluation = Evaluation(
+        setup,
+        tuple(range(command.seed, command.seed + command.episodes)),
+        settings(command, setup, pilot),
     )
+    free = LEAVES_LOCKSTEP_ALONE if command.lockstep else LEAVES_RESULTS_ALONE
+    known = command.out is not None and (command.out / RUN_FILE).exists()
+    say = partial(_say, console, style="yellow")
+    with ExitStack() as held, terminated_as_interrupted():
+        if command.out is not None:
+            # First of all: the processes of a run that was killed may be about to write.
+            keeps = held.enter_context(locked(command.out, say))
+        folder, done = open_folder(
+            command.out,
+            label or f"sitl-{setup.policy.name}",
+            evaluation,
+            free=free,
+            may_grow=True,
+        )
+        if command.out is None:
+            keeps = held.enter_context(locked(folder.path, say))
+        if done:
+            _say(console, f"{folder.path}: {len(done)} of {command.episodes} episodes are there")
+        jobs = evaluation.jobs(done)
+        if not jobs:
+            return Flown(folder.path, 0, 0)
+        _say_what_flies(command, setup, console)
+        code = EXIT_BROKEN
+        with RichObserver(console, command.episodes, len(done)) as observer:
+            try:
+                if command.lockstep:
+                    _rehearse_in_lockstep(command, setup, pilot, jobs, folder, observer)
+                else:
+                    planned = plan(command, setup, pilot)
+                    with Rehearsal(planned, folder, observer, keeps=(keeps,)) as rehearsal:
+                        rehearsal.run(done={record.index for record in done})
+                code = 0
+            except (RehearsalError, LockstepError) as error:
+                _say(console, f"error: {error}", "red")
+                say(f"broken off: {_kept(folder)}")
+            except KeyboardInterrupt:
+                say(f"interrupted: {_kept(folder)}")
+                code = EXIT_INTERRUPTED
+            except UsageError:
+                if not known and not observer.finished_episodes:
+                    folder.discard()
+                raise
+            finally:
+                folder.sweep()
+                if command.cpu_quota is not None:
+                    remove_left()
+        return Flown(folder.path, code, observer.finished_episodes)
+
+
+def settings(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> dict[str, Any]:
+    """Return all that is written down of a run: what was left open is filled in.
+
+    Profiles and policy by their content too: a name does not tell a changed one.
+    """
+    latency = setup.injection.latency
+    profiles: dict[str, BaseModel] = {
+        "vehicle": load_vehicle(command.vehicle),
+        "arena": load_profile("arenas", command.arena, ArenaSpec),
+        "computer": load_computer(command.computer),
+        **({} if latency is None else {"latency": latency}),
+    }
+    asked = asdict(command)
+    del asked["out"]
+    return {
+        **asked,
+        "hold": pilot.hold_s,
+        "altitude": pilot.altitude_m,
+        "goal_radius": pilot.goal_radius_m,
+        "speed": setup.speed,
+        "policy_sha256": find_policy(command.policy).sha256,
+        "profiles_sha256": {kind: fingerprint(profile) for kind, profile in profiles.items()},
+    }
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Treat SIGTERM as Ctrl-C for a while."""
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _kept(folder: RunFolder) -> str:
+    return f"what was flown is kept; --out {folder.path} goes on"
+
+
+def _say(console: Console, text: str, style: str | None = None) -> None:
+    console.print(text, style=style, soft_wrap=True, markup=False, highlight=False)
+
+
+def _say_what_flies(command: SitlCommand, setup: Setup, console: Console) -> None:
+    """Print what flies, and where to connect to it."""
     console.print(
         f"airl-sitl  {setup.vehicle.name} in {setup.arena.name}, policy {setup.policy.name}"
     )
     if command.lockstep:
         console.print("lockstep   one process, one simulated clock, MAVSDK on raw bytes")
-    else:
-        console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
-        console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
-    code = 0
-    with RichObserver(console, command.episodes) as observer:
-        try:
-            if command.lockstep:
-                _rehearse_in_lockstep(command, setup, pilot, folder, observer)
-            else:
-                with Rehearsal(plan(command, setup, pilot), folder, observer) as rehearsal:
-                    rehearsal.run()
-        except (RehearsalError, LockstepError) as error:
-            console.print(f"error: {error}", style="red", markup=False, highlight=False)
-            code = EXIT_BROKEN
-        except KeyboardInterrupt:
-            console.print("interrupted: what was flown is kept", style="yellow")
-            code = EXIT_INTERRUPTED
-        except UsageError:
-            folder.discard()
-            raise
-        finally:
-            folder.sweep()
-    conclude(folder, console)
-    return code
+        return
+    console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
+    console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
 
 
 def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
@@ -111,6 +223,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         *("--control", "stdio"),
         *("--policy", command.policy, "--runtime", command.runtime),
         *("--threads", f"{command.threads}"),
+        *(("--cpu-quota", f"{command.cpu_quota!r}") if command.cpu_quota is not None else ()),
         *("--computer", command.computer),
         *(("--workload", command.workload) if command.workload is not None else ()),
         *(("--latency", command.latency) if command.latency is not None else ()),
@@ -142,6 +255,7 @@ def _rehearse_in_lockstep(
     command: SitlCommand,
     setup: Setup,
     pilot: PilotSettings,
+    jobs: Sequence[Job],
     folder: RunFolder,
     observer: RichObserver,
 ) -> None:
@@ -153,19 +267,18 @@ def _rehearse_in_lockstep(
     observer.waiting("loading")
     planned = lockstep_plan(command, setup, pilot)
     warm_up(planned.vehicle)
-    seeds = [command.seed + i for i in range(command.episodes)]
-    rehearse(planned, seeds, policies(command, pilot.hold_s), folder, observer)
+    rehearse(planned, jobs, policies(command, pilot.hold_s), folder, observer)
 
 
-def conclude(folder: RunFolder, console: Console) -> None:
+def conclude(path: Path, console: Console) -> None:
     """Print the tables and write the report of what was flown."""
     # Imported late: the figures take a second to load, and nobody waits for them before a flight.
     from airl_mav.report.rebuild import rebuild
     from airl_mav.report.terminal import print_report
 
-    flown, page = rebuild(folder.path)
+    flown, page = rebuild(path)
     if page is None:
-        console.print(f"no episode was finished; logs in {folder.path}")
+        _say(console, f"no episode was finished; logs in {path}")
         return
     print_report(flown, console, page)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tyro
@@ -19,6 +19,7 @@ from airl_mav.cli.companion_command import (
     GREATEST_THREADS,
     PilotOptions,
     check_holding,
+    check_quota,
     hover_after_s,
     pilot_settings,
 )
@@ -72,6 +73,10 @@ class SitlCommand:
 
     threads: int = 1
     """Threads of one inference."""
+
+    cpu_quota: float | None = None
+    """Hold the companion to so many percent of one core, for real, by a Linux control group; 1 to
+    6400. What it then takes is measured, nothing is injected. None: no limit."""
 
     computer: str = "workstation"
     """Computer profile to fly as: a shipped name, or a path to a .toml."""
@@ -132,7 +137,8 @@ class SitlCommand:
     """Ports."""
 
     out: Path | None = None
-    """Run folder. None: runs/<UTC time>-sitl-<policy>."""
+    """Run folder; one that holds some episodes of the same run gets the others. None: runs/<UTC
+    time>-sitl-<policy>."""
 
 
 def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
@@ -178,6 +184,11 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
         macs=policy.macs,
     )
     hover_s = hover_after_s(command.watchdog, policy)
+    check_quota(
+        command.cpu_quota, lockstep=command.lockstep, injected=injection.latency is not None
+    )
+    if command.cpu_quota is not None:
+        injection = replace(injection, label=held_label(command.cpu_quota))
     if command.lockstep:
         injection = without_timing(injection, Delay().native_ms, "lockstep")
     setup = Setup(
@@ -192,6 +203,14 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
         between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
     )
     return setup, pilot
+
+
+def held_label(percent: float) -> str:
+    """Return what is flown when the companion is held to a share of a core, in words."""
+    return (
+        f"native speed of the machine that flew, companion held to {percent:g} % of a core; "
+        "nothing injected"
+    )
 
 
 def _flown(command: SitlCommand, policy: PolicyInfo) -> PilotSettings:

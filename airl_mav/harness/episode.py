@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.channel import Ended, Loaded, State
 from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
-from airl_mav.flight.judge import Referee
+from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
@@ -20,6 +20,11 @@ from airl_mav.harness.following import Follower
 from airl_mav.harness.run_folder import TICK_LATENESS, RunFolder
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
+from companion.mission import CAMERA_SILENT, LINK_LOST
+
+SEPARATED = (LINK_LOST, CAMERA_SILENT)
+"""Why a mission ends when both processes live but no longer hear each other: one of them stood
+still for seconds, or the host has too much to do."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +76,14 @@ class Episode:
     def referee(self) -> Referee:
         """The referee."""
         return self.follower.referee
+
+    @property
+    def separated(self) -> str | None:
+        """Why it ended before its verdict, if the processes no longer heard each other."""
+        verdict, ended = self.referee.verdict, self.ended
+        if verdict is None or verdict.outcome is not Outcome.ABORTED or ended is None:
+            return None
+        return ended.reason if ended.reason in SEPARATED else None
 
     @property
     def slipped_us(self) -> int:

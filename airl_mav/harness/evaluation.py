@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,9 +56,21 @@ class Watch:
 
 
 def open_folder(
-    out: Path | None, name: str, evaluation: Evaluation
+    out: Path | None,
+    name: str,
+    evaluation: Evaluation,
+    *,
+    free: Collection[str] = LEAVES_RESULTS_ALONE,
+    may_grow: bool = False,
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
+
+    Args:
+        out: The folder; None makes a new one.
+        name: Name of a new run.
+        evaluation: What is flown.
+        free: Settings that may differ, a table of them by its name.
+        may_grow: Whether a run with the first ones of the seeds is the same one, and is added to.
 
     Returns:
         The folder, and the episodes that it holds.
@@ -66,25 +78,35 @@ def open_folder(
     Raises:
         UsageError: It holds another run.
     """
-    config = evaluation.config
+    config, seeds = evaluation.config, evaluation.seeds
     if out is None or not (out / RUN_FILE).exists():
-        folder = RunFolder.create(out, name, config, setup=evaluation.setup, seeds=evaluation.seeds)
+        folder = RunFolder.create(out, name, config, setup=evaluation.setup, seeds=seeds)
         return folder, ()
-    if (difference := another_config(load(out).info.config, config)) is not None:
+    held = load(out).info
+    grows = may_grow and len(held.seeds) < len(seeds) and held.seeds == seeds[: len(held.seeds)]
+    if difference := another_config(held.config, config, (*free, "episodes") if grows else free):
         raise UsageError(
             f"--out {out}: holds a run with {difference}; accepted: a new folder, or the same "
             "settings to go on"
         )
     folder, run = RunFolder.resume(out)
     folder.sweep()
+    if grows:
+        folder.plan_again(config, seeds)
     return folder, run.episodes
 
 
-def another_config(held: Mapping[str, Any], asked: Mapping[str, Any]) -> str | None:
-    """Return the first setting in which two configurations differ, or None when they do not."""
+def another_config(
+    held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = LEAVES_RESULTS_ALONE
+) -> str | None:
+    """Return the first setting in which two configurations differ, or None when they do not.
+
+    Settings in `free` are passed over, a table of them by its name.
+    """
     old, new = _flat(held), _flat(json.loads(json.dumps(asked)))
     for key in sorted(old.keys() | new.keys()):
-        if key not in LEAVES_RESULTS_ALONE and old.get(key) != new.get(key):
+        known = key in free or key.partition(".")[0] in free
+        if not known and old.get(key) != new.get(key):
             return f"{key} = {old.get(key)!r}, not {new.get(key)!r}"
     return None
 

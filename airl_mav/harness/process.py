@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import queue
+import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,8 +31,11 @@ class Exited:
     """Exit status; negative = the signal that killed it."""
 
     def __str__(self) -> str:
-        """Return it in words."""
-        return f"killed by signal {-self.code}" if self.code < 0 else f"exit code {self.code}"
+        """Return it in words: SIGKILL, or exit status 1."""
+        if self.code < 0:
+            with contextlib.suppress(ValueError):
+                return signal.Signals(-self.code).name
+        return f"exit status {self.code}"
 
 
 class Child:
@@ -43,6 +48,8 @@ class Child:
         arguments: list[str],
         log: Path,
         events: queue.Queue[tuple[str, Event | Exited]],
+        *,
+        keeps: Sequence[int] = (),
     ) -> None:
         """Start `python -m module arguments`.
 
@@ -52,6 +59,7 @@ class Child:
             arguments: Its arguments.
             log: Its standard error goes here.
             events: Gets (name, event); after the last one (name, Exited).
+            keeps: File descriptors that it inherits and never looks at: locks.
         """
         self.name = name
         self.log = log
@@ -59,6 +67,7 @@ class Child:
         """Its end is wanted: no surprise when it comes."""
         self._events = events
         with log.open("ab") as file:
+            self._log_start = file.tell()
             # A session of its own: Ctrl-C at the terminal reaches the harness alone, which then
             # ends the children in order. A fixed argument list, no shell.
             self._process = subprocess.Popen(  # noqa: S603
@@ -67,6 +76,7 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=file,
                 start_new_session=True,
+                pass_fds=keeps,
             )
         self._reader = threading.Thread(target=self._read, name=f"{name}-events", daemon=True)
         self._reader.start()
@@ -110,11 +120,12 @@ class Child:
         self._process.kill()
 
     def log_tail(self) -> str:
-        """Return the last lines of its log."""
+        """Return the last lines that it wrote to its log."""
         try:
-            lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+            written = self.log.read_bytes()[self._log_start :]
         except OSError:
             return ""
+        lines = written.decode(errors="replace").splitlines()
         return "\n".join(lines[-TAIL_LINES:])
 
     def _read(self) -> None:

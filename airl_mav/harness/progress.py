@@ -28,9 +28,12 @@ _STYLE = {
 class RichObserver:
     """A progress bar over the episodes, a live line of the vehicle's state, a line per episode."""
 
-    def __init__(self, console: Console, episodes: int) -> None:
+    def __init__(self, console: Console, episodes: int, done: int = 0) -> None:
+        """Take where to draw, the number of all episodes, and of those that are there already."""
         self._console = console
-        self._episodes = episodes
+        self._episodes, self._done = episodes, done
+        self.finished_episodes = 0
+        """Number of those that have ended while it looked on."""
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
@@ -47,7 +50,9 @@ class RichObserver:
     def __enter__(self) -> RichObserver:
         """Start drawing."""
         self._progress.start()
-        self._task = self._progress.add_task("episodes", total=self._episodes, state="")
+        self._task = self._progress.add_task(
+            "episodes", total=self._episodes, completed=self._done, state=""
+        )
         return self
 
     def __exit__(
@@ -90,6 +95,7 @@ class RichObserver:
 
     def finished(self, record: EpisodeRecord) -> None:
         """Print an episode's line and advance the bar."""
+        self.finished_episodes += 1
         quality = record.quality
         figures = ""
         if quality is not None:
@@ -118,6 +124,10 @@ class RichObserver:
         self._console.file.flush()
         if self._task is not None:
             self._progress.advance(self._task)
+
+    def lost(self, what: str) -> None:
+        """Print what happened to an episode that begins again."""
+        self._say(f"  {what}")
 
     def _say(self, text: str) -> None:
         self._console.print(text, style="yellow", markup=False, highlight=False, soft_wrap=True)

@@ -1,44 +1,36 @@
-"""A rehearsal: two processes, N seeded episodes, one run folder."""
+"""A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
+
+An episode is saved when it has been flown whole. One that lost a process on the way is flown again
+by two new ones, from its seed: nothing of the lost one enters the records but a note.
+"""
 
 from __future__ import annotations
 
-import queue
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Collection, Sequence
+from typing import Protocol
 
 from airl_mav.channel import (
     Abort,
     Ended,
     Event,
-    Failed,
     FinishEpisode,
     Fly,
     Loaded,
     LoadEpisode,
     Progress,
-    Ready,
     Saved,
     State,
     Text,
 )
 from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Referee, Task, TruthSample, Verdict
 from airl_mav.flight.record import EpisodeRecord
+from airl_mav.harness.crew import COMPANION, FIRMWARE, Crew, LostError
 from airl_mav.harness.episode import Episode, Plan, save_episode
 from airl_mav.harness.following import TAKEOFF_LIMIT_S, Follower, Order
-from airl_mav.harness.process import Child, Exited
 from airl_mav.harness.run_folder import RunFolder
-
-FIRMWARE, COMPANION = "firmware", "companion"
-
-READY_TIMEOUT_S = 180.0
-"""The first start after an install compiles the kernels [wall s]."""
-
-REPLY_TIMEOUT_S = 30.0
-"""Longest wait for an answer of a healthy process [wall s]."""
+from airl_mav.harness.workers import TRIES
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""
@@ -75,78 +67,96 @@ class Observer(Protocol):
         """An episode has been saved."""
         ...
 
+    def lost(self, what: str) -> None:
+        """An episode was lost and begins again."""
+        ...
+
 
 class Rehearsal:
     """Runs a plan. Use as a context manager: whatever happens, both processes end."""
 
-    def __init__(self, plan: Plan, folder: RunFolder, observer: Observer) -> None:
+    def __init__(
+        self, plan: Plan, folder: RunFolder, observer: Observer, keeps: Sequence[int] = ()
+    ) -> None:
+        """Take the plan; nothing is started yet.
+
+        Args:
+            plan: What is flown.
+            folder: Where everything goes.
+            observer: Who looks on.
+            keeps: File descriptors that the processes inherit: locks.
+        """
         self._plan = plan
         self._folder = folder
         self._observer = observer
-        self._events: queue.Queue[tuple[str, Event | Exited]] = queue.Queue()
-        self._children: dict[str, Child] = {}
+        self._keeps = keeps
+        self._crew: Crew | None = None
 
     def __enter__(self) -> Rehearsal:
-        """Start both processes and wait until they are ready.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            RehearsalError: A process died or did not become ready in time.
-        """
-        try:
-            for name, plan in ((FIRMWARE, self._plan.firmware), (COMPANION, self._plan.companion)):
-                log = self._folder.path / f"{name}.log"
-                self._children[name] = Child(name, plan.module, plan.arguments, log, self._events)
-            self._observer.waiting("starting firmware and companion")
-            ready: set[str] = set()
-
-            def note(name: str, event: Event) -> bool:
-                if isinstance(event, Ready):
-                    ready.add(name)
-                if isinstance(event, Failed):
-                    raise UsageError(event.message)
-                return len(ready) == len(self._children)
-
-            self._pump(note, READY_TIMEOUT_S, "both processes to be ready")
-        except BaseException:
-            self._stop_children()
-            raise
+        """Return the rehearsal."""
         return self
 
     def __exit__(self, *_: object) -> None:
         """End both processes."""
-        self._stop_children()
+        self._dismiss()
 
-    def _stop_children(self) -> None:
-        try:
-            # The companion first: what it commands last is part of the flight.
-            for name in (COMPANION, FIRMWARE):
-                if name in self._children:
-                    self._children[name].stop()
-        except BaseException:
-            # A second Ctrl-C: no more patience, but nobody is left behind.
-            for child in self._children.values():
-                child.kill()
-            raise
+    def run(self, done: Collection[int] = ()) -> None:
+        """Fly the episodes; each is saved as it ends.
 
-    def run(self) -> None:
-        """Fly all episodes; each is saved as it ends.
+        Args:
+            done: Numbers of those that need not be flown.
 
         Raises:
-            RehearsalError: A process died. The running episode is saved as aborted, unless it was
-                the firmware, which holds its data.
+            UsageError: A process says that its input cannot be used.
+            RehearsalError: An episode was lost too often.
         """
         for index in range(self._plan.episodes):
-            self._fly(index)
+            if index not in done:
+                self._fly_surely(index)
+
+    def _fly_surely(self, index: int) -> None:
+        """Fly an episode; when it is lost, again with two new processes."""
+        flight = f"flight {index:03d}, seed {self._plan.seed + index}"
+        notes: list[str] = []
+        while True:
+            try:
+                self._fly(index, notes)
+            except LostError as error:
+                self._dismiss()
+                notes.append(f"flown again: {error.what}")
+                if len(notes) == TRIES:
+                    raise RehearsalError(f"{flight}: lost {TRIES} times; at last {error}") from None
+                self._observer.lost(f"{flight} begins again: {error}")
+            else:
+                return
+
+    def _present(self) -> Crew:
+        """Return the two processes; started when there are none."""
+        if self._crew is None:
+            # Known before it is started: who is interrupted meanwhile still ends it.
+            self._crew = crew = Crew()
+            self._observer.waiting("starting firmware and companion")
+            plan = self._plan
+            crew.start(plan.firmware, plan.companion, self._folder.path, self._keeps)
+        return self._crew
+
+    def _dismiss(self) -> None:
+        crew, self._crew = self._crew, None
+        if crew is not None:
+            crew.stop()
 
     # --- one episode
 
-    def _fly(self, index: int) -> None:
-        plan, folder = self._plan, self._folder
+    def _fly(self, index: int, notes: Sequence[str]) -> None:
+        """Fly an episode and save it. Raises LostError when it is none."""
+        crew, plan, folder = self._present(), self._plan, self._folder
         seed = plan.seed + index
         record_path = folder.path / f".episode-{index:03d}.npz"
         decisions_path = folder.path / f".decisions-{index:03d}.npz"
-        self._children[FIRMWARE].send(
+        for path in (record_path, decisions_path):
+            path.unlink(missing_ok=True)
+        crew.send(
+            FIRMWARE,
             LoadEpisode(
                 episode=index,
                 arena=plan.arena,
@@ -154,51 +164,45 @@ class Rehearsal:
                 seed=seed,
                 tlog=str(folder.tlog_path(index).absolute()),
                 record=str(record_path.absolute()),
-            )
+            ),
         )
-        loaded = self._wait_for(Loaded, REPLY_TIMEOUT_S)
+        loaded = crew.wait_for(Loaded, self._look)
         task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
         follower = Follower(Referee(task), loaded.time_us)
-        episode = Episode(index, seed, loaded, follower, WallClock())
+        episode = Episode(index, seed, loaded, follower, WallClock(), notes=list(notes))
         self._observer.episode(index, seed, loaded.goal)
-        self._children[COMPANION].send(
+        crew.send(
+            COMPANION,
             Fly(
                 episode=index,
                 goal=loaded.goal,
                 epoch_ns=loaded.epoch_ns,
                 latency_seed=seed,
                 record=str(decisions_path.absolute()),
-            )
+            ),
         )
         limit_s = (TAKEOFF_LIMIT_S + plan.time_limit_s + WRAP_UP_S) / plan.speed
-        broken: RehearsalError | None = None
         try:
-            self._pump(
-                lambda name, event: self._follow(episode, name, event), limit_s, "the flight"
-            )
-        except RehearsalError as error:
-            broken = error
-            now_us = episode.state.time_us if episode.state is not None else loaded.time_us
-            self._judge(episode, episode.referee.abort(now_us, str(error)))
-            if not self._firmware_lives():
+            crew.pump(lambda _, event: self._follow(crew, episode, event), limit_s, "the flight")
+        except LostError as error:
+            if not crew.lives(FIRMWARE):
                 raise
             # The firmware still flies. Whatever is wrong with the companion, its setpoints end
-            # here; see the failsafe through, then keep the data.
-            self._children[COMPANION].stop()
-            self._watch_failsafe(episode)
-            if not self._firmware_lives():
-                raise
-        self._children[FIRMWARE].send(FinishEpisode())
-        self._wait_for(Saved, REPLY_TIMEOUT_S)
-        self._save(episode, record_path, decisions_path)
-        if broken is not None:
-            raise broken
+            # here; see the failsafe through.
+            crew.stop_one(COMPANION)
+            seen = self._watch_failsafe(crew, episode)
+            raise LostError("; ".join((error.what, *seen)), error.detail) from None
+        if (reason := episode.separated) is not None:
+            raise LostError(f"firmware and companion lost each other ({reason})")
+        crew.send(FIRMWARE, FinishEpisode())
+        crew.wait_for(Saved, self._look)
+        self._observer.finished(save_episode(episode, plan, folder, record_path, decisions_path))
 
-    def _follow(self, episode: Episode, _name: str, event: Event) -> bool:
+    def _follow(self, crew: Crew, episode: Episode, event: Event) -> bool:
         """Take one event of a flight; True when it is over."""
         referee = episode.referee
         if isinstance(event, State):
-            self._see(episode, event)
+            self._see(crew, episode, event)
         elif isinstance(event, Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
@@ -215,7 +219,7 @@ class Rehearsal:
             return True
         return False
 
-    def _see(self, episode: Episode, state: State) -> None:
+    def _see(self, crew: Crew, episode: Episode, state: State) -> None:
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         judged = episode.referee.verdict is not None
@@ -226,7 +230,7 @@ class Rehearsal:
         if verdict is not None and not judged:
             self._judge(episode, verdict)
         if order is not None:
-            self._children[COMPANION].send(Abort(land=order is Order.LAND))
+            crew.send(COMPANION, Abort(land=order is Order.LAND))
 
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
@@ -234,76 +238,31 @@ class Rehearsal:
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
-    def _watch_failsafe(self, episode: Episode) -> None:
-        """The companion is gone: watch what the flight controller does, until it is down."""
+    def _watch_failsafe(self, crew: Crew, episode: Episode) -> list[str]:
+        """The companion is gone: watch what the flight controller does, until it is down.
+
+        Returns:
+            What the autopilot said.
+        """
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
+        said: list[str] = []
 
         def down(_name: str, event: Event) -> bool:
             if isinstance(event, Text):
                 self._observer.text(event)
-                episode.notes.append(f"autopilot at {event.time_us / US_PER_S:.2f} s: {event.text}")
+                said.append(f"autopilot at {event.time_us / US_PER_S:.2f} s: {event.text}")
             if isinstance(event, State):
-                episode.state = event
                 self._observer.state(event, episode.loaded.time_us)
                 return not event.armed
             return False
 
         try:
-            self._pump(down, WRAP_UP_S / self._plan.speed, "the vehicle to come down")
-        except RehearsalError as error:
-            episode.notes.append(str(error))
+            crew.pump(down, WRAP_UP_S / self._plan.speed, "the vehicle to come down")
+        except LostError as error:
+            said.append(error.what)
+        return said
 
-    def _save(self, episode: Episode, record_path: Path, decisions_path: Path) -> None:
-        record = save_episode(episode, self._plan, self._folder, record_path, decisions_path)
-        self._observer.finished(record)
-
-    # --- events
-
-    def _firmware_lives(self) -> bool:
-        return not self._children[FIRMWARE].ending
-
-    def _wait_for(self, kind: type[Any], timeout_s: float) -> Any:
-        found: list[Any] = []
-
-        def look(_name: str, event: Event) -> bool:
-            if isinstance(event, Text):
-                self._observer.text(event)
-            if isinstance(event, kind):
-                found.append(event)
-            return bool(found)
-
-        self._pump(look, timeout_s, f"the event {kind.__name__!r}")
-        return found[0]
-
-    def _pump(self, take: Callable[[str, Event], bool], timeout_s: float, what: str) -> None:
-        """Feed events to `take` until it returns True.
-
-        Raises:
-            RehearsalError: A process died or failed, or the time is over.
-        """
-        deadline = WallClock()
-        while True:
-            left_s = timeout_s - deadline.time_us() / US_PER_S
-            if left_s <= 0.0:
-                raise RehearsalError(f"gave up waiting for {what} after {timeout_s:.0f} s")
-            try:
-                # Short waits, so that Ctrl-C is seen at once on every platform.
-                name, event = self._events.get(timeout=min(left_s, 0.2))
-            except queue.Empty:
-                continue
-            if isinstance(event, Exited):
-                self._died(name, event)
-            elif take(name, event):
-                return
-            elif isinstance(event, Failed):
-                self._children[name].ending = True
-                raise RehearsalError(f"{name}: {event.message}")
-
-    def _died(self, name: str, exited: Exited) -> None:
-        child = self._children[name]
-        if child.ending:
-            return
-        child.ending = True
-        tail = child.log_tail()
-        detail = f"\n{tail}" if tail else ""
-        raise RehearsalError(f"the {name} process died: {exited} (log: {child.log}){detail}")
+    def _look(self, event: Event) -> None:
+        """Take an event that nobody waits for."""
+        if isinstance(event, Text):
+            self._observer.text(event)

@@ -11,7 +11,7 @@ import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -138,9 +138,7 @@ class RunFolder:
             machine=describe_machine(),
             git=git_state(),
         )
-        plain = _INFO.dump_python(info, mode="json")
-        text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-        replace_file(path / RUN_FILE, text.encode())
+        _write_info(path / RUN_FILE, info)
         return cls(path)
 
     @classmethod
@@ -153,6 +151,11 @@ class RunFolder:
             if (whole := data.rfind(b"\n") + 1) != len(data):
                 os.truncate(lines, whole)
         return cls(path), run
+
+    def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
+        """Replace the settings and the seeds that are planned, in `run.json`."""
+        path = self.path / RUN_FILE
+        _write_info(path, replace(_load_info(path), config=dict(config), seeds=tuple(seeds)))
 
     def tlog_path(self, index: int) -> Path:
         """Return the path of an episode's raw MAVLink log."""
@@ -216,6 +219,13 @@ def load(path: Path) -> LoadedRun:
         raise UsageError(f"{path / TRAJECTORIES_FILE}: {error}") from None
     latency = {i: arrays for i, arrays in stamps.items() if i in done}
     return LoadedRun(path, info, episodes, latency, trajectories)
+
+
+def _write_info(path: Path, info: RunInfo) -> None:
+    """Write `run.json`."""
+    plain = _INFO.dump_python(info, mode="json")
+    text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    replace_file(path, text.encode())
 
 
 def _load_info(path: Path) -> RunInfo:

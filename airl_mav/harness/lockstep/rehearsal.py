@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from airl_mav.channel import Text
+from airl_mav.harness.evaluation import Job
 from airl_mav.harness.lockstep.flight import LockstepPlan, Watching, fly
 from airl_mav.harness.rehearsal import Observer
 from airl_mav.harness.run_folder import RunFolder
@@ -19,16 +20,16 @@ SHOW_EVERY = 125
 
 def rehearse(
     plan: LockstepPlan,
-    seeds: list[int],
+    jobs: Sequence[Job],
     fresh_policy: Callable[[int], Policy],
     folder: RunFolder,
     observer: Observer,
 ) -> None:
-    """Fly all episodes; each is saved as it ends.
+    """Fly episodes; each is saved as it ends.
 
     Args:
         plan: What is flown on what.
-        seeds: Of each episode, by index.
+        jobs: The episodes.
         fresh_policy: Gives the policy as it begins a flight with a seed.
         folder: Where everything goes.
         observer: Who looks on.
@@ -37,14 +38,14 @@ def rehearse(
         UsageError: The policy cannot use the camera; no arena can be made of a seed.
         LockstepError: The companion hangs, or broke.
     """
-    for index, seed in enumerate(seeds):
+    for job in jobs:
         flown = fly(
             plan,
-            fresh_policy(seed),
-            index,
-            seed,
-            tlog=folder.tlog_path(index),
-            watching=_watching(observer, index, seed),
+            fresh_policy(job.seed),
+            job.index,
+            job.seed,
+            tlog=folder.tlog_path(job.index),
+            watching=_watching(observer, job.index, job.seed),
         )
         folder.save_episodes([flown])
         observer.finished(flown.record)
