@@ -11,6 +11,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
+from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Circle
@@ -45,7 +46,11 @@ SHEET_COLUMNS = 3
 LONG_TAIL = 30.0
 """A maximum this many times the median: the axis becomes logarithmic."""
 PATH_SEGMENTS = 500
-"""A drawn path has at most this many coloured pieces: more are not seen, and weigh."""
+"""A drawn path has at most this many corners: more are not seen, and weigh."""
+TIME_POINTS = 500
+"""A line over time has at most this many corners."""
+PATH_COLOURS = 24
+"""Steps of a path's colour: neighbours of one step are one line."""
 
 OUTCOME_COLOURS = {
     Outcome.SUCCESS: "#1b8a3f",
@@ -121,7 +126,7 @@ def _draw_latency(
     bottom.set_yticks([0, 50, 100])
     bottom.set_ylim(0, 104)
     bottom.set_xlabel(f"ms, n = {summary.n:,}", fontsize=8.5, color=MUTED)
-    if _long_tail(values):
+    if long_tail(values):
         bottom.set_xscale("log")
         bottom.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         bottom.xaxis.set_minor_formatter(NullFormatter())
@@ -131,7 +136,7 @@ def _draw_latency(
         quiet(ax)
 
 
-def _long_tail(values: NDArray[np.float64]) -> bool:
+def long_tail(values: NDArray[np.float64]) -> bool:
     """Return whether sorted values call for a logarithmic axis."""
     return bool(values[0] > 0.0 and values[-1] > LONG_TAIL * np.median(values))
 
@@ -143,7 +148,7 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
     """
     bins = int(np.clip(2.0 * math.sqrt(len(values)), 12, 40)) | 1
     low, high = float(values[0]), float(values[-1])
-    if _long_tail(values):
+    if long_tail(values):
         return [float(edge) for edge in np.geomspace(low, high, bins + 1)]
     # One duration only, as in lockstep, still needs a width.
     pad = 0.03 * (high - low) if high > low else max(0.1 * abs(high), 0.001)
@@ -221,15 +226,16 @@ def _draw_path(
     colours = speed_colours()
     scale = Normalize(0.0, top_speed)
     ax.plot(*points.T, color=HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
+    pieces, levels = coloured_pieces(points, 0.5 * (speed[1:] + speed[:-1]), top_speed)
     path = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)),
+        pieces,
         cmap=colours,
         norm=scale,
         linewidths=2.2,
         capstyle="round",
         zorder=2.6,
     )
-    path.set_array(0.5 * (speed[1:] + speed[:-1]))
+    path.set_array(levels)
     ax.add_collection(path)
     outcome = episode.outcome
     ax.plot(
@@ -244,6 +250,11 @@ def _draw_path(
         label=f"end: {OUTCOME_WORDS[outcome]}",
     )
     bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, shrink=0.45, aspect=26, pad=0.015)
+    speed_bar(bar)
+
+
+def speed_bar(bar: Colorbar) -> None:
+    """Style the colour scale of a path."""
     if bar.solids is not None:
         # 256 colour steps weigh less as pixels than as shapes.
         bar.solids.set_rasterized(True)
@@ -252,16 +263,43 @@ def _draw_path(
     bar.ax.tick_params(colors=MUTED, labelsize=8, length=0)
 
 
+def coloured_pieces(
+    points: NDArray[np.float64], values: NDArray[np.float64], top: float
+) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+    """Cut a line where its colour changes.
+
+    Args:
+        points: (n, 2) its corners, n >= 2.
+        values: (n - 1,) value of each segment.
+        top: Value at the upper end of the colour scale, which begins at 0.
+
+    Returns:
+        The pieces, each (k, 2), which share their ends; and the value of each.
+    """
+    step = top / PATH_COLOURS
+    levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)
+    cuts = np.flatnonzero(np.diff(levels)) + 1
+    starts, ends = [0, *cuts], [*cuts, len(values)]
+    pieces = [points[start : end + 1] for start, end in zip(starts, ends, strict=True)]
+    return pieces, (levels[np.array(starts)] + 0.5) * step
+
+
 def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
     """Draw speed, altitude and power over time, zero where navigation begins."""
     figure = new_figure(5.2, 4.9)
     zero_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
-    t = (trajectory.time_us - zero_us) / US_PER_S
+    keep = np.unique(np.linspace(0, len(trajectory) - 1, TIME_POINTS).astype(int))
+    # Power is a mean since the sample before: so it stays when samples are left out.
+    steps_us = np.diff(trajectory.time_us, prepend=trajectory.time_us[0] - 1)
+    energy = np.cumsum(trajectory.power_w * steps_us)
+    passed_us = trajectory.time_us[keep] - trajectory.time_us[0] + 1
+    power = np.diff(energy[keep], prepend=0.0) / np.diff(passed_us, prepend=0)
+    t = (trajectory.time_us[keep] - zero_us) / US_PER_S
     rows: tuple[tuple[Any, str, NDArray[np.float64]], ...] = tuple(
         zip(
             figure.subplots(3, 1, sharex=True),
             ("speed [m/s]", "altitude [m]", "power [W]"),
-            (trajectory.speed(), -trajectory.position[:, 2], trajectory.power_w),
+            (trajectory.speed()[keep], -trajectory.position[keep, 2], power),
             strict=True,
         )
     )

@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.atomic import replace_file
+from airl_mav.flight.evidence import Cause
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
-from airl_mav.flight.trajectory import Trajectory
 from airl_mav.harness.run_folder import LoadedRun, RunInfo
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.report.ages import ages_table, run_ages
+from airl_mav.report.energy import (
+    energy_figure,
+    energy_flights_table,
+    energy_table,
+    flight_energies,
+)
 from airl_mav.report.figures import latency_figure, latency_overview, map_figure, time_figure
 from airl_mav.report.overview import overview_figure
+from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json
+from airl_mav.report.scene_figure import scene_figure
 from airl_mav.report.summary import RunSummary, summarize_run
 from airl_mav.report.tables import (
     NONE,
     ORIGIN_WORDS,
     OUTCOME_WORDS,
     episodes_table,
-    failures_first,
     latency_table,
     ms,
     quality_table,
@@ -32,11 +43,13 @@ from airl_mav.report.tables import (
     setup_rows,
 )
 from airl_mav.report.theme import Picture
+from airl_mav.report.timeline import RULE_WORDS, slowest_table, timeline_figure, timeline_of
+from airl_mav.report.worst import causes_table, flown_path, judge_worst, ranked, worst_table
 
 REPORT_FILE = "report.html"
 
 MAX_PICTURED = 12
-"""Flights with pictures: those that failed first."""
+"""Flights with pictures: the worst."""
 
 MAX_LISTED = 200
 """Flights in the table: those that failed first."""
@@ -51,8 +64,11 @@ class Flight:
     outcome: str
     words: str
     reason: str
+    cause: Cause | None
     notes: tuple[str, ...]
     pictures: tuple[Picture, ...]
+    scene: int | None
+    """Its number in the view in three dimensions; None where it has no path."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +81,20 @@ class Headline:
     detail: str
 
 
-def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None = None) -> Path:
+def build_report(
+    run: LoadedRun,
+    arenas: Mapping[int, Arena],
+    out: Path | None = None,
+    *,
+    vehicle: VehicleProfile | None = None,
+) -> Path:
     """Write `report.html` and the PNG files, each one whole or not at all.
 
     Args:
         run: The run, as `run_folder.load` returns it.
         arenas: The arena of each episode, by episode index; a flight without one is drawn without.
         out: Folder to write into; None is the run's own.
+        vehicle: What flew; without it the energy has fewer parts, and the causes say less.
 
     Returns:
         The path of the page.
@@ -79,19 +102,25 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
     folder = out or run.path
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize_run(run)
-    measured = [
-        (stage, summary.samples[stage.key], summary.stages[stage.key])
-        for stage in summary.shown_stages
-        if summary.stages[stage.key].n
-    ]
-    latency_pictures = [latency_figure(*part) for part in measured]
-    if measured:
-        replace_file(folder / "latency.png", latency_overview(measured))
+    measured = [stage for stage in summary.shown_stages if summary.stages[stage.key].n]
+    samples = [(s, summary.samples[s.key], summary.stages[s.key]) for s in measured]
+    if samples:
+        replace_file(folder / "latency.png", latency_overview(samples))
+    decisions = timeline_of(run)
+    timeline = timeline_figure(decisions, measured) if measured and len(decisions) else None
+    energies = flight_energies(run, None if vehicle is None else vehicle.power)
+    energy = energy_figure(energies) if energies else None
     overview = overview_figure(run, arenas) if needs_overview(run) else None
-    flights = _flights(run, arenas)
+    judged = judge_worst(run, arenas, vehicle)
+    shown = _shown(run, arenas)
+    flights = _flights(run, arenas, shown, {j.record.index: j.cause for j in judged})
+    solid = scene_figure(shown[0], _top_speed(shown)) if shown else None
+    alone = [overview, timeline, energy, solid]
     pictures = [picture for flight in flights for picture in flight.pictures]
-    for picture in [*pictures, *([overview] if overview else [])]:
+    for picture in [*pictures, *(picture for picture in alone if picture)]:
         replace_file(folder / f"{picture.name}.png", picture.png)
+    everyone = ranked(run)[:ALL_FLIGHTS]
+    fov = 0.0 if vehicle is None else vehicle.camera.horizontal_fov_deg
     page = (
         environment()
         .get_template("report.html.j2")
@@ -107,14 +136,29 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
             headlines=_headlines(run, summary),
             origin=ORIGIN_WORDS[run.info.setup.injection.origin],
             setup=setup_rows(run),
-            latency=latency_table(summary),
             quality=quality_table(summary),
-            episodes=episodes_table(run, MAX_LISTED),
             real_time=real_time_table(run, summary) if summary.timed else None,
-            latency_pictures=latency_pictures,
             overview=overview,
+            worst=worst_table(judged, len(run.episodes)) if judged else None,
+            causes=causes_table(judged, run),
+            scene_picture=solid,
+            scene_flights=[(k, flight) for k, flight in enumerate(shown)],
+            scene_all=len(everyone),
+            scene_data=Markup(scene_json(run, shown, everyone, fov)),  # noqa: S704 - escaped there
+            scene_script=Markup(_script("scene.js")),  # noqa: S704 - our own
+            energy=energy,
+            energy_table=energy_table(energies) if energies else None,
+            energy_flights=energy_flights_table(energies, MAX_LISTED) if energies else None,
+            latency=latency_table(summary),
+            ages=ages_table(run_ages(run), summary.stages["end_to_end"]),
+            latency_pictures=[latency_figure(*part) for part in samples],
+            timeline=timeline,
+            timeline_rule=RULE_WORDS,
+            slowest=slowest_table(decisions, measured) if len(decisions) else None,
+            episodes=episodes_table(run, MAX_LISTED),
             flights=flights,
             flown=len(run.episodes),
+            outcome_words=OUTCOME_WORDS,
             outcome_keys={words: outcome.value for outcome, words in OUTCOME_WORDS.items()},
             configuration=json.dumps(run.info.config, indent=2, ensure_ascii=False),
             provenance=provenance(run.info),
@@ -126,8 +170,8 @@ def build_report(run: LoadedRun, arenas: Mapping[int, Arena], out: Path | None =
 
 
 def pictured(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the episodes that get pictures, in the order they were flown."""
-    return failures_first(run.episodes, MAX_PICTURED)
+    """Return the episodes that get pictures, the worst first."""
+    return ranked(run)[:MAX_PICTURED]
 
 
 def needs_overview(run: LoadedRun) -> bool:
@@ -147,38 +191,56 @@ def environment() -> Environment:
     )
 
 
-def _flights(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[Flight]:
-    """Draw the flights that get pictures, in the order they were flown."""
-    chosen = pictured(run)
-    # Up to the verdict: what is recorded after it is the landing.
-    paths = {
-        episode.index: path.between(int(path.time_us[0]), episode.ended_us)
-        for episode in chosen
-        if (path := run.trajectories.get(episode.index)) is not None and len(path)
-    }
-    top_speed = max((float(path.speed().max(initial=0.0)) for path in paths.values()), default=0.0)
+def _script(name: str) -> str:
+    """Return a script of the page, which travels with the templates."""
+    return (files("airl_mav.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _shown(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[SceneFlight]:
+    """Return the flights with pictures that have a path, the worst first."""
+    paths = [(episode, flown_path(run, episode)) for episode in pictured(run)]
     return [
-        _flight(episode, paths.get(episode.index), arenas.get(episode.index), top_speed or 1.0)
-        for episode in chosen
+        SceneFlight(episode, path, arenas.get(episode.index))
+        for episode, path in paths
+        if path is not None and len(path) > 1
     ]
 
 
-def _flight(
-    episode: EpisodeRecord, path: Trajectory | None, arena: Arena | None, top_speed: float
-) -> Flight:
-    """Draw one flight."""
-    pictures = [map_figure(episode, path, arena, top_speed)]
-    if path is not None and len(path) > 1:
-        pictures.append(time_figure(episode, path))
-    return Flight(
-        index=episode.index,
-        seed=episode.seed,
-        outcome=episode.outcome.value,
-        words=OUTCOME_WORDS[episode.outcome],
-        reason=episode.reason,
-        notes=episode.notes,
-        pictures=tuple(pictures),
-    )
+def _top_speed(shown: Sequence[SceneFlight]) -> float:
+    """Return the upper end of the colour scale of all paths [m/s]."""
+    return max((float(flight.path.speed().max()) for flight in shown), default=0.0) or 1.0
+
+
+def _flights(
+    run: LoadedRun,
+    arenas: Mapping[int, Arena],
+    shown: Sequence[SceneFlight],
+    causes: Mapping[int, Cause],
+) -> list[Flight]:
+    """Draw the flights that get pictures, the worst first."""
+    numbers = {flight.record.index: k for k, flight in enumerate(shown)}
+    top_speed = _top_speed(shown)
+    flights = []
+    for episode in pictured(run):
+        number = numbers.get(episode.index)
+        path = None if number is None else shown[number].path
+        pictures = [map_figure(episode, path, arenas.get(episode.index), top_speed)]
+        if path is not None:
+            pictures.append(time_figure(episode, path))
+        flights.append(
+            Flight(
+                index=episode.index,
+                seed=episode.seed,
+                outcome=episode.outcome.value,
+                words=OUTCOME_WORDS[episode.outcome],
+                reason=episode.reason,
+                cause=causes.get(episode.index),
+                notes=episode.notes,
+                pictures=tuple(pictures),
+                scene=number,
+            )
+        )
+    return flights
 
 
 def _headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:

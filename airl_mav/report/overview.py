@@ -58,18 +58,18 @@ def overview_figure(run: LoadedRun, arenas: Mapping[int, Arena]) -> Picture:
     if alone and first is not None:
         draw_arena(first, ax, goal_radius_m=run.episodes[0].goal_radius_m)
     else:
-        _draw_ground(ax, b)
+        draw_ground(ax, b)
     # What went wrong lies on top.
     ranked = sorted(run.episodes, key=lambda episode: episode.outcome is not Outcome.SUCCESS)
     for outcome in dict.fromkeys(episode.outcome for episode in ranked):
         flights = [episode for episode in ranked if episode.outcome is outcome]
-        _draw_paths(ax, outcome, flights, run.trajectories)
-    _draw_goals(ax, run.episodes)
+        draw_paths(ax, outcome, flights, run.trajectories)
+    draw_goals(ax, run.episodes)
     quiet(ax, grid=False)
     for label in (ax.xaxis.label, ax.yaxis.label):
         label.set(color=MUTED, fontsize=8.5)
     figure.legend(
-        handles=_legend(run.episodes),
+        handles=outcome_legend(run.episodes),
         loc="outside lower left",
         ncols=4,
         frameon=False,
@@ -82,7 +82,7 @@ def overview_figure(run: LoadedRun, arenas: Mapping[int, Arena]) -> Picture:
     return render(figure, OVERVIEW_NAME, alt)
 
 
-def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
+def draw_ground(ax: Axes, bounds: Bounds | None) -> None:
     """Draw floor and start; the walls' place is known where all arenas share it."""
     if bounds is not None:
         b = bounds
@@ -100,7 +100,7 @@ def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
     ax.plot(0.0, 0.0, marker="^", ms=10, color=START_COLOUR, mec="white", mew=0.8, zorder=5)
 
 
-def _draw_paths(
+def draw_paths(
     ax: Axes,
     outcome: Outcome,
     flights: Sequence[EpisodeRecord],
@@ -110,7 +110,7 @@ def _draw_paths(
     failed = outcome is not Outcome.SUCCESS
     colour = OUTCOME_COLOURS[outcome]
     lines = [
-        _points(paths[flight.index], flight.ended_us)
+        path_points(paths[flight.index], flight.ended_us)
         for flight in flights
         if flight.index in paths and len(paths[flight.index]) > 1
     ]
@@ -130,7 +130,7 @@ def _draw_paths(
         _mark(ax, ends, marker=OUTCOME_MARKERS[outcome], s=34, color=colour, zorder=4.5)
 
 
-def _draw_goals(ax: Axes, episodes: Sequence[EpisodeRecord]) -> None:
+def draw_goals(ax: Axes, episodes: Sequence[EpisodeRecord]) -> None:
     """Draw where the flights had to go."""
     goals = np.array([(episode.goal[1], episode.goal[0]) for episode in episodes])
     strength = _strength(len(goals))
@@ -147,7 +147,7 @@ def _mark(ax: Axes, points: NDArray[np.float64], **look: Any) -> PathCollection:
     return ax.scatter(*points.T, edgecolors="white", linewidths=0.6, rasterized=True, **look)
 
 
-def _points(path: Trajectory, ended_us: int) -> NDArray[np.float64]:
+def path_points(path: Trajectory, ended_us: int) -> NDArray[np.float64]:
     """Return some points (k, 2), east and north, of a path up to the verdict."""
     inside = np.flatnonzero(path.time_us <= ended_us)
     keep = np.unique(np.linspace(0, len(inside) - 1, min(len(inside), PATH_POINTS)).astype(int))
@@ -155,7 +155,7 @@ def _points(path: Trajectory, ended_us: int) -> NDArray[np.float64]:
     return points
 
 
-def _legend(episodes: Sequence[EpisodeRecord]) -> list[Line2D]:
+def outcome_legend(episodes: Sequence[EpisodeRecord]) -> list[Line2D]:
     """Return the legend: how many flights ended how."""
     handles = [
         Line2D([], [], ls="none", marker="^", ms=8, color=START_COLOUR, label="start"),

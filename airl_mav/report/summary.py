@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 
 from airl_mav.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.statistics import Aggregate, aggregate
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import Aggregate, Estimate, aggregate, median_of
 from airl_mav.harness.run_folder import TICK_LATENESS, LoadedRun
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
@@ -29,6 +31,9 @@ MODELLED_STAGES = tuple(
     if stage.key not in ("send", "control")
 )
 """Level gym sends in no time, and has link and control in one."""
+
+MEASURES = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "mean_speed_m_s")
+"""Fields of a flight's quality that have a mean and a median."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,8 @@ class RunSummary:
     samples: dict[str, Samples]
     """Raw durations behind them [µs]."""
     quality: Aggregate
+    medians: dict[str, Estimate]
+    """Of the same flights as the means of `quality`, by its field."""
     real_time: RealTime
     modelled: bool
     """Times come from a model and were not measured: level gym."""
@@ -79,10 +86,17 @@ def summarize_run(run: LoadedRun) -> RunSummary:
         stages=stages,
         samples=samples,
         quality=aggregate(run.episodes),
+        medians=_medians(run.episodes),
         real_time=_real_time(run, stages),
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
     )
+
+
+def _medians(episodes: Sequence[EpisodeRecord]) -> dict[str, Estimate]:
+    """Return the medians of the flights that reached the goal."""
+    good = [e.quality for e in episodes if e.outcome is Outcome.SUCCESS and e.quality is not None]
+    return {name: median_of([getattr(quality, name) for quality in good]) for name in MEASURES}
 
 
 def _real_time(run: LoadedRun, stages: dict[str, Summary]) -> RealTime:

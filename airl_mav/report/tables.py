@@ -186,24 +186,31 @@ def quality_table(summary: RunSummary) -> TableView:
         Column("measure", number=False),
         Column("value"),
         Column("95 % interval"),
+        Column("median"),
+        Column("95 % interval", page_only=True),
         Column("n"),
     )
-    q = summary.quality
-    rows = (
-        _estimate_row("success rate", "%", q.success_rate, 100.0, rate_digits(q.success_rate)),
-        _estimate_row("flight time", "s", q.flight_time_s, 1.0, 2),
-        _estimate_row("distance", "m", q.distance_m, 1.0, 2),
-        _estimate_row("energy, vehicle", "kJ", q.energy_j, 1e-3, 2),
-        _estimate_row("energy, computer", "J", q.computer_energy_j, 1.0, 0),
-        _estimate_row("mean speed", "m/s", q.mean_speed_m_s, 1.0, 2),
+    q, nothing = summary.quality, Estimate(None, None, None, 0)
+    measures = (
+        ("flight time", "s", "flight_time_s", 1.0, 2),
+        ("distance", "m", "distance_m", 1.0, 2),
+        ("energy, vehicle", "kJ", "energy_j", 1e-3, 2),
+        ("energy, computer", "J", "computer_energy_j", 1.0, 0),
+        ("mean speed", "m/s", "mean_speed_m_s", 1.0, 2),
     )
+    digits = rate_digits(q.success_rate)
+    rows = [_estimate_row("success rate", "%", q.success_rate, nothing, 100.0, digits)]
+    for title, unit, name, scale, places in measures:
+        mean = getattr(q, name)
+        rows.append(_estimate_row(title, unit, mean, summary.medians[name], scale, places))
     notes = [
-        "Means over the flights that reached the goal; n is their number (for the success rate: "
-        "all flights but aborted ones). Intervals: Wilson for the rate, bootstrap for the means."
+        "Means and medians over the flights that reached the goal; n is their number (for the "
+        "success rate: all flights but aborted ones). Intervals: Wilson for the rate, bootstrap "
+        "for the means, binomial for the medians."
     ]
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
-    return TableView("quality", "Quality of flight", columns, rows, tuple(notes))
+    return TableView("quality", "Quality of flight", columns, tuple(rows), tuple(notes))
 
 
 def rate_digits(rate: Estimate) -> int:
@@ -218,16 +225,19 @@ def outcomes_in_words(summary: RunSummary) -> str:
 
 
 def _estimate_row(
-    title: str, unit: str, estimate: Estimate, scale: float, digits: int
+    title: str, unit: str, estimate: Estimate, median: Estimate, scale: float, digits: int
 ) -> tuple[str, ...]:
     """Return an estimate's cells."""
 
     def show(value: float | None) -> str:
         return NONE if value is None else f"{scale * value:,.{digits}f}"
 
-    interval = NONE if estimate.low is None else f"{show(estimate.low)} … {show(estimate.high)}"
+    def interval(of: Estimate) -> str:
+        return NONE if of.low is None else f"{show(of.low)} … {show(of.high)}"
+
     value = NONE if estimate.value is None else f"{show(estimate.value)} {unit}"
-    return title, value, interval, f"{estimate.n}"
+    middle = show(median.value), interval(median)
+    return title, value, interval(estimate), *middle, f"{estimate.n}"
 
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
 
@@ -54,6 +55,12 @@ DARK = {
 
 PNG_DPI = 160
 SVG_DPI = 120
+_PATH = re.compile(r'\b(?:d|x|y)="[^"]*"')
+# Places on the figure to a tenth of a point; markers, which are small, to a hundredth.
+_DECIMALS = re.compile(r"(?<=\d)(\d\.\d)\d+|(\.\d\d)\d+")
+_BITMAP = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=\s]+)")
+BITMAP_COLOURS = 128
+"""Colours of a bitmap inside a figure: more are not seen, and weigh."""
 _FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
 
 
@@ -86,7 +93,7 @@ def render(figure: Figure, name: str, alt: str) -> Picture:
     svg = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(svg, format="svg", dpi=SVG_DPI, metadata={"Date": None, "Creator": None})
-    return Picture(name, alt, themed(svg.getvalue()), png)
+    return Picture(name, alt, themed(slim(svg.getvalue())), png)
 
 
 def render_png(figure: Figure) -> bytes:
@@ -98,6 +105,21 @@ def render_png(figure: Figure) -> bytes:
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=PNG_DPI)
     return png.getvalue()
+
+
+def slim(svg: str) -> str:
+    """Return an SVG that weighs less: places of no more digits than are seen, few colours."""
+    svg = _PATH.sub(lambda found: _DECIMALS.sub(r"\1\2", found[0]), svg)
+    return _BITMAP.sub(lambda found: found[1] + _with_palette(found[2]), svg)
+
+
+def _with_palette(encoded: str) -> str:
+    """Return a PNG, in base64, with few colours."""
+    small = io.BytesIO()
+    with Image.open(io.BytesIO(base64.b64decode(encoded))) as image:
+        few = image.convert("RGBA").quantize(BITMAP_COLOURS, method=Image.Quantize.FASTOCTREE)
+        few.save(small, format="png", optimize=True)
+    return base64.b64encode(small.getvalue()).decode()
 
 
 def themed(svg: str) -> str:

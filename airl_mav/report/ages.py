@@ -1,0 +1,80 @@
+"""How old the flown command was, by time: what percentiles over decisions leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.latency.omission import CommandAges, command_ages
+from airl_mav.latency.percentiles import Summary
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.tables import Column, TableView, ms, percentile_cell
+
+
+def run_ages(run: LoadedRun) -> CommandAges:
+    """Return how old the commands of a run were while they were flown.
+
+    From the frame that a command rests on to the motors, and on until the next command's motors.
+    """
+    seen: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+    flown, flight = list(seen), list(seen)
+    for number, stamps in sorted(run.latency.items()):
+        frames, motors = _acted(stamps)
+        seen.append(frames)
+        flown.append(motors)
+        flight.append(np.full(len(frames), number, np.int64))
+    return command_ages(np.concatenate(seen), np.concatenate(flown), np.concatenate(flight))
+
+
+def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return frame and motor time of the decisions of an episode that have both [µs]."""
+    nothing: NDArray[np.int64] = np.zeros(0, np.int64)
+    if "capture_us" not in stamps or "motor_us" not in stamps:
+        return nothing, nothing
+    frames, motors = stamps["capture_us"], stamps["motor_us"]
+    both = (frames != NO_STAMP) & (motors != NO_STAMP)
+    return frames[both].astype(np.int64), motors[both].astype(np.int64)
+
+
+def ages_table(ages: CommandAges, end_to_end: Summary) -> TableView | None:
+    """Return the age of the flown command beside the latency that it begins with.
+
+    None where no command was followed by another.
+    """
+    n = ages.youngest_us.size
+    if not n or not ages.time_us:
+        return None
+    columns = (
+        Column("how old the flown command was", number=False),
+        Column("n"),
+        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+    )
+    s = end_to_end
+    rows = (
+        (
+            "as it took effect, by decision",
+            f"{s.n:,}",
+            ms(s.mean),
+            ms(s.p50),
+            percentile_cell(s.p90, s.n),
+            percentile_cell(s.p99, s.n),
+            ms(s.max),
+        ),
+        (
+            "at any moment, by time",
+            f"{n:,}",
+            ms(ages.mean),
+            *(percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
+            ms(float(ages.oldest_us.max())),
+        ),
+    )
+    notes = (
+        "A command ages until the next one moves the motors. By decision a stall is one sample, "
+        "however long it lasts; by time it weighs what the vehicle flew of it (coordinated "
+        "omission).",
+    )
+    return TableView("ages", "Age of the flown command", columns, rows, notes)

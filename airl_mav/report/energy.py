@@ -1,0 +1,215 @@
+"""Where the energy went, as a figure and as tables: the airframe's parts and the computer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from airl_mav.flight.energy import EnergySplit, add_up, split_energy
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.profiles.vehicle import Power
+from airl_mav.report.figures import quiet
+from airl_mav.report.tables import NONE, OUTCOME_WORDS, Column, TableView, failures_first
+from airl_mav.report.theme import INK, MARK, MUTED, SERIES, SERIES_SOFT, Picture, new_figure, render
+
+ENERGY_NAME = "energy"
+
+COMPUTER_COLOUR = "#a35bb8"
+"""Of middling lightness: legible on light and on dark paper."""
+
+BARS = 60
+"""Up to this many flights have a bar each; more of them are sorted by their energy."""
+
+RANKS = 160
+"""Of more flights so many are drawn, evenly over the order."""
+
+HIGH = 2.0
+"""Flights with more than this times the 95th percentile would press all others flat: cut off."""
+
+PARTS = (
+    ("hover_j", "hovering", SERIES),
+    ("manoeuvre_j", "manoeuvres", MARK),
+    ("motion_j", "speed", SERIES_SOFT),
+    ("computer_j", "computer", COMPUTER_COLOUR),
+)
+
+
+@dataclass(frozen=True)
+class FlightEnergy:
+    """One flight's energy, from the start of navigation."""
+
+    record: EpisodeRecord
+    airframe_j: float
+    computer_j: float
+    parts: EnergySplit | None
+    """None where the vehicle's power model or the recording is missing."""
+
+
+def flight_energies(run: LoadedRun, power: Power | None) -> list[FlightEnergy]:
+    """Return the energies of all flights that navigated, in the order flown.
+
+    Args:
+        run: The run.
+        power: The vehicle's power model; None leaves the airframe's energy whole.
+    """
+    watts = run.info.setup.computer_watts
+    flights = []
+    for e in run.episodes:
+        if e.quality is None or e.navigation_us is None or e.outcome is Outcome.ABORTED:
+            continue
+        path = run.trajectories.get(e.index)
+        parts = (
+            None
+            if path is None or power is None or len(path) < 2
+            else split_energy(path, e.navigation_us, e.ended_us, power, watts)
+        )
+        q = e.quality
+        flights.append(FlightEnergy(e, q.energy_j, q.computer_energy_j, parts))
+    return flights
+
+
+def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
+    """Return the energy of all flights (at least one) together, by part."""
+    columns = (
+        Column("part", number=False),
+        Column("all flights", "kJ"),
+        Column("share", "%"),
+        Column("mean power", "W"),
+    )
+    time_s = sum(f.record.quality.flight_time_s for f in flights if f.record.quality is not None)
+    airframe = sum(f.airframe_j for f in flights)
+    computer = sum(f.computer_j for f in flights)
+    whole = airframe + computer
+    splits = [f.parts for f in flights if f.parts is not None]
+    lines = [("airframe", airframe)]
+    notes = [
+        f"{len(flights):,} flights, from the start of navigation, failed ones included. Computer: "
+        "its watts times the flight time."
+    ]
+    if splits and len(splits) == len(flights):
+        split = add_up(splits)
+        lines += [
+            ("– hovering", split.hover_j),
+            ("– speed", split.motion_j),
+            ("– manoeuvres", split.manoeuvre_j),
+        ]
+        notes.append(
+            "The airframe's parts follow the terms of its power model (Krishnan et al. 2021, eq. "
+            "1). Hovering: staying up, with the payload. Speed: what moving adds; below 0 where it "
+            "saves. Manoeuvres: what is left, of accelerating, braking and wind."
+        )
+    lines.append(("computer", computer))
+    rows = tuple(
+        (
+            title,
+            f"{joules / 1e3:,.2f}",
+            f"{100.0 * joules / whole:.1f}" if whole else NONE,
+            f"{joules / time_s:,.1f}" if time_s else NONE,
+        )
+        for title, joules in [*lines, ("together", whole)]
+    )
+    return TableView("energy", "Energy", columns, rows, tuple(notes))
+
+
+def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableView:
+    """Return the energy of each flight, of at most so many, those that failed first."""
+    columns = (
+        Column("#"),
+        Column("outcome", number=False),
+        Column("time", "s"),
+        Column("airframe", "kJ"),
+        Column("hovering", "kJ"),
+        Column("speed", "kJ"),
+        Column("manoeuvres", "kJ"),
+        Column("computer", "J"),
+        Column("mean power", "W"),
+    )
+    shown = {r.index for r in failures_first([f.record for f in flights], most)}
+    rows = tuple(_flight_row(f) for f in flights if f.record.index in shown)
+    notes = ("Mean power: of airframe and computer together.",)
+    return TableView("energy-flights", "Energy of each flight", columns, rows, notes)
+
+
+def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
+    """Return one flight's cells."""
+    p = flight.parts
+    names = ("hover_j", "motion_j", "manoeuvre_j")
+    parts = [NONE] * 3 if p is None else [f"{getattr(p, name) / 1e3:.2f}" for name in names]
+    q = flight.record.quality
+    time_s = 0.0 if q is None else q.flight_time_s
+    whole = flight.airframe_j + flight.computer_j
+    return (
+        f"{flight.record.index}",
+        OUTCOME_WORDS[flight.record.outcome],
+        f"{time_s:.2f}",
+        f"{flight.airframe_j / 1e3:.2f}",
+        *parts,
+        f"{flight.computer_j:,.0f}",
+        f"{whole / time_s:,.1f}" if time_s else NONE,
+    )
+
+
+def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
+    """Draw the energy of each flight (at least one), its parts on top of each other."""
+    figure = new_figure(6.4, 3.4)
+    ax = figure.subplots()
+    many = len(flights) > BARS
+    ranked = list(flights)
+    kept = np.arange(len(ranked))
+    if many:
+        ranked.sort(key=lambda f: f.airframe_j + f.computer_j)
+        kept = np.unique(np.linspace(0, len(ranked) - 1, RANKS).round().astype(int))
+        ranked = [ranked[k] for k in kept]
+    whole = all(f.parts is not None for f in flights)
+    x = kept
+    above, below = np.zeros(len(ranked)), np.zeros(len(ranked))
+    for name, title, colour in PARTS if whole else (("", "airframe", SERIES), PARTS[-1]):
+        values = np.array([_joules(f, name) for f in ranked]) / 1e3
+        # What is below 0 hangs below the axis: the bar above it is longer than the energy drawn.
+        base = np.where(values < 0.0, below, above)
+        if many:
+            ax.fill_between(x, base, base + values, color=colour, lw=0, step="mid", label=title)
+        else:
+            ax.bar(x, values, 0.8, bottom=base, color=colour, lw=0, label=title)
+        above, below = above + np.maximum(values, 0.0), below + np.minimum(values, 0.0)
+    top = HIGH * float(np.percentile(above, 95.0))
+    if above.max() > top > 0.0:
+        ax.set_ylim(top=top)
+        over = sum(f.airframe_j + f.computer_j > 1e3 * top for f in flights)
+        ax.set_title(
+            f"{over} above, up to {above.max():,.0f} kJ", loc="right", fontsize=8.5, color=MARK
+        )
+    ax.axhline(0.0, color=MUTED, lw=0.8)
+    ax.set_ylabel("kJ", fontsize=8.5, color=MUTED)
+    if many:
+        label = "flights, sorted by their energy"
+        ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+        ax.set_xlim(-0.5, len(flights) - 0.5)
+    else:
+        label = "flight"
+        step = -(-len(ranked) // 20)
+        ax.set_xticks(x[::step], [f"{f.record.index}" for f in ranked[::step]])
+    ax.set_xlabel(label, fontsize=8.5, color=MUTED)
+    quiet(ax)
+    ax.grid(False, axis="x")
+    figure.legend(
+        loc="outside upper left", ncols=4, frameon=False, fontsize=8.5, labelcolor=INK,
+        handlelength=1.0, handletextpad=0.5, columnspacing=1.4,
+    )  # fmt: skip
+    titles = ", ".join(title for _, title, _ in PARTS) if whole else "airframe, computer"
+    alt = f"Energy of each of {len(flights)} flights by part: {titles}"
+    return render(figure, ENERGY_NAME, alt)
+
+
+def _joules(flight: FlightEnergy, name: str) -> float:
+    """Return one part of a flight's energy [J]; no name: the airframe's."""
+    if name == "computer_j":
+        return flight.computer_j
+    if not name or flight.parts is None:
+        return flight.airframe_j
+    return float(getattr(flight.parts, name))

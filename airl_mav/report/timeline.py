@@ -1,0 +1,264 @@
+"""The latency of every decision over a run: each stage in the order flown, outliers marked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
+
+from airl_mav.constants import US_PER_S
+from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
+from airl_mav.latency.stages import STAGES, Samples, Stage
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.figures import long_tail, quiet
+from airl_mav.report.tables import US_PER_MS, Column, TableView, ms
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    MUTED,
+    PAPER,
+    RULE,
+    SERIES,
+    SERIES_SOFT,
+    Picture,
+    new_figure,
+    render,
+)
+
+TIMELINE_NAME = "latency-timeline"
+
+COLUMNS = 320
+"""A row shows at most this many columns: a wider run has several decisions in each."""
+
+MARKED = 40
+"""Outliers of a row that get a mark: the longest."""
+
+BANDS = 40
+"""At most this many bands show where flights begin; longer runs have several flights in each."""
+
+NAMED = 16
+"""Up to this many flights are named above the rows."""
+
+SLOWEST = 8
+"""Rows of the table of decisions that stand out."""
+
+RULE_WORDS = (
+    f"Marked: above the third quartile by more than {FENCE_RANGES:g} times the interquartile range "
+    "(Tukey's outer fence, Exploratory Data Analysis, 1977). A stage of which more than 5 % lie "
+    "above it has two kinds of decisions, and no marks."
+)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The decisions of a run in the order flown."""
+
+    flights: tuple[int, ...]
+    """Number of each flight that has decisions."""
+    starts: NDArray[np.int64]
+    """(k + 1,) first decision of each, and the number of all."""
+    stages: dict[str, Samples]
+    """(n,) duration of each stage [µs], by its key; `NO_STAMP` where there is none."""
+    since_us: NDArray[np.int64]
+    """(n,) when each decision's frame was taken, from the start of navigation [µs]."""
+
+    def __len__(self) -> int:
+        """Return n."""
+        return int(self.starts[-1])
+
+    def flight_of(self, decision: int) -> int:
+        """Return the number of the flight that a decision belongs to."""
+        return self.flights[int(np.searchsorted(self.starts, decision, side="right")) - 1]
+
+
+def timeline_of(run: LoadedRun) -> Timeline:
+    """Return the decisions of a run in the order of its flights."""
+    began = {
+        e.index: e.started_us if e.navigation_us is None else e.navigation_us for e in run.episodes
+    }
+    flights = [i for i in sorted(began) if len(run.latency.get(i, {}).get("sent_us", ())) > 0]
+    series = [decision_series(run.latency[i]) for i in flights]
+    keys = decision_series({}).keys()
+    nothing: Samples = np.zeros(0, np.int64)
+    sizes = [len(run.latency[i]["sent_us"]) for i in flights]
+    since = [
+        run.latency[i].get("capture_us", np.full(size, began[i])) - began[i]
+        for i, size in zip(flights, sizes, strict=True)
+    ]
+    return Timeline(
+        flights=tuple(flights),
+        starts=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        stages={key: np.concatenate([nothing, *(part[key] for part in series)]) for key in keys},
+        since_us=np.concatenate([nothing, *since]),
+    )
+
+
+def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> Picture:
+    """Draw each stage (at least one) of all decisions, in the order flown.
+
+    Args:
+        timeline: The decisions.
+        stages: Those that have durations.
+    """
+    figure = new_figure(10.6, 0.62 + 1.0 * len(stages))
+    rows = np.atleast_1d(figure.subplots(len(stages), 1, sharex=True))
+    band = _draw_bands(rows, timeline)
+    for ax, stage in zip(rows, stages, strict=True):
+        _draw_stage(ax, stage, timeline.stages[stage.key])
+    per = -(-len(timeline) // COLUMNS)
+    label = "decision, in the order flown; bands: " + (
+        "flights" if band == 1 else f"{band} flights each"
+    )
+    if per > 1:
+        label += f"; line: median of {per} decisions, shade: least to greatest"
+    rows[-1].set_xlabel(label, fontsize=8.5, color=MUTED)
+    rows[-1].set_xlim(-0.5, len(timeline) - 0.5)
+    rows[-1].xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    alt = "Duration of each stage of every decision in the order flown, outliers marked: " + (
+        ", ".join(stage.title for stage in stages)
+    )
+    return render(figure, TIMELINE_NAME, alt)
+
+
+def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
+    """Shade every other flight, or group of flights; return how many flights a band has."""
+    count, per = len(timeline.flights), 1
+    while count > BANDS * per:
+        # 1, 2, 5, 10, 20, 50, ...
+        per = per * 5 // 2 if f"{per}"[0] == "2" else 2 * per
+    edges = timeline.starts[::per]
+    if edges[-1] != len(timeline):
+        edges = np.append(edges, len(timeline))
+    for k in range(0, len(edges) - 1, 2):
+        for ax in rows:
+            ax.axvspan(edges[k] - 0.5, edges[k + 1] - 0.5, color=RULE, alpha=0.4, lw=0, zorder=0)
+    if count <= NAMED:
+        for number, start, end in zip(
+            timeline.flights, timeline.starts[:-1], timeline.starts[1:], strict=True
+        ):
+            rows[0].annotate(
+                f"{'flight ' if count <= 8 else ''}{number}",
+                (0.5 * (start + end - 1), 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(0, -2),
+                textcoords="offset points",
+                ha="center",
+                va="top",
+                fontsize=7.5,
+                color=MUTED,
+                zorder=5,
+                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 0.8, "alpha": 0.75},
+            )
+    return per
+
+
+def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
+    """Draw one stage: a line through the decisions, or through the medians of columns of them."""
+    there = np.flatnonzero(durations != NO_STAMP)
+    found = durations[there]
+    edges = np.linspace(0, len(durations), min(len(durations), COLUMNS) + 1).astype(int)
+    # Where each column begins and ends among the decisions that have this stage.
+    cuts = np.searchsorted(there, edges)
+    middle = np.full((3, len(edges) - 1), np.nan)
+    for k, (start, end) in enumerate(pairwise(cuts)):
+        if end > start:
+            part = found[start:end]
+            middle[:, k] = part.min(), np.median(part), part.max()
+    middle /= US_PER_MS
+    x = 0.5 * (edges[:-1] + edges[1:] - 1)
+    if len(durations) > COLUMNS:
+        ax.fill_between(x, middle[0], middle[2], color=SERIES_SOFT, lw=0, zorder=2)
+    ax.plot(x, middle[1], color=SERIES, lw=0.9, zorder=2.5)
+    limit = fence(found)
+    _mark_outliers(ax, there, found, limit)
+    ax.set_title(stage.title, loc="left", fontsize=9, color=INK, pad=3)
+    if limit is not None:
+        ax.set_title(_in_words(limit), loc="right", fontsize=8, color=MARK, pad=3)
+    ax.set_ylabel("ms", fontsize=8, color=MUTED)
+    ax.yaxis.set_major_locator(MaxNLocator(3))
+    if long_tail(np.sort(found) / US_PER_MS):
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    elif np.ptp(found) == 0:
+        value = found[0] / US_PER_MS
+        ax.set_ylim(0.0, 2.0 * value if value > 0.0 else 1.0)
+    quiet(ax)
+    ax.grid(False, axis="x")
+
+
+def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fence | None) -> None:
+    """Mark the longest of the durations beyond the fence."""
+    if limit is None:
+        return
+    beyond = np.flatnonzero(limit.marks(found))
+    longest = beyond[np.argsort(-found[beyond], kind="stable")[:MARKED]]
+    ax.plot(there[longest], found[longest] / US_PER_MS, "o", ms=3.4, color=MARK, mew=0, zorder=4)
+
+
+def _in_words(limit: Fence) -> str:
+    """Say how many lie beyond the fence."""
+    where = f"above {ms(limit.limit_us)} ms"
+    if limit.second_kind:
+        return f"{limit.beyond / limit.n:.0%} {where}: a second kind, not marked"
+    if not limit.beyond:
+        return "no outliers"
+    shown = f", the {MARKED} longest marked" if limit.beyond > MARKED else ""
+    return f"{limit.beyond:,} of {limit.n:,} {where}{shown}"
+
+
+def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | None:
+    """Return the decisions that stand out from frame to motors; None when none does.
+
+    Args:
+        timeline: The decisions.
+        stages: Those that the run has.
+    """
+    whole = timeline.stages["end_to_end"]
+    there = np.flatnonzero(whole != NO_STAMP)
+    limit = fence(whole[there])
+    if limit is None or not limit.marks(whole[there]).any():
+        return None
+    median = float(np.median(whole[there]))
+    beyond = there[limit.marks(whole[there])]
+    beyond = beyond[np.argsort(-whole[beyond], kind="stable")[:SLOWEST]]
+    parts = [s for s in STAGES if s in stages and s.key not in ("end_to_end", "t3")]
+    rows = tuple(_slow_row(timeline, int(k), median, parts) for k in beyond)
+    columns = (
+        Column("flight"),
+        Column("at", "s"),
+        Column("end to end", "ms"),
+        Column("times the median"),
+        Column("longest part", number=False),
+        Column("of it", "ms"),
+    )
+    notes = (
+        f"{limit.beyond:,} of {limit.n:,} decisions above {ms(limit.limit_us)} ms; "
+        f"the {len(rows)} longest. Times from the start of navigation.",
+    )
+    return TableView("slowest", "Decisions that stand out", columns, rows, notes)
+
+
+def _slow_row(
+    timeline: Timeline, decision: int, median_us: float, parts: Sequence[Stage]
+) -> tuple[str, ...]:
+    """Return the cells of one decision."""
+    whole = int(timeline.stages["end_to_end"][decision])
+    spent: Mapping[str, int] = {
+        stage.title: int(timeline.stages[stage.key][decision]) for stage in parts
+    }
+    title = max(spent, key=spent.__getitem__, default="")
+    return (
+        f"{timeline.flight_of(decision)}",
+        f"{timeline.since_us[decision] / US_PER_S:.2f}",
+        ms(whole),
+        f"{whole / median_us:.1f}",
+        title,
+        ms(spent.get(title)),
+    )
