@@ -27,6 +27,7 @@ from airl_mav.cli.companion_command import (
 )
 from airl_mav.cli.companion_service import serve
 from airl_mav.clock import WallClock
+from airl_mav.cpu_quota import held_to
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
 from companion.link import LinkError
@@ -59,7 +60,10 @@ def stand_alone(command: CompanionCommand) -> int:
     bounds = watchdog_settings(command)
     latency = sampler(command, command.seed)
     try:
-        with opened(command, clock, abandon) as (link, frames):
+        with (
+            held_to(command.cpu_quota),
+            opened(command, clock, abandon) as (link, frames),
+        ):
             console.print(f"waiting for a flight controller on {command.connect}", markup=False)
             link.connect(command.connect_timeout, stop)
             check_camera(policy, frames, stop)

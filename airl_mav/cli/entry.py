@@ -7,49 +7,37 @@ must not greet its user with a traceback.
 from __future__ import annotations
 
 import importlib
-import sys
-from importlib.util import find_spec
 
-from rich.console import Console
-
-from airl_mav.cli.common import EXIT_INTERRUPTED, EXIT_USAGE
-
-SIM_MODULES = ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy")
-"""What the [sim] extra installs."""
+from airl_mav.cli.common import check_installed, run_command
 
 
-def _start(command: str, needed: tuple[str, ...] = SIM_MODULES) -> None:
-    """Run the main of `airl_mav.cli.<command>`, if all that it needs is installed."""
-    missing = [name for name in needed if find_spec(name) is None]
-    if missing:
-        Console(stderr=True, soft_wrap=True).print(
-            f"error: not installed: {', '.join(missing)}; pip install 'airl-mav[sim]'",
-            style="red",
-            markup=False,
-        )
-        sys.exit(EXIT_USAGE)
-    try:
-        module = importlib.import_module(f"airl_mav.cli.{command}")
-    except KeyboardInterrupt:  # The imports take a second: nothing has begun.
-        sys.exit(EXIT_INTERRUPTED)
-    module.main()
+def _start(command: str, *needed: str) -> None:
+    """Run the main of `airl_mav.cli.<command>`, if the extras that it needs are installed."""
+
+    def start() -> int:
+        check_installed(*needed)
+        importlib.import_module(f"airl_mav.cli.{command}").main()
+        return 0
+
+    # The imports take a second: who interrupts them sees no traceback either.
+    run_command(start)
 
 
 def sitl() -> None:
     """`airl-sitl`."""
-    _start("sitl")
+    _start("sitl", "sim")
 
 
 def firmware() -> None:
     """`airl-firmware`."""
-    _start("firmware")
+    _start("firmware", "sim")
 
 
 def companion() -> None:
     """`airl-companion`: needs nothing beyond the light installation."""
-    _start("companion", needed=())
+    _start("companion")
 
 
 def airl() -> None:
-    """`airl`."""
+    """`airl`: each subcommand says itself what it needs."""
     _start("main")

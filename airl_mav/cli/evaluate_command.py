@@ -98,8 +98,8 @@ class EvaluateCommand:
     """Ports of level sitl."""
 
     on_card: bool = False
-    """Write the results onto the policies' cards, in place of earlier ones of the same arena and
-    level."""
+    """Write the results onto the policies' cards, in place of earlier ones of the same arena,
+    level and latency."""
 
     out: Path | None = None
     """Run folder, or with several policies or arenas the folder of their run folders. None:

@@ -25,12 +25,13 @@ from airl_mav.training.config import TrainingConfig
 from airl_mav.training.store import Evaluation, TrainingFolder
 
 
-def run(command: TrainCommand, console: Console | None = None) -> int:
+def run(command: TrainCommand, console: Console | None = None, *, words: str | None = None) -> int:
     """Train, export, and say what came out.
 
     Args:
         command: What was asked for.
         console: Where to print; None means standard output.
+        words: The command line that makes the policy, for its card; None: that of this process.
 
     Returns:
         Exit status: 0 trained to the end, 130 Ctrl-C.
@@ -46,7 +47,7 @@ def run(command: TrainCommand, console: Console | None = None) -> int:
     stem = Path(command.config).stem
     path = command.out or Path("runs") / f"train-{stem}"
     signal.signal(signal.SIGTERM, _interrupt)
-    words = shlex.join(["airl", *sys.argv[1:]])
+    words = shlex.join(["airl", *sys.argv[1:]]) if words is None else words
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
     from airl_mav.training.run import train
 

@@ -161,18 +161,21 @@ def load_learned(
         UsageError: Card and policy do not fit each other, or the runtime is not installed.
     """
     card = read_card(folder)
-    network: Runtime
-    if runtime == "onnx":
-        network = open_model(folder, card, threads)
-    else:
-        program = read_torch_program(folder, card)
-        try:
-            network = TorchRuntime(program, card.observation, threads)
-        except ValueError as error:
-            raise UsageError(f"{folder / TORCH_FILE}: {error}") from None
+    network = open_network(folder, card, runtime, threads)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     _warm_up(policy, network)
     return policy
+
+
+def open_network(folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int) -> Runtime:
+    """Return the network of a card, ready for its first inference. Raises as `load_learned`."""
+    if runtime == "onnx":
+        return open_model(folder, card, threads)
+    program = read_torch_program(folder, card)
+    try:
+        return TorchRuntime(program, card.observation, threads)
+    except ValueError as error:
+        raise UsageError(f"{folder / TORCH_FILE}: {error}") from None
 
 
 def _warm_up(policy: LearnedPolicy, network: Runtime) -> None:

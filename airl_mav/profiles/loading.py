@@ -18,12 +18,14 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Kind = Literal["vehicles", "computers", "arenas", "training"]
+Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "studies"]
 _SINGULAR: dict[Kind, str] = {
     "vehicles": "vehicle",
     "computers": "computer",
     "arenas": "arena",
     "training": "training",
+    "sweeps": "sweep",
+    "studies": "study",
 }
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -1,0 +1,189 @@
+"""What a machine's speed depends on at a moment: governor, frequency, temperature, throttling.
+
+Everything is read from where Linux and the Raspberry Pi's firmware offer it; None stands for what
+a system does not offer.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+NOT_OFFERED = "not offered by this system"
+VCGENCMD_TIMEOUT_S = 5.0
+
+PI_FLAGS = {
+    0: "under-voltage",
+    1: "frequency capped",
+    2: "throttled",
+    3: "soft temperature limit",
+    16: "under-voltage has occurred",
+    17: "frequency capping has occurred",
+    18: "throttling has occurred",
+    19: "soft temperature limit has occurred",
+}
+"""Bits of the Raspberry Pi's `get_throttled` (raspberrypi.com, documentation of vcgencmd)."""
+
+CPU_SENSORS = ("cpu", "soc", "x86_pkg", "coretemp", "k10temp", "package")
+"""Beginnings or parts of the names of thermal zones that belong to a processor."""
+
+
+@dataclass(frozen=True)
+class MachineState:
+    """A machine at one moment."""
+
+    governor: str | None
+    """Frequency governors of the cores, one when all have the same."""
+    frequency_mhz: tuple[float, float] | None
+    """Least and greatest frequency of the cores."""
+    frequency_limit_mhz: float | None
+    """Greatest frequency that is allowed."""
+    temperature_c: float | None
+    """Of the processor; the hottest sensor of it."""
+    throttling: str | None
+    """In words: none, or what the system reports."""
+    load: tuple[float, float, float] | None
+    """Load average over 1, 5 and 15 minutes."""
+
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """Return what is known, in words."""
+        mhz, limit, load = self.frequency_mhz, self.frequency_limit_mhz, self.load
+        frequency = None
+        if mhz is not None:
+            low, high = mhz
+            frequency = f"{low:.0f} MHz" if high - low < 1.0 else f"{low:.0f} to {high:.0f} MHz"
+            if limit is not None:
+                frequency += f", at most {limit:.0f} MHz"
+        known = {
+            "governor": self.governor,
+            "frequency": frequency,
+            "temperature": None if self.temperature_c is None else f"{self.temperature_c:.1f} °C",
+            "throttling": self.throttling,
+            "load average": None if load is None else ", ".join(f"{value:.2f}" for value in load),
+        }
+        return tuple((name, value or NOT_OFFERED) for name, value in known.items())
+
+
+def machine_state(
+    root: Path = Path("/"), ask_pi: Callable[[], str | None] | None = None
+) -> MachineState:
+    """Return the state of this machine.
+
+    Args:
+        root: Where /sys and /proc are found.
+        ask_pi: Returns what `vcgencmd get_throttled` says, None where there is no such program;
+            None asks it.
+    """
+    cpus = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq"))
+    governors = sorted({text for cpu in cpus if (text := _text(cpu / "scaling_governor"))})
+    now = [khz / 1e3 for cpu in cpus if (khz := _number(cpu / "scaling_cur_freq")) is not None]
+    limits = [khz / 1e3 for cpu in cpus if (khz := _number(cpu / "scaling_max_freq")) is not None]
+    return MachineState(
+        governor=", ".join(governors) or None,
+        frequency_mhz=(min(now), max(now)) if now else _cpuinfo_mhz(root),
+        frequency_limit_mhz=max(limits, default=None),
+        temperature_c=_temperature_c(root),
+        throttling=_throttling(root, ask_pi or _vcgencmd),
+        load=_load(root),
+    )
+
+
+def _cpuinfo_mhz(root: Path) -> tuple[float, float] | None:
+    """Return the frequencies that /proc/cpuinfo lists: x86 without a frequency driver."""
+    lines = (_text(root / "proc/cpuinfo") or "").splitlines()
+    found = []
+    for line in lines:
+        key, _, value = line.partition(":")
+        if key.strip() == "cpu MHz":
+            found.append(float(value))
+    return (min(found), max(found)) if found else None
+
+
+def _temperature_c(root: Path) -> float | None:
+    """Return the hottest sensor of the processor [°C]."""
+    found = []
+    for zone in sorted((root / "sys/class/thermal").glob("thermal_zone*")):
+        name, value = _text(zone / "type"), _number(zone / "temp")
+        if name and value is not None and any(word in name.lower() for word in CPU_SENSORS):
+            found.append(value / 1e3)
+    for monitor in sorted((root / "sys/class/hwmon").glob("hwmon*")):
+        name = _text(monitor / "name") or ""
+        if any(word in name.lower() for word in CPU_SENSORS):
+            values = (_number(path) for path in sorted(monitor.glob("temp*_input")))
+            found += [value / 1e3 for value in values if value is not None]
+    return max(found, default=None)
+
+
+def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
+    """Return what slows the processor down, in words; None where nothing tells."""
+    bits = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
+    if bits is None and (answer := ask_pi()) is not None:
+        bits = answer.partition("=")[2]
+    if bits is not None:
+        try:
+            return pi_throttling(int(bits, 16))
+        except ValueError:
+            return None
+    counts = [
+        count
+        for path in sorted(
+            (root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count")
+        )
+        if (count := _number(path)) is not None
+    ]
+    if counts:
+        return f"{sum(counts):.0f} times since the start of the system" if sum(counts) else "none"
+    return None
+
+
+def pi_throttling(bits: int) -> str:
+    """Return the Raspberry Pi's word of flags in words."""
+    flags = [text for bit, text in PI_FLAGS.items() if bits >> bit & 1]
+    return ", ".join(flags) or "none"
+
+
+def _vcgencmd() -> str | None:
+    program = shutil.which("vcgencmd")
+    if program is None:
+        return None
+    try:
+        done = subprocess.run(  # noqa: S603 - fixed words, no shell
+            [program, "get_throttled"],
+            capture_output=True,
+            text=True,
+            timeout=VCGENCMD_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _load(root: Path) -> tuple[float, float, float] | None:
+    text = _text(root / "proc/loadavg")
+    if text is not None:
+        one, five, fifteen = (float(value) for value in text.split()[:3])
+        return one, five, fifteen
+    try:
+        return os.getloadavg()
+    except (OSError, AttributeError):
+        return None
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip() or None
+    except OSError:
+        return None
+
+
+def _number(path: Path) -> float | None:
+    text = _text(path)
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return None

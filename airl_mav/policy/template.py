@@ -1,0 +1,165 @@
+"""Randomly initialised networks of the paper's template, written as ONNX without torch.
+
+L convolutions of F filters (3x3, stride 1, same padding), joined with velocity and goal, L dense
+layers of F units, a score for each action (Krishnan et al., Air Learning, 2021). How long an
+inference takes depends on the layers' sizes, not on what was learned.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.errors import UsageError
+from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest, write_card
+from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec
+from airl_mav.policy.runtime import ACTION, outputs_of
+
+OPSET = 18
+IR_VERSION = 10
+"""ONNX's file format: what ONNX Runtime reads since 1.18."""
+
+KERNEL = 3
+VECTOR_INPUTS = 6
+GREATEST_BYTES = 1_900_000_000
+"""An .onnx file with its weights inside stays below 2 GiB (a limit of its encoding)."""
+
+
+class Size(NamedTuple):
+    """What a network takes."""
+
+    parameters: int
+    macs: int
+    """Multiply-accumulates of one inference."""
+
+
+def template_size(layers: int, filters: int, height_px: int, width_px: int, outputs: int) -> Size:
+    """Return the size of a network of the template."""
+    pixels = height_px * width_px
+    weights, biases, macs = 0, 0, 0
+    channels = 1
+    for _ in range(layers):
+        kernel = KERNEL * KERNEL * channels * filters
+        weights, biases, macs = weights + kernel, biases + filters, macs + kernel * pixels
+        channels = filters
+    inputs = filters * pixels + VECTOR_INPUTS
+    for units in (*[filters] * layers, outputs):
+        weights, biases, macs = weights + inputs * units, biases + units, macs + inputs * units
+        inputs = units
+    return Size(weights + biases, macs)
+
+
+def write_template(
+    folder: Path, layers: int, filters: int, facts: PolicyFacts, rng: np.random.Generator
+) -> PolicyCard:
+    """Write a random network of the template and its card to a folder that exists.
+
+    Args:
+        folder: Where to write.
+        layers: Convolutions, and as many dense layers, >= 1.
+        filters: Filters of each, >= 1.
+        facts: What the card says beyond the network.
+        rng: Source of the weights.
+
+    Raises:
+        UsageError: The network is too large for one .onnx file.
+    """
+    spec, outputs = facts.observation, outputs_of(facts.actions)
+    size = template_size(layers, filters, spec.height_px, spec.width_px, outputs)
+    if 4 * size.parameters > GREATEST_BYTES:
+        raise UsageError(
+            f"--network {layers}x{filters}: {size.parameters:,} parameters; accepted: at most "
+            f"{GREATEST_BYTES // 4:,} (a smaller --image has fewer)"
+        )
+    model = build_template(layers, filters, spec, facts.actions, rng)
+    (folder / ONNX_FILE).write_bytes(model)
+    card = PolicyCard(
+        **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
+        sha256=digest(model),
+        network=f"{layers} x conv {filters} 3x3, {layers} x dense {filters}, dense {outputs}",
+        parameters=size.parameters,
+        macs=size.macs,
+    )
+    write_card(folder, card)
+    return card
+
+
+def build_template(
+    layers: int,
+    filters: int,
+    spec: ObservationSpec,
+    actions: ActionSpec,
+    rng: np.random.Generator,
+) -> bytes:
+    """Return a random network of the template as the bytes of an .onnx file.
+
+    Weights are He's (normal, variance 2 / inputs), so that signals neither die out nor grow.
+    """
+    # Imported late: only the [profile] and [train] extras install it.
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes: list[Any] = []
+    weights: list[Any] = []
+
+    def add(name: str, values: NDArray[np.float32]) -> str:
+        weights.append(numpy_helper.from_array(values, name))
+        return name
+
+    def random(name: str, shape: tuple[int, ...]) -> str:
+        scale = np.float32(np.sqrt(2.0 / np.prod(shape[1:])))
+        return add(name, rng.standard_normal(shape, np.float32) * scale)
+
+    def zeros(name: str, count: int) -> str:
+        return add(name, np.zeros(count, np.float32))
+
+    def node(operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
+        return output
+
+    full = add("full_scale", np.array(255.0, np.float32))
+    x = node("Div", [node("Cast", [DEPTH], "pixels", to=TensorProto.FLOAT), full], "image")
+    channels = 1
+    for k in range(layers):
+        kernel = random(f"conv{k}.weight", (filters, channels, KERNEL, KERNEL))
+        x = node(
+            "Conv",
+            [x, kernel, zeros(f"conv{k}.bias", filters)],
+            f"conv{k}",
+            kernel_shape=[KERNEL, KERNEL],
+            pads=[KERNEL // 2] * 4,
+        )
+        x = node("Relu", [x], f"conv{k}.relu")
+        channels = filters
+    flat = node("Flatten", [x], "flat", axis=1)
+    x = node("Concat", [flat, VELOCITY, GOAL], "joined", axis=1)
+    inputs = filters * spec.height_px * spec.width_px + VECTOR_INPUTS
+    for k in range(layers):
+        dense = [x, random(f"dense{k}.weight", (filters, inputs)), zeros(f"dense{k}.bias", filters)]
+        x = node("Relu", [node("Gemm", dense, f"dense{k}", transB=1)], f"dense{k}.relu")
+        inputs = filters
+    outputs = outputs_of(actions)
+    last = [x, random("score.weight", (outputs, inputs)), zeros("score.bias", outputs)]
+    node("Gemm", last, ACTION, transB=1)
+    image = ["n", 1, spec.height_px, spec.width_px]
+    graph = helper.make_graph(
+        nodes,
+        "template",
+        [
+            helper.make_tensor_value_info(DEPTH, TensorProto.UINT8, image),
+            helper.make_tensor_value_info(VELOCITY, TensorProto.FLOAT, ["n", 3]),
+            helper.make_tensor_value_info(GOAL, TensorProto.FLOAT, ["n", 3]),
+        ],
+        [helper.make_tensor_value_info(ACTION, TensorProto.FLOAT, ["n", outputs])],
+        weights,
+    )
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION
+    )
+    onnx.checker.check_model(model)
+    data: bytes = model.SerializeToString(deterministic=True)
+    return data

@@ -1,0 +1,202 @@
+"""What the stamps cost, and by how much the harness changes the latency t2 that it measures.
+
+    python benchmarks/bench_stamps.py
+
+1. One stamp (`WallClock.time_us`) and one row of the decision log.
+2. In a real flight (airl-firmware in a process of its own, MAVSDK and camera here, as on the drone)
+   every decision is also timed from inside, from the encoding to the bounded action: t2 less that
+   is what the pilot's stamps add. Pairs, decision by decision.
+3. The same decisions without any flight, with the same pauses, right before and after each flight:
+   what MAVSDK and the camera in the same process, and the simulator beside it, do to them.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from airl_mav.camera.frame import Frame
+from airl_mav.cli import profile_bare, profile_hil
+from airl_mav.cli.profile_command import ProfileCommand
+from airl_mav.cli.profile_plan import ProfilePlan, planned
+from airl_mav.clock import WallClock
+from airl_mav.latency.stamps import DecisionLog
+from airl_mav.policy.actions import Action
+from airl_mav.policy.observation import Kinematics, Observation
+from companion import pilot
+
+CALLS, REPEATS = 10_000, 50
+FLIGHTS, DECISIONS, WARM_UP = 3, 200, 20
+STAMP_LIMIT_US, CHANGE_LIMIT = 0.5, 0.01
+
+NETWORKS = {
+    "milliseconds": ProfileCommand(network="3x32", image="64x48"),
+    "shipped policy": ProfileCommand(),
+}
+
+
+def best_us(call: Callable[[], object]) -> tuple[float, float]:
+    """Return the least and the median time of a call over repeats, loop included [µs]."""
+    times = []
+    for _ in range(REPEATS):
+        start = time.perf_counter_ns()
+        for _ in range(CALLS):
+            call()
+        times.append((time.perf_counter_ns() - start) / CALLS / 1e3)
+    return min(times), float(np.median(times))
+
+
+class Watch:
+    """Times a decision from inside the pilot: from the encoding to the bounded action."""
+
+    def __init__(self) -> None:
+        self.took_ns: list[int] = []
+        self._started_ns = 0
+        self._encode, self._limited = pilot.encode, pilot.limited
+
+    def __enter__(self) -> Watch:
+        def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
+            self._started_ns = time.perf_counter_ns()
+            return self._encode(frame, state, goal)
+
+        def limited(action: Action, speed_m_s: float) -> Action:
+            bounded = self._limited(action, speed_m_s)
+            self.took_ns.append(time.perf_counter_ns() - self._started_ns)
+            return bounded
+
+        pilot.encode, pilot.limited = encode, limited
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pilot.encode, pilot.limited = self._encode, self._limited
+
+
+@dataclass(frozen=True)
+class Flight:
+    added_us: np.ndarray
+    """t2 as stamped less the decision itself, of each decision [µs]."""
+    inside_us: np.ndarray
+    """The decision itself: encode, infer, bound [µs]."""
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
+    """Run a simulator of its own; give its two addresses."""
+    udp = [free_port(socket.SOCK_DGRAM) for _ in range(2)]
+    tcp = free_port(socket.SOCK_STREAM)
+    words = [sys.executable, "-m", "airl_mav.cli.firmware", "--vehicle", vehicle]
+    words += ["--arena", "no-obstacles", "--api-port", f"{udp[0]}", "--gcs-port", f"{udp[1]}"]
+    words += ["--api-local-port", "0", "--gcs-local-port", "0", "--camera-port", f"{tcp}"]
+    with (folder / "firmware.log").open("wb") as log:
+        process = subprocess.Popen(words, stdout=log, stderr=log)  # noqa: S603
+        try:
+            yield f"udpin://127.0.0.1:{udp[0]}", f"tcp://127.0.0.1:{tcp}"
+        finally:
+            process.terminate()
+            process.wait(20)
+
+
+def flown(plan: ProfilePlan) -> Flight:
+    """Fly, and pair each t2 with the work inside it."""
+    with Watch() as watch:
+        (stamps,) = profile_hil.measure(plan, lambda _: None).flights
+    t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
+    inside_us = np.array(watch.took_ns[WARM_UP : WARM_UP + len(t2_us)]) / 1e3
+    return Flight(t2_us - inside_us, inside_us)
+
+
+def alone(plan: ProfilePlan) -> float:
+    """Return the median of the same decisions without a flight, with the same pauses [µs]."""
+    policy, _ = profile_bare.opened(plan, WallClock())
+    views, times = profile_bare.seen_by(plan), []
+    for k in range(WARM_UP + DECISIONS):
+        time.sleep(plan.hold_s)
+        start = time.perf_counter_ns()
+        profile_bare.decide(plan, policy, views[k % len(views)])
+        times.append(time.perf_counter_ns() - start)
+    return float(np.median(times[WARM_UP:])) / 1e3
+
+
+def main() -> None:
+    console = Console(width=110)
+    clock, log = WallClock(), DecisionLog()
+    setpoint = (1.0, 0.0, 0.0, 0.1)
+
+    def record() -> None:
+        if len(log) == 4096:
+            log.clear()
+        log.record(1, 2, 3, 4, 5, 6, setpoint)
+
+    table = Table("cost", "best, µs", "median, µs", "limit, µs", title="stamps")
+    costs = {"one stamp": best_us(clock.time_us), "one row of the log": best_us(record)}
+    for name, (best, median) in costs.items():
+        limit = f"{STAMP_LIMIT_US:g}" if name == "one stamp" else ""
+        table.add_row(name, f"{best:.3f}", f"{median:.3f}", limit)
+    console.print(table)
+    change = Table(
+        *("network", "flight", "decision, µs", "added, µs", "added, %"),
+        *("alone before / after, µs", "flown / alone"),
+        title=f"t2 in flight, {DECISIONS} decisions a flight (medians)",
+    )
+    shares = []
+    for name, command in NETWORKS.items():
+        options = {**vars(command), "decisions": DECISIONS, "warm_up": WARM_UP, "on": "bench"}
+        with TemporaryDirectory() as scratch:
+            # Nothing is written there: the folder only has to be a new one.
+            bare = ProfileCommand(**{**options, "out": Path(scratch)})
+            with planned(bare) as first:
+                vehicle = first.vehicle
+            before: float | None = None
+            for k in range(FLIGHTS):
+                with firmware(vehicle, Path(scratch)) as (connect, camera):
+                    asked = {**vars(bare), "level": "hil", "connect": connect, "camera": camera}
+                    with planned(ProfileCommand(**asked)) as plan:
+                        before = alone(plan) if before is None else before
+                        flight = flown(plan)
+                        after = alone(plan)
+                added = float(np.median(flight.added_us))
+                inside = float(np.median(flight.inside_us))
+                share = float(np.median(flight.added_us / flight.inside_us))
+                low, high = np.percentile(flight.added_us / flight.inside_us, (25, 75))
+                if name == "milliseconds":
+                    shares.append(share)
+                change.add_row(
+                    name if k == 0 else "",
+                    f"{k + 1}",
+                    f"{inside:,.0f}",
+                    f"{added:.1f}",
+                    f"{share:.2%} ({low:.2%} to {high:.2%})",
+                    f"{before:,.0f} / {after:,.0f}",
+                    f"{2.0 * inside / (before + after):.3f}",
+                )
+                before = after
+    console.print(change)
+    stamp_us = costs["one stamp"][0]
+    worst = max(shares)
+    console.print(
+        f"one stamp {stamp_us:.2f} µs (limit {STAMP_LIMIT_US:g}): "
+        f"{'yes' if stamp_us <= STAMP_LIMIT_US else 'NO'}; added to a t2 of milliseconds "
+        f"{worst:.2%} (limit {CHANGE_LIMIT:.0%}): {'yes' if worst < CHANGE_LIMIT else 'NO'}"
+    )
+    sys.exit(not (stamp_us <= STAMP_LIMIT_US and worst < CHANGE_LIMIT))
+
+
+if __name__ == "__main__":
+    main()
