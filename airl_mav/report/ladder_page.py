@@ -5,12 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure, SubFigure
-
 from airl_mav.atomic import replace_file
 from airl_mav.flight.paired import Change
-from airl_mav.report.figures import quiet
+from airl_mav.report.differences import Against, draw_differences, draw_sheet
 from airl_mav.report.html import REPORT_FILE, Headline, environment, provenance
 from airl_mav.report.ladder import LADDER_FILE, Ladder
 from airl_mav.report.ladder_tables import (
@@ -26,24 +23,10 @@ from airl_mav.report.ladder_tables import (
 )
 from airl_mav.report.ladder_words import differences_in_words
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, TableView
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    MUTED,
-    PAPER,
-    RULE,
-    SERIES,
-    Picture,
-    new_figure,
-    render,
-    render_png,
-)
+from airl_mav.report.theme import Picture
 
 PAGE_FILE = "ladder.html"
 FIGURE_FILE = "ladder.png"
-
-_ROW_IN = 0.42
-"""Height of a level in a figure."""
 
 
 def build_page(ladder: Ladder) -> Path:
@@ -111,57 +94,17 @@ def _headline(measure: Measure, change: Change) -> Headline:
 
 def differences_figure(ladder: Ladder, measure: Measure) -> Picture:
     """Draw the differences of one measure: a dot with its interval for each level."""
-    figure = new_figure(4.2, 1.05 + _ROW_IN * len(ladder.comparisons))
-    _draw_differences(figure, ladder, measure)
-    told = ", ".join(level.name for level in ladder.levels[1:])
-    alt = f"Difference in {measure.title} from {ladder.reference.name}, with intervals: {told}"
-    return render(figure, f"ladder-{measure.key.replace('_', '-')}", alt)
+    return draw_differences("ladder", ladder.reference.name, _against(ladder), measure)
 
 
 def differences_sheet(ladder: Ladder) -> bytes:
     """Draw all measures on one sheet; return the PNG."""
-    figure = new_figure(8.4, 2.0 * (1.05 + _ROW_IN * len(ladder.comparisons)))
-    parts = np.ravel(figure.subfigures(2, 2, squeeze=False))
-    for part, measure in zip(parts, MEASURES, strict=True):
-        part.set_facecolor(PAPER)
-        _draw_differences(part, ladder, measure)
-    return render_png(figure)
+    return draw_sheet(ladder.reference.name, _against(ladder))
 
 
-def _draw_differences(figure: Figure | SubFigure, ladder: Ladder, measure: Measure) -> None:
-    """Draw one measure: levels from top to bottom, the reference as the line of zero."""
-    ax = figure.subplots()
-    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
-    names = [level.name for level in ladder.levels[1:]]
-    ends = [0.0]
-    for row, comparison in enumerate(ladder.comparisons):
-        d = change_of(comparison, measure).difference
-        told = f"n = {d.n:,}" if d.value is None else f"{d.value:+.2f}, n = {d.n:,}"
-        ax.annotate(
-            told,
-            (1.0, row - 0.14),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-            color=MARK,
-        )
-        if d.value is None:
-            continue
-        if d.low is not None and d.high is not None:
-            ax.plot([d.low, d.high], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
-            ends += [d.low, d.high]
-        ends.append(d.value)
-        ax.plot(d.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=3)
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.5, -0.65)
-    # Zero stays inside, and a level without any difference still has an axis.
-    room = 0.08 * (max(ends) - min(ends)) or 1.0
-    ax.set_xlim(min(ends) - room, max(ends) + room)
-    ax.set_title(measure.title, loc="left", fontsize=10.5, color=INK, pad=6)
-    unit = "percentage points" if measure.difference_unit == "points" else "%"
-    ax.set_xlabel(f"difference from {ladder.reference.name} [{unit}]", fontsize=8.5, color=MUTED)
-    quiet(ax)
-    ax.grid(False, axis="y")
-    ax.tick_params(axis="y", labelsize=9, labelcolor=INK)
-    ax.spines["bottom"].set_color(RULE)
+def _against(ladder: Ladder) -> list[Against]:
+    """Return what is drawn against the reference."""
+    return [
+        (level.name, comparison)
+        for level, comparison in zip(ladder.levels[1:], ladder.comparisons, strict=True)
+    ]

@@ -74,7 +74,7 @@ def levels_table(ladder: Ladder) -> TableView:
         (
             level.name,
             f"{level.quality.success_rate.n:,}",
-            *(_alone(getattr(level.quality, m.key), m) for m in MEASURES),
+            *(with_interval(getattr(level.quality, m.key), m) for m in MEASURES),
         )
         for level in ladder.levels
     )
@@ -87,8 +87,8 @@ def levels_table(ladder: Ladder) -> TableView:
     return TableView("levels", "Levels", columns, rows, tuple(notes))
 
 
-def _alone(estimate: Estimate, measure: Measure) -> str:
-    """Return a figure with its interval."""
+def with_interval(estimate: Estimate, measure: Measure) -> str:
+    """Return a figure with its 95 % interval in brackets."""
     if estimate.value is None:
         return NONE
     text = f"{measure.scale * estimate.value:.{measure.digits}f}"
@@ -101,12 +101,13 @@ def _alone(estimate: Estimate, measure: Measure) -> str:
 def comparison_tables(ladder: Ladder) -> list[TableView]:
     """Return one table for each level but the reference, which it is compared with."""
     return [
-        _comparison_table(ladder.reference.name, level.name, comparison)
+        comparison_table(ladder.reference.name, level.name, comparison)
         for level, comparison in zip(ladder.levels[1:], ladder.comparisons, strict=True)
     ]
 
 
-def _comparison_table(reference: str, level: str, comparison: Comparison) -> TableView:
+def comparison_table(reference: str, level: str, comparison: Comparison) -> TableView:
+    """Return how one thing that flew differs from another, its reference, on the same seeds."""
     columns = (
         Column("same seeds", number=False),
         Column(reference),

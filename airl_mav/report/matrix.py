@@ -128,23 +128,23 @@ def write_matrix(folder: Path, facts: Mapping[str, Any], cells: Sequence[Cell]) 
     text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
     replace_file(folder / MATRIX_FILE, text.encode())
     told = ", ".join(f"{key} {value}" for key, value in facts.items() if value is not None)
-    parts = [told, *(_markdown(view) for view in matrix_tables(cells))]
+    parts = [told, *(markdown_table(view) for view in matrix_tables(cells))]
     replace_file(folder / MATRIX_TABLE_FILE, ("\n\n".join(parts) + "\n").encode())
 
 
-def _markdown(view: TableView) -> str:
+def markdown_table(view: TableView) -> str:
     """Return a table with its title and notes as Markdown."""
     titles = [f"{c.title} [{c.unit}]" if c.unit else c.title for c in view.columns]
     rule = ["---:" if column.number else "---" for column in view.columns]
     lines = [" | ".join(row) for row in (titles, rule, *map(_escaped, view.rows))]
     table = "\n".join(f"| {line} |" for line in lines)
-    return "\n\n".join([f"## {view.title}", table, *map(_escape, view.notes)])
+    return "\n\n".join([f"## {view.title}", table, *map(escape_markdown, view.notes)])
 
 
 def _escaped(row: Sequence[str]) -> list[str]:
-    return [_escape(cell) for cell in row]
+    return [escape_markdown(cell) for cell in row]
 
 
-def _escape(text: str) -> str:
+def escape_markdown(text: str) -> str:
     """Return text in which nothing is taken for Markdown."""
     return "".join(f"\\{c}" if c in "\\|*_`[]<>" else c for c in text)

@@ -1,0 +1,99 @@
+"""Paired differences as figures: a dot with its interval for everything that is compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure, SubFigure
+
+from airl_mav.flight.paired import Comparison
+from airl_mav.report.figures import quiet
+from airl_mav.report.ladder_tables import MEASURES, Measure, change_of
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    MUTED,
+    PAPER,
+    RULE,
+    SERIES,
+    Picture,
+    new_figure,
+    render,
+    render_png,
+)
+
+Against = tuple[str, Comparison]
+"""What is compared with the reference: its name, and the comparison."""
+
+_ROW_IN = 0.42
+"""Height of one of them in a figure."""
+
+
+def draw_differences(
+    prefix: str, reference: str, others: Sequence[Against], measure: Measure
+) -> Picture:
+    """Draw the differences of one measure.
+
+    Args:
+        prefix: What the picture's name begins with.
+        reference: Name of what all others are compared with.
+        others: Those others, one or more, from top to bottom.
+        measure: What is drawn.
+    """
+    figure = new_figure(4.2, 1.05 + _ROW_IN * len(others))
+    _draw(figure, reference, others, measure)
+    told = ", ".join(name for name, _ in others)
+    alt = f"Difference in {measure.title} from {reference}, with intervals: {told}"
+    return render(figure, f"{prefix}-{measure.key.replace('_', '-')}", alt)
+
+
+def draw_sheet(reference: str, others: Sequence[Against]) -> bytes:
+    """Draw all measures on one sheet; return the PNG."""
+    figure = new_figure(8.4, 2.0 * (1.05 + _ROW_IN * len(others)))
+    parts = np.ravel(figure.subfigures(2, 2, squeeze=False))
+    for part, measure in zip(parts, MEASURES, strict=True):
+        part.set_facecolor(PAPER)
+        _draw(part, reference, others, measure)
+    return render_png(figure)
+
+
+def _draw(
+    figure: Figure | SubFigure, reference: str, others: Sequence[Against], measure: Measure
+) -> None:
+    """Draw one measure: rows from top to bottom, the reference as the line of zero."""
+    ax = figure.subplots()
+    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
+    ends = [0.0]
+    for row, (_, comparison) in enumerate(others):
+        d = change_of(comparison, measure).difference
+        told = f"n = {d.n:,}" if d.value is None else f"{d.value:+.2f}, n = {d.n:,}"
+        ax.annotate(
+            told,
+            (1.0, row - 0.14),
+            xycoords=("axes fraction", "data"),
+            ha="right",
+            va="bottom",
+            fontsize=8,
+            color=MARK,
+        )
+        if d.value is None:
+            continue
+        if d.low is not None and d.high is not None:
+            ax.plot([d.low, d.high], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
+            ends += [d.low, d.high]
+        ends.append(d.value)
+        ax.plot(d.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=3)
+    names = [name for name, _ in others]
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.5, -0.65)
+    # Zero stays inside, and a row without any difference still has an axis.
+    room = 0.08 * (max(ends) - min(ends)) or 1.0
+    ax.set_xlim(min(ends) - room, max(ends) + room)
+    ax.set_title(measure.title, loc="left", fontsize=10.5, color=INK, pad=6)
+    unit = "percentage points" if measure.difference_unit == "points" else "%"
+    ax.set_xlabel(f"difference from {reference} [{unit}]", fontsize=8.5, color=MUTED)
+    quiet(ax)
+    ax.grid(False, axis="y")
+    ax.tick_params(axis="y", labelsize=9, labelcolor=INK)
+    ax.spines["bottom"].set_color(RULE)

@@ -1,0 +1,265 @@
+"""The definition of the hardware gap, against hand-made values, scipy and the paper's tables."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from airl_mav.flight.gap import (
+    HardwareGap,
+    MetricGap,
+    hardware_gap,
+    median_ratio,
+    metric_gap,
+    relative_gap,
+)
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paper import (
+    ABLATION,
+    BEST_OF_SWEEP,
+    DEGRADATION,
+    GENERALISATION,
+    MITIGATION,
+    SYSTEM_EVALUATION,
+    PaperFigures,
+    gap_of,
+)
+from airl_mav.flight.quality import Leg, Quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import BOOTSTRAP_SEED, RESAMPLES
+
+# --- one gap
+
+
+def flight(
+    seed: int, outcome: Outcome, time_s: float = 1.0, energy_j: float = 100.0, watts: float = 2.0
+) -> EpisodeRecord:
+    return EpisodeRecord(
+        index=seed,
+        seed=seed,
+        arena="a",
+        arena_seed=seed,
+        outcome=outcome,
+        reason="",
+        goal=(1.0, 2.0),
+        goal_radius_m=3.0,
+        time_limit_s=120.0,
+        started_us=0,
+        navigation_us=0,
+        ended_us=int(1e6 * time_s),
+        wall_s=None,
+        slipped_us=0,
+        battery_remaining=0.5,
+        quality=Quality(
+            flight_time_s=time_s,
+            distance_m=3.0 * time_s,
+            energy_j=energy_j,
+            computer_energy_j=watts * time_s,
+            mean_speed_m_s=3.0,
+            max_speed_m_s=4.0,
+            takeoff=Leg(0.0, 0.0, 0.0),
+        ),
+    )
+
+
+GOOD, HIT = Outcome.SUCCESS, Outcome.COLLISION
+
+REFERENCE = [
+    flight(1, GOOD, 10.0, 1000.0, 5.0),
+    flight(2, GOOD, 20.0, 3000.0, 5.0),
+    flight(3, GOOD, 30.0, 9000.0, 5.0),
+    flight(4, HIT, 5.0),
+    flight(5, Outcome.ABORTED, 1.0),
+    flight(6, GOOD, 90.0, 9000.0, 5.0),
+]
+TARGET = [
+    flight(1, GOOD, 15.0, 1100.0, 2.0),
+    flight(2, GOOD, 21.0, 3900.0, 2.0),
+    flight(3, HIT, 2.0),
+    flight(4, GOOD, 50.0),
+    flight(5, GOOD, 50.0),
+    flight(6, HIT, 2.0),
+]
+
+
+def test_a_gap_worked_out_by_hand() -> None:
+    gap = hardware_gap(REFERENCE, TARGET)
+    # Seeds 1, 2, 3, 4, 6 make pairs; 5 was aborted. Both reached the goal with 1 and 2 alone.
+    assert astuple(gap.agreement) == (2, 2, 1, 0)
+    success = gap.success_rate
+    assert (success.reference, success.other) == (0.8, 0.6)
+    assert success.difference.value == pytest.approx(-20.0)  # points, not percent
+    assert success.difference.n == 5
+    time = gap.flight_time_s
+    assert (time.change.reference, time.change.other) == (15.0, 18.0)
+    assert time.change.difference.value == pytest.approx(20.0)  # 18 / 15
+    assert time.median.value == pytest.approx(27.5)  # between +50 and +5 %
+    assert time.change.difference.n == time.median.n == 2
+    assert gap.distance_m.change.difference.value == pytest.approx(20.0)
+    assert gap.energy_j.change.difference.value == pytest.approx(25.0)  # 2500 / 2000
+    computer = gap.computer_energy_j.change
+    assert (computer.reference, computer.other) == (75.0, 36.0)
+    assert computer.difference.value == pytest.approx(-52.0)
+    total = gap.total_energy_j.change
+    assert (total.reference, total.other) == (2075.0, 2536.0)
+    assert total.difference.value == pytest.approx(100.0 * 461.0 / 2075.0)
+
+
+def test_the_other_way_round_is_another_gap() -> None:
+    back = hardware_gap(TARGET, REFERENCE)
+    assert back.success_rate.difference.value == pytest.approx(20.0)
+    assert back.flight_time_s.change.difference.value == pytest.approx(100.0 * (15.0 / 18.0 - 1.0))
+
+
+def test_nothing_in_common_is_no_gap() -> None:
+    gap = hardware_gap([flight(1, GOOD)], [flight(1, HIT)])
+    assert gap.success_rate.difference.value == -100.0
+    for field in fields(HardwareGap):
+        metric = getattr(gap, field.name)
+        if isinstance(metric, MetricGap):
+            assert metric.change.difference.value is metric.median.value is None
+            assert metric.change.difference.n == 0
+    none = hardware_gap([], [])
+    assert none.success_rate.difference.value is None
+
+
+def test_a_computer_without_watts_has_means_and_no_gap() -> None:
+    free, other = [flight(1, GOOD, watts=0.0)], [flight(1, GOOD, time_s=2.0)]
+    computer = hardware_gap(free, other).computer_energy_j
+    assert (computer.change.reference, computer.change.other) == (0.0, 4.0)
+    assert computer.change.difference.value is computer.median.value is None
+    assert hardware_gap(free, other).total_energy_j.change.difference.value is not None
+
+
+# --- intervals
+
+
+def test_the_interval_of_the_means_is_scipys_bootstrap_over_pairs() -> None:
+    rng = np.random.default_rng(1)
+    first = rng.gamma(5.0, 2.0, 60)
+    second = first * rng.lognormal(0.3, 0.2, 60)
+    gap = metric_gap(first, second).change.difference
+    pairs = stats.bootstrap(
+        (first, second),
+        lambda a, b, axis=-1: 100.0 * (b.mean(axis=axis) / a.mean(axis=axis) - 1.0),
+        paired=True,
+        n_resamples=RESAMPLES,
+        rng=np.random.default_rng(BOOTSTRAP_SEED),
+        method="BCa",
+    ).confidence_interval
+    assert gap.value == pytest.approx(100.0 * (second.mean() / first.mean() - 1.0))
+    assert gap.low == pytest.approx(pairs.low)
+    assert gap.high == pytest.approx(pairs.high)
+    assert pairs.low < pairs.high
+
+
+@pytest.mark.parametrize("n", [2, 5, 6, 7, 20, 101, 1000])
+def test_the_interval_of_the_median_is_that_of_scipys_quantile_test(n: int) -> None:
+    rng = np.random.default_rng(n)
+    first = rng.gamma(5.0, 2.0, n)
+    second = first * rng.lognormal(0.1, 0.2, n)
+    percent = 100.0 * (second - first) / first
+    expected: Any = stats.quantile_test(percent, p=0.5).confidence_interval(0.95)
+    found = median_ratio(first, second)
+    assert found.value == pytest.approx(np.median(percent))
+    assert found.n == n
+    if n < 6:
+        assert np.isnan(expected.low) or np.isnan(expected.high)
+        assert found.low is found.high is None
+    else:
+        assert found.low == pytest.approx(expected.low)
+        assert found.high == pytest.approx(expected.high)
+
+
+def test_one_long_flight_moves_the_mean_and_not_the_median() -> None:
+    first = np.full(50, 8.0)
+    second = np.full(50, 8.0)
+    second[7] = 70.0
+    gap = metric_gap(first, second)
+    assert gap.change.difference.value == pytest.approx(100.0 * 62.0 / 400.0)
+    assert gap.median.value == 0.0
+    assert (gap.median.low, gap.median.high) == (0.0, 0.0)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.1, 1e3), st.floats(0.1, 1e3)), min_size=1, max_size=12),
+    st.floats(0.01, 100.0),
+)
+def test_a_gap_has_no_unit(pairs: list[tuple[float, float]], scale: float) -> None:
+    first, second = np.array(pairs).T
+    plain, scaled = metric_gap(first, second), metric_gap(scale * first, scale * second)
+    assert scaled.change.difference.value == pytest.approx(plain.change.difference.value, abs=1e-9)
+    assert scaled.median.value == pytest.approx(plain.median.value, abs=1e-9)
+
+
+def test_a_gap_of_two_figures() -> None:
+    assert relative_gap(11.0, 396.0) == pytest.approx(3500.0)
+    assert relative_gap(100.0, 87.0) == pytest.approx(-13.0)
+    with pytest.raises(ValueError, match="must be > 0"):
+        relative_gap(0.0, 1.0)
+
+
+# --- the paper
+
+
+@pytest.mark.parametrize("arena", sorted(SYSTEM_EVALUATION))
+def test_the_papers_system_evaluation_follows_from_its_columns(arena: str) -> None:
+    """So its figures are copied right, and its definition is ours; its success is in points."""
+    table = next(table for name, table in SYSTEM_EVALUATION.items() if name == arena)
+    found, printed = gap_of(table.reference, table.target), table.printed
+    assert found.latency_percent == pytest.approx(printed.latency_percent, rel=1e-4)
+    assert found.flight_time_percent == pytest.approx(printed.flight_time_percent, abs=0.05)
+    assert found.distance_percent == pytest.approx(printed.distance_percent, abs=0.1)
+    assert found.energy_percent == pytest.approx(printed.energy_percent, abs=0.05)
+    assert -found.success == printed.success
+
+
+def test_the_papers_mitigation_is_measured_from_the_delay_trained_policy() -> None:
+    m = MITIGATION
+    without = gap_of(m.delay_trained, m.unmitigated)
+    assert without.flight_time_percent == pytest.approx(37.73, abs=0.02)
+    assert without.distance_percent == pytest.approx(16.03, abs=0.02)
+    assert without.energy_percent == pytest.approx(15.49, abs=0.02)
+    mitigated = gap_of(m.delay_trained, m.mitigated)
+    assert abs(mitigated.flight_time_percent) == pytest.approx(0.5, abs=0.06)
+    assert abs(mitigated.distance_percent) == pytest.approx(1.37, abs=0.02)
+    assert abs(mitigated.energy_percent) == pytest.approx(0.1, abs=0.02)
+    undelayed = gap_of(m.undelayed, m.unmitigated)
+    assert undelayed.flight_time_percent == pytest.approx(86.6, abs=0.05)
+    assert undelayed.distance_percent == pytest.approx(33.2, abs=0.05)
+    assert undelayed.energy_percent == pytest.approx(48.8, abs=0.05)
+    assert gap_of(m.undelayed, m.mitigated).flight_time_percent == pytest.approx(34.7, abs=0.05)
+
+
+def test_the_papers_success_gaps_there_are_percent_of_the_target() -> None:
+    m = MITIGATION
+
+    def of_target(target: PaperFigures) -> float:
+        assert m.delay_trained.success_percent is not None
+        assert target.success_percent is not None
+        return relative_gap(target.success_percent, m.delay_trained.success_percent)
+
+    assert of_target(m.mitigated) == pytest.approx(m.printed_with.success, abs=0.01)
+    assert of_target(m.unmitigated) == pytest.approx(m.printed_without.success, abs=0.01)
+    assert gap_of(m.delay_trained, m.mitigated).success == -2.0
+    assert gap_of(m.delay_trained, m.unmitigated).success == -12.0
+
+
+def test_the_paper_agrees_with_itself_where_it_does() -> None:
+    """The texts: +97 % time, +21 % distance, +43 % energy at 300 ms; the same best networks."""
+    worst = gap_of(DEGRADATION[0], DEGRADATION[-1])
+    assert worst.flight_time_percent == pytest.approx(97.0, abs=1.0)
+    assert worst.distance_percent == pytest.approx(21.0, abs=1.0)
+    assert worst.energy_percent == pytest.approx(43.0, abs=0.2)
+    assert DEGRADATION[0].flight_time_s == MITIGATION.undelayed.flight_time_s
+    for arena, (_, success) in BEST_OF_SWEEP.items():
+        assert SYSTEM_EVALUATION[arena].reference.success_percent == success
+        assert ABLATION[arena]["none"] == success
+    for trained, rates in GENERALISATION.items():
+        assert rates[trained] == BEST_OF_SWEEP[trained][1]
