@@ -1,0 +1,1 @@
+"""The studies of the Air Learning paper: campaigns of evaluations, each with a page of answers."""
