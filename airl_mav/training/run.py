@@ -57,13 +57,16 @@ def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
     return spec.model_copy(update={"curriculum": None, "randomisation": Randomisation()})
 
 
-def train(config: TrainingConfig, folder: TrainingFolder, watcher: Watcher) -> Evaluation:
+def train(
+    config: TrainingConfig, folder: TrainingFolder, watcher: Watcher, device: str = "cpu"
+) -> Evaluation:
     """Train to the end, from the newest checkpoint if there is one.
 
     Args:
         config: What to train.
         folder: Where everything goes.
         watcher: Is told how it goes.
+        device: What learns, as torch calls it.
 
     Returns:
         The evaluation of the best weights, which lie in `folder.best_model`.
@@ -73,7 +76,7 @@ def train(config: TrainingConfig, folder: TrainingFolder, watcher: Watcher) -> E
     """
     env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment))
     env.seed(config.seed)
-    model = make_model(config.algorithm, config.network, env, config.seed)
+    model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
     callback = _Between(config, folder, watcher, env)
     meta = load_latest(folder.checkpoints, model)

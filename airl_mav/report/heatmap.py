@@ -1,0 +1,158 @@
+"""A grid of numbers as coloured fields, each with its figure written in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize, to_rgb
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from airl_mav.report.figures import quiet
+from airl_mav.report.theme import INK, MARK, MUTED, RULE
+
+CELL_WIDTH_IN, CELL_HEIGHT_IN = 1.12, 0.62
+MARGIN_IN = (1.15, 1.05)
+"""Room beside and above the fields, axes and colour bar included."""
+
+LEAST_IN = (4.4, 2.6)
+"""Smallest figure: titles need room however few the fields."""
+
+DARK_INK, LIGHT_INK = "#010203", "#ffffff"
+"""Figures in bright and in dark fields; the fields keep their colours in a dark page, and so do
+these. They are none of the theme's colours for that reason."""
+
+BRIGHT = 0.179
+"""Relative luminance of a field on which black and white are read equally well."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field of a heat map."""
+
+    value: float
+    """What the colour shows."""
+    text: str
+    """What is written, at most two lines."""
+    marked: bool = False
+    """Framed: the one to look at."""
+
+
+@dataclass(frozen=True)
+class HeatMap:
+    """Rows from bottom to top, columns from left to right; a field that is missing stays empty."""
+
+    title: str
+    rows: Sequence[int]
+    row_title: str
+    columns: Sequence[int]
+    column_title: str
+    fields: Mapping[tuple[int, int], Field]
+    """By (row, column)."""
+    unit: str
+    limits: tuple[float, float]
+    """Values of the first and the last colour."""
+    logarithmic: bool = False
+    note: str = field(default="")
+    """Small, under the title."""
+
+    @property
+    def size_in(self) -> tuple[float, float]:
+        """Width and height of a figure of it."""
+        return (
+            max(LEAST_IN[0], MARGIN_IN[0] + CELL_WIDTH_IN * len(self.columns)),
+            max(LEAST_IN[1], MARGIN_IN[1] + CELL_HEIGHT_IN * len(self.rows)),
+        )
+
+
+def colours() -> Colormap:
+    """Return a map from pale to dark that is read in grey and by the colour-blind too."""
+    return ListedColormap(colormaps["YlGnBu"](np.linspace(0.06, 0.92, 256)), name="fields")
+
+
+def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
+    """Draw a heat map with its colour bar; return the axes of the fields."""
+    ax: Axes = figure.subplots()
+    norm = (LogNorm if heat.logarithmic else Normalize)(*heat.limits, clip=True)
+    shades = colours()
+    for y, row in enumerate(heat.rows):
+        for x, column in enumerate(heat.columns):
+            _draw_field(ax, x, y, heat.fields.get((row, column)), shades, norm)
+    ax.set_xlim(-0.5, len(heat.columns) - 0.5)
+    ax.set_ylim(-0.5, len(heat.rows) - 0.5)
+    ax.set_xticks(range(len(heat.columns)), [f"{column}" for column in heat.columns])
+    ax.set_yticks(range(len(heat.rows)), [f"{row}" for row in heat.rows])
+    ax.set_xlabel(heat.column_title, fontsize=8.5, color=MUTED)
+    ax.set_ylabel(heat.row_title, fontsize=8.5, color=MUTED)
+    ax.set_title(heat.title, loc="left", fontsize=10.5, color=INK, pad=16 if heat.note else 6)
+    if heat.note:
+        ax.text(0.0, 1.0, heat.note, transform=ax.transAxes, va="bottom", fontsize=8.5, color=MUTED)
+    quiet(ax, grid=False)
+    ax.tick_params(labelsize=9, labelcolor=INK)
+    bar = figure.colorbar(ScalarMappable(norm, shades), ax=ax, fraction=0.06, pad=0.02)
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(colors=MUTED, labelsize=8, length=0, which="both")
+    if heat.logarithmic:
+        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
+        bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    bar.set_label(heat.unit, fontsize=8.5, color=MUTED)
+    return ax
+
+
+def _plain(value: float) -> str:
+    """Return a number as people write it: 200 M."""
+    for unit, size in ((" G", 1e9), (" M", 1e6), (" k", 1e3)):
+        if value >= size:
+            return f"{value / size:g}{unit}"
+    return f"{value:g}"
+
+
+def _draw_field(
+    ax: Axes, x: int, y: int, told: Field | None, shades: Colormap, norm: Normalize
+) -> None:
+    corner = (x - 0.48, y - 0.47)
+    if told is None:
+        ax.add_patch(
+            Rectangle(corner, 0.96, 0.94, facecolor="none", edgecolor=RULE, hatch="///", lw=0.6)
+        )
+        return
+    colour = shades(norm(told.value))
+    ax.add_patch(Rectangle(corner, 0.96, 0.94, facecolor=colour, edgecolor="none"))
+    if told.marked:
+        # Drawn inside, so that neighbours do not cover it.
+        ax.add_patch(
+            Rectangle(
+                (x - 0.455, y - 0.435),
+                0.91,
+                0.87,
+                facecolor="none",
+                edgecolor=MARK,
+                lw=2.2,
+                zorder=3,
+            )
+        )
+    ax.text(
+        x,
+        y,
+        told.text,
+        ha="center",
+        va="center",
+        fontsize=9,
+        linespacing=1.25,
+        color=_ink_on(colour),
+        zorder=4,
+    )
+
+
+def _ink_on(colour: tuple[float, ...]) -> str:
+    """Return what is read on a colour (relative luminance after WCAG 2.1)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return DARK_INK if luminance > BRIGHT else LIGHT_INK

@@ -1,0 +1,46 @@
+"""Small sweeps for tests: a file, and results that nobody has trained for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.profiles.loading import profiles_dir
+from airl_mav.sweep.config import SweepConfig
+from airl_mav.sweep.result import Trained, TrialResult
+from airl_mav.sweep.trial import Trial, size_of
+
+TINY = (profiles_dir() / "sweeps" / "tiny.toml").read_text(encoding="utf-8")
+
+
+def write_sweep_file(folder: Path, text: str = TINY) -> Path:
+    path = folder / "small.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def fake_results(
+    config: SweepConfig, trials: Sequence[Trial], successes: Sequence[int], episodes: int = 300
+) -> list[TrialResult]:
+    """Return results with so many successes each."""
+    results = []
+    for trial, count in zip(trials, successes, strict=True):
+        size = size_of(config, trial)
+        outcomes = {Outcome.SUCCESS: count, Outcome.COLLISION: episodes - count}
+        trained = Trained(config.training.steps, config.training.steps, 0.5, 60.0)
+        results.append(
+            TrialResult(
+                trial=trial,
+                parameters=size.parameters,
+                macs=size.macs,
+                trained=trained,
+                episodes=episodes,
+                successes=count,
+                outcomes=outcomes,
+                flight_time_s=8.0 if count else None,
+                distance_m=25.0 if count else None,
+                energy_j=3500.0 if count else None,
+            )
+        )
+    return results
