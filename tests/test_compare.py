@@ -23,10 +23,10 @@ from airl_mav.cli.report_command import ReportCommand
 from airl_mav.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.harness.run_folder import RunFolder
-from airl_mav.report.compare import Compared, keyed, lettered, load_compared
-from airl_mav.report.compare_figures import _steps
-from airl_mav.report.compare_page import build_comparison, panel_of
-from airl_mav.report.compare_tables import (
+from airl_mav.report.compare.build import Compared, keyed, lettered, load_compared
+from airl_mav.report.compare.figures import _steps
+from airl_mav.report.compare.page import build_comparison, panel_of
+from airl_mav.report.compare.tables import (
     flown_table,
     latency_table,
     pairing_tables,

@@ -31,11 +31,11 @@ from airl_mav.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.report import gap_terminal
-from airl_mav.report.gap import GapStudy, worst_seeds
-from airl_mav.report.gap_file import GAP_FILE, read_gap, write_gap
-from airl_mav.report.gap_tables import columns_table, detail_table, gaps_table
-from airl_mav.report.gap_words import answers
+from airl_mav.report.gap import terminal as gap_terminal
+from airl_mav.report.gap.build import GapStudy, worst_seeds
+from airl_mav.report.gap.file import GAP_FILE, read_gap, write_gap
+from airl_mav.report.gap.tables import columns_table, detail_table, gaps_table
+from airl_mav.report.gap.words import answers
 
 EPISODES = 24
 ROLES = ("reference", "target", "mitigated", "training", "mitigated-reference")

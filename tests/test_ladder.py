@@ -32,16 +32,17 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
 from airl_mav.harness import evaluation_gym
 from airl_mav.harness.run_folder import RunFolder, load
-from airl_mav.report import html, ladder_page
-from airl_mav.report.ladder import LADDER_FILE, Held, Ladder, build_ladder, read_ladder
-from airl_mav.report.ladder_page import build_page, differences_figure
-from airl_mav.report.ladder_tables import (
+from airl_mav.report import html
+from airl_mav.report.ladder import page as ladder_page
+from airl_mav.report.ladder.build import LADDER_FILE, Held, Ladder, build_ladder, read_ladder
+from airl_mav.report.ladder.page import build_page, differences_figure
+from airl_mav.report.ladder.tables import (
     MEASURES,
     comparison_tables,
     levels_table,
     split_table,
 )
-from airl_mav.report.ladder_words import differences_in_words
+from airl_mav.report.ladder.words import differences_in_words
 
 EPISODES, SITL_EPISODES = 24, 6
 WORDS: dict[str, Any] = {"arena": "dense-obstacles", "episodes": EPISODES, "seed": 20}

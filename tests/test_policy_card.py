@@ -261,10 +261,10 @@ def test_a_kill_between_policy_and_card_leaves_no_card_for_the_wrong_policy(
 ) -> None:
     old = read_card(folder)
 
-    def killed(path: Path, data: bytes) -> None:
+    def killed(path: Path, data: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(card_module, "replace_file", killed)
+    monkeypatch.setattr(card_module, "write_json", killed)
     with pytest.raises(KeyboardInterrupt):
         export_tiny(folder, "PPO", name="other")
     monkeypatch.undo()

@@ -26,7 +26,7 @@ from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_map
-from airl_mav.report.sweep_page import build_page
+from airl_mav.report.sweep.page import build_page
 from airl_mav.report.theme import new_figure, render_png
 from airl_mav.sweep.config import load_sweep
 from airl_mav.sweep.size_fit import fit_times, neighbours

@@ -81,8 +81,8 @@ def check_root(root: Path, *, but: str | None = None) -> None:
         but: Name of the file by which a campaign of the same kind is known.
     """
     # Imported late: they draw and reckon, and a typo must not wait for them.
-    from airl_mav.report.gap_file import GAP_FILE
-    from airl_mav.report.ladder import LADDER_FILE
+    from airl_mav.report.gap.file import GAP_FILE
+    from airl_mav.report.ladder.build import LADDER_FILE
 
     others = {
         RUN_FILE: "a single run",

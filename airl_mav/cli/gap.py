@@ -17,7 +17,7 @@ from airl_mav.harness.workers import GREATEST_WORKERS
 if TYPE_CHECKING:
     from airl_mav.cli.cells import FlownCell
     from airl_mav.cli.gap_plan import GapPlan
-    from airl_mav.report.gap import HeldArena
+    from airl_mav.report.gap.build import HeldArena
 
 
 def run(command: GapCommand, console: Console | None = None) -> int:
@@ -38,7 +38,7 @@ def run(command: GapCommand, console: Console | None = None) -> int:
     # Imported late: the kernels take a second to load, and a typo must not wait for them.
     from airl_mav.cli.cells import check_root, fly_cells
     from airl_mav.cli.gap_plan import plan_gap
-    from airl_mav.report.gap_file import GAP_FILE
+    from airl_mav.report.gap.file import GAP_FILE
 
     plan = plan_gap(command)
     name = f"{plan.policy.name}-{plan.target.name}"
@@ -48,8 +48,8 @@ def run(command: GapCommand, console: Console | None = None) -> int:
         console.print(remark, style="yellow", soft_wrap=True, markup=False, highlight=False)
     flown, code = fly_cells(root, [planned.cell for planned in plan.cells], console)
     if flown:
-        from airl_mav.report.gap import build_gap
-        from airl_mav.report.gap_terminal import show_gap
+        from airl_mav.report.gap.build import build_gap
+        from airl_mav.report.gap.terminal import show_gap
 
         show_gap(build_gap(root, plan.facts, _held(plan, flown)), console)
     return code
@@ -57,7 +57,7 @@ def run(command: GapCommand, console: Console | None = None) -> int:
 
 def _held(plan: GapPlan, flown: Sequence[FlownCell]) -> list[HeldArena]:
     """Return where the flights of each column lie, of those columns that have any."""
-    from airl_mav.report.gap import Held, HeldArena
+    from airl_mav.report.gap.build import Held, HeldArena
 
     by_key = {held.cell.key: held for held in flown}
     columns: dict[str, list[Held]] = {}

@@ -47,9 +47,9 @@ def run(command: LadderCommand, console: Console | None = None) -> int:
             raise UsageError(f"--out {root}: holds {what}; accepted: another folder")
     held, code = climb.fly(root, console)
     if len(held) > 1:
-        from airl_mav.report.ladder import build_ladder, write_ladder
-        from airl_mav.report.ladder_page import build_page
-        from airl_mav.report.ladder_terminal import print_ladder
+        from airl_mav.report.ladder.build import build_ladder, write_ladder
+        from airl_mav.report.ladder.page import build_page
+        from airl_mav.report.ladder.terminal import print_ladder
 
         facts: dict[str, Any] = {"policy": climb.policy.name, "arena": arena}
         facts |= {key: getattr(command, key) for key in FACTS} | {"rules": climb.rules}

@@ -11,7 +11,7 @@ from airl_mav.cli.evaluate_task import Result, prepare
 from airl_mav.cli.ladder_command import LadderCommand, LevelName
 from airl_mav.policy.registry import find_policy
 from airl_mav.report.html import REPORT_FILE
-from airl_mav.report.ladder import Held
+from airl_mav.report.ladder.build import Held
 from airl_mav.report.rebuild import rebuild
 from airl_mav.report.tables import OUTCOME_WORDS
 

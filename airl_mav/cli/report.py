@@ -10,14 +10,14 @@ from airl_mav.cli.report_command import ReportCommand
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.harness.run_folder import RUN_FILE
-from airl_mav.report.compare import COMPARE_FILE, load_compared, run_folders
-from airl_mav.report.compare_page import build_comparison
-from airl_mav.report.compare_terminal import print_comparison
-from airl_mav.report.gap_file import GAP_FILE, read_gap
-from airl_mav.report.gap_terminal import show_gap
-from airl_mav.report.ladder import LADDER_FILE, read_ladder
-from airl_mav.report.ladder_page import build_page
-from airl_mav.report.ladder_terminal import print_ladder
+from airl_mav.report.compare.build import COMPARE_FILE, load_compared, run_folders
+from airl_mav.report.compare.page import build_comparison
+from airl_mav.report.compare.terminal import print_comparison
+from airl_mav.report.gap.file import GAP_FILE, read_gap
+from airl_mav.report.gap.terminal import show_gap
+from airl_mav.report.ladder.build import LADDER_FILE, read_ladder
+from airl_mav.report.ladder.page import build_page
+from airl_mav.report.ladder.terminal import print_ladder
 from airl_mav.report.rebuild import rebuild
 from airl_mav.report.terminal import print_report
 

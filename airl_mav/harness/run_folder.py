@@ -6,7 +6,6 @@ which is written last; arrays without a line belong to an episode that never end
 
 from __future__ import annotations
 
-import json
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -17,15 +16,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from airl_mav.atomic import add_arrays, replace_file
+from airl_mav.atomic import add_arrays
 from airl_mav.clock import utc_now
 from airl_mav.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.provenance import describe_machine, git_state, package_versions
+from airl_mav.versioned import read_versioned, write_json
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""
@@ -155,7 +155,8 @@ class RunFolder:
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
         """Replace the settings and the seeds that are planned, in `run.json`."""
         path = self.path / RUN_FILE
-        _write_info(path, replace(_load_info(path), config=dict(config), seeds=tuple(seeds)))
+        info = read_versioned(path, _INFO, SCHEMA, "run")
+        _write_info(path, replace(info, config=dict(config), seeds=tuple(seeds)))
 
     def tlog_path(self, index: int) -> Path:
         """Return the path of an episode's raw MAVLink log."""
@@ -208,7 +209,7 @@ def load(path: Path) -> LoadedRun:
     Raises:
         UsageError: The folder holds no run, or a file of it cannot be read.
     """
-    info = _load_info(path / RUN_FILE)
+    info = read_versioned(path / RUN_FILE, _INFO, SCHEMA, "run")
     episodes = _load_episodes(path / EPISODES_FILE)
     done = {episode.index for episode in episodes}
     stamps = _load_arrays(path / LATENCY_FILE)
@@ -223,28 +224,7 @@ def load(path: Path) -> LoadedRun:
 
 def _write_info(path: Path, info: RunInfo) -> None:
     """Write `run.json`."""
-    plain = _INFO.dump_python(info, mode="json")
-    text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(path, text.encode())
-
-
-def _load_info(path: Path) -> RunInfo:
-    """Read `run.json`."""
-    try:
-        data = json.loads(path.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{path.parent}: no run here: {RUN_FILE}: {error.strerror}") from None
-    except ValueError as error:
-        raise UsageError(f"{path}: not JSON: {error}") from None
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise UsageError(f"{path}: schema = {schema!r}: accepted: {SCHEMA}")
-    try:
-        return _INFO.validate_python(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{path}: {field}: {first['msg']}") from None
+    write_json(path, _INFO.dump_python(info, mode="json"))
 
 
 def _load_episodes(path: Path) -> tuple[EpisodeRecord, ...]:

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 
 from pydantic import Field, Strict, ValidationError, model_validator
 
-from airl_mav.atomic import replace_file
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.errors import UsageError
 from airl_mav.flight.setup import Level
@@ -23,6 +22,7 @@ from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import explain
 from airl_mav.profiles.vehicle import Camera
+from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of the card's fields."""
@@ -186,8 +186,7 @@ def write_card(folder: Path, card: PolicyCard) -> None:
     if card.torch_sha256 is not None:
         read_torch_program(folder, card)
     plain = {"schema": SCHEMA, **card.model_dump(mode="json")}
-    text = json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(folder / CARD_FILE, text.encode())
+    write_json(folder / CARD_FILE, plain)
 
 
 def add_result(folder: Path, result: Result) -> PolicyCard:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from airl_mav.flight.paired import Comparison
 from airl_mav.report.figures import quiet
-from airl_mav.report.ladder_tables import MEASURES, Measure, change_of
+from airl_mav.report.ladder.tables import MEASURES, Measure, change_of
 from airl_mav.report.theme import (
     INK,
     MARK,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from pydantic import TypeAdapter
 from airl_mav.atomic import replace_file
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.report.tables import NONE, Column, TableView
+from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `matrix.json`; docs/run-folder.md describes it."""
@@ -125,8 +125,7 @@ def write_matrix(folder: Path, facts: Mapping[str, Any], cells: Sequence[Cell]) 
         for cell in cells
     ]
     data = {"schema": SCHEMA, **facts, "cells": rows}
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(folder / MATRIX_FILE, text.encode())
+    write_json(folder / MATRIX_FILE, data)
     told = ", ".join(f"{key} {value}" for key, value in facts.items() if value is not None)
     parts = [told, *(markdown_table(view) for view in matrix_tables(cells))]
     replace_file(folder / MATRIX_TABLE_FILE, ("\n\n".join(parts) + "\n").encode())

@@ -14,10 +14,10 @@ from airl_mav.cli.cells import Cell
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.gap_plan import GapPlan, plan_gap
 from airl_mav.errors import UsageError
-from airl_mav.report.gap import GapStudy
-from airl_mav.report.gap_file import read_gap
-from airl_mav.report.gap_tables import all_tables
-from airl_mav.report.gap_words import answers
+from airl_mav.report.gap.build import GapStudy
+from airl_mav.report.gap.file import read_gap
+from airl_mav.report.gap.tables import all_tables
+from airl_mav.report.gap.words import answers
 from airl_mav.studies.parts import facts_of, fan_data, fan_gallery, fan_table, made_of, runs_of
 from airl_mav.studies.sheet import Section, Sheet
 from airl_mav.studies.study import FanConfig, Flown, Study, StudyConfig

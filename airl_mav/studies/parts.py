@@ -15,7 +15,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Aggregate, Estimate, bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
-from airl_mav.report.compare_page import first_arena
+from airl_mav.report.compare.page import first_arena
 from airl_mav.report.fan import Panel, fan_pictures, fan_sheet
 from airl_mav.report.html import provenance
 from airl_mav.report.tables import NONE, Column, TableView, ms, rate_digits

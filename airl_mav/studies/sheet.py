@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from airl_mav.report.matrix import markdown_table
 from airl_mav.report.tables import TableView
 from airl_mav.report.terminal import print_table
 from airl_mav.report.theme import Picture
+from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `study.json`; docs/studies.md describes it."""
@@ -85,8 +85,7 @@ def write_sheet(sheet: Sheet, folder: Path, command: str) -> Path:
         for picture in gallery.pictures:
             replace_file(folder / f"{picture.name}.png", picture.png)
     data = {"schema": SCHEMA, "study": sheet.key, "command": command, **sheet.data}
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(folder / DATA_FILE, text.encode())
+    write_json(folder / DATA_FILE, data)
     replace_file(folder / TABLE_FILE, _markdown(sheet, command).encode())
     page = environment().get_template("study.html.j2").render(sheet=sheet, command=command)
     path = folder / PAGE_FILE

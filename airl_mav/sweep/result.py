@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from airl_mav.atomic import replace_file
 from airl_mav.envs.evaluation import OUTCOMES, Flown
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.sweep.trial import Trial
+from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `result.json`; docs/sweep.md describes it."""
@@ -104,8 +104,7 @@ def write_result(path: Path, result: TrialResult, evaluation: dict[str, Any]) ->
         evaluation: On which flights they rest: seeds and number.
     """
     data = {"schema": SCHEMA, "evaluation": evaluation, **as_data(result)}
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(path, text.encode())
+    write_json(path, data)
 
 
 def read_result(path: Path, trial: Trial, evaluation: dict[str, Any]) -> TrialResult | None:

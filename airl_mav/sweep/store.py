@@ -29,6 +29,7 @@ from airl_mav.provenance import describe_machine, git_state, package_versions
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.result import TrialResult, read_result, write_result
 from airl_mav.sweep.trial import Trial
+from airl_mav.versioned import read_json
 
 SCHEMA = 1
 """Version of `sweep.json`; docs/sweep.md describes it."""
@@ -162,14 +163,7 @@ def as_data(config: SweepConfig) -> dict[str, Any]:
 
 def read_data(path: Path) -> dict[str, Any]:
     """Return what `sweep.json` in a folder holds. Raises UsageError."""
-    file = path / SWEEP_FILE
-    try:
-        data = json.loads(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file}: not a sweep: {error}") from None
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise UsageError(f"{file}: schema: accepted: {SCHEMA}")
-    return data
+    return read_json(path / SWEEP_FILE, SCHEMA, "sweep")
 
 
 def config_of(data: dict[str, Any]) -> SweepConfig:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from airl_mav.atomic import replace_file
 from airl_mav.errors import UsageError
 from airl_mav.flight.paper import BEST_OF_SWEEP
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
@@ -21,6 +19,7 @@ from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.trial import Trial, size_of, trials
+from airl_mav.versioned import write_json
 
 
 @dataclass(frozen=True)
@@ -219,8 +218,7 @@ def write_sweep(sweep: Sweep) -> None:
         "best": {arena: _best(sweep, arena) for arena in sweep.arenas},
         "cells": [_cell_data(cell) for cell in sweep.cells],
     }
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(sweep.folder.path / SWEEP_FILE, text.encode())
+    write_json(sweep.folder.path / SWEEP_FILE, data)
 
 
 def _best(sweep: Sweep, arena: str) -> dict[str, Any] | None:

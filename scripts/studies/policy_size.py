@@ -42,7 +42,7 @@ from airl_mav.provenance import describe_machine, package_versions
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.matrix import markdown_table
-from airl_mav.report.sweep_tables import count, t2_ms
+from airl_mav.report.sweep.tables import count, t2_ms
 from airl_mav.report.tables import TOO_FEW_CELL, Column, TableView
 from airl_mav.report.terminal import print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png

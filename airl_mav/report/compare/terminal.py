@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.report.compare import Compared, Side, keyed, lettered
-from airl_mav.report.compare_tables import (
+from airl_mav.report.compare.build import Compared, Side, keyed, lettered
+from airl_mav.report.compare.tables import (
     latency_table,
     pairing_tables,
     pairs_in_words,

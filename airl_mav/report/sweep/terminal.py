@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.report.sweep_tables import best_in_words, cells_table, count, fact_rows, t2_ms
+from airl_mav.report.sweep.tables import best_in_words, cells_table, count, fact_rows, t2_ms
 from airl_mav.report.tables import Column, TableView
 from airl_mav.report.terminal import print_table
 from airl_mav.sweep.config import SweepConfig

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from airl_mav.report.figures import quiet
 from airl_mav.report.heatmap import Field, HeatMap, draw_heat_map
 from airl_mav.report.palette import look
-from airl_mav.report.sweep_tables import count, percent, t2_ms
+from airl_mav.report.sweep.tables import count, percent, t2_ms
 from airl_mav.report.theme import INK, MARK, MUTED, PAPER, Picture, new_figure, render, render_png
 from airl_mav.sweep.summary import Cell, Sweep
 

@@ -7,8 +7,8 @@ from statistics import median
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, pair_by_seed
-from airl_mav.report.ladder import Ladder, Level
-from airl_mav.report.ladder_tables import successes_in_words
+from airl_mav.report.ladder.build import Ladder, Level
+from airl_mav.report.ladder.tables import successes_in_words
 from airl_mav.report.tables import ms
 
 WIDEST = 3

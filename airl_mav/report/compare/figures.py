@@ -12,7 +12,7 @@ from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from airl_mav.latency.stages import ALL_STAGES, Samples
-from airl_mav.report.compare import Compared, Side
+from airl_mav.report.compare.build import Compared, Side
 from airl_mav.report.figures import LONG_TAIL, quiet
 from airl_mav.report.palette import look
 from airl_mav.report.tables import US_PER_MS

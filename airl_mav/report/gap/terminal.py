@@ -8,18 +8,18 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.report.gap import ArenaGap, GapStudy
-from airl_mav.report.gap_file import write_gap
-from airl_mav.report.gap_markdown import TABLES_FILE, write_markdown
-from airl_mav.report.gap_page import build_page
-from airl_mav.report.gap_tables import (
+from airl_mav.report.gap.build import ArenaGap, GapStudy
+from airl_mav.report.gap.file import write_gap
+from airl_mav.report.gap.markdown import TABLES_FILE, write_markdown
+from airl_mav.report.gap.page import build_page
+from airl_mav.report.gap.tables import (
     columns_table,
     energy_note,
     fact_rows,
     gaps_table,
     legend_rows,
 )
-from airl_mav.report.gap_words import answers
+from airl_mav.report.gap.words import answers
 from airl_mav.report.terminal import print_table
 
 

@@ -9,17 +9,17 @@ from pathlib import Path
 
 from airl_mav.atomic import replace_file
 from airl_mav.report.fan import fan_pictures, fan_sheet
-from airl_mav.report.gap import WITH, WITH_TRAINED, WITHOUT, ArenaGap, Gap, GapStudy
-from airl_mav.report.gap_figures import (
+from airl_mav.report.gap.build import WITH, WITH_TRAINED, WITHOUT, ArenaGap, Gap, GapStudy
+from airl_mav.report.gap.figures import (
     flight_panels,
     gap_picture,
     gap_sheet,
     worst_pictures,
     worst_sheet,
 )
-from airl_mav.report.gap_file import GAP_FILE
-from airl_mav.report.gap_markdown import TABLES_FILE
-from airl_mav.report.gap_tables import (
+from airl_mav.report.gap.file import GAP_FILE
+from airl_mav.report.gap.markdown import TABLES_FILE
+from airl_mav.report.gap.tables import (
     change_of,
     columns_table,
     detail_table,
@@ -30,7 +30,7 @@ from airl_mav.report.gap_tables import (
     paper_gap,
 )
 from airl_mav.report.html import REPORT_FILE, Headline, environment, provenance
-from airl_mav.report.ladder_tables import MEASURES, Measure
+from airl_mav.report.ladder.tables import MEASURES, Measure
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, TableView
 from airl_mav.report.theme import Picture
 

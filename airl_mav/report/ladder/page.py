@@ -9,8 +9,8 @@ from airl_mav.atomic import replace_file
 from airl_mav.flight.paired import Change
 from airl_mav.report.differences import Against, draw_differences, draw_sheet
 from airl_mav.report.html import REPORT_FILE, Headline, environment, provenance
-from airl_mav.report.ladder import LADDER_FILE, Ladder
-from airl_mav.report.ladder_tables import (
+from airl_mav.report.ladder.build import LADDER_FILE, Ladder
+from airl_mav.report.ladder.tables import (
     MEASURES,
     Measure,
     change_of,
@@ -21,7 +21,7 @@ from airl_mav.report.ladder_tables import (
     split_table,
     start_table,
 )
-from airl_mav.report.ladder_words import differences_in_words
+from airl_mav.report.ladder.words import differences_in_words
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, TableView
 from airl_mav.report.theme import Picture
 

@@ -17,9 +17,9 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.fan import Panel
 from airl_mav.report.figures import OUTCOME_MARKERS, quiet
-from airl_mav.report.gap import OVERLAID, ArenaGap, Flown, Role
-from airl_mav.report.gap_tables import change_of, median_of_gap, paper_gap
-from airl_mav.report.ladder_tables import MEASURES, Measure
+from airl_mav.report.gap.build import OVERLAID, ArenaGap, Flown, Role
+from airl_mav.report.gap.tables import change_of, median_of_gap, paper_gap
+from airl_mav.report.ladder.tables import MEASURES, Measure
 from airl_mav.report.overview import path_points
 from airl_mav.report.palette import look
 from airl_mav.report.tables import OUTCOME_WORDS

@@ -14,9 +14,16 @@ from airl_mav.harness.run_folder import LoadedRun
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.compare import COMPARE_FILE, Compared, Side, keyed, lettered, write_compared
-from airl_mav.report.compare_figures import cdf_pictures, cdf_sheet, energy_figure
-from airl_mav.report.compare_tables import (
+from airl_mav.report.compare.build import (
+    COMPARE_FILE,
+    Compared,
+    Side,
+    keyed,
+    lettered,
+    write_compared,
+)
+from airl_mav.report.compare.figures import cdf_pictures, cdf_sheet, energy_figure
+from airl_mav.report.compare.tables import (
     flown_table,
     latency_table,
     paired,
@@ -27,7 +34,7 @@ from airl_mav.report.compare_tables import (
 from airl_mav.report.differences import Against, draw_differences, draw_sheet
 from airl_mav.report.fan import Panel, fan_pictures, fan_sheet
 from airl_mav.report.html import REPORT_FILE, environment, provenance
-from airl_mav.report.ladder_tables import MEASURES
+from airl_mav.report.ladder.tables import MEASURES
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, rate_digits
 
 PAGE_FILE = "compare.html"

@@ -10,17 +10,17 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.atomic import replace_file
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate
 from airl_mav.harness.run_folder import LoadedRun, load
-from airl_mav.report.ladder import LADDER_FILE
+from airl_mav.report.ladder.build import LADDER_FILE
 from airl_mav.report.matrix import MATRIX_FILE
 from airl_mav.report.summary import RunSummary, summarize_run
 from airl_mav.report.tables import setup_rows
+from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `compare.json`; docs/run-folder.md describes it."""
@@ -311,8 +311,7 @@ def write_compared(compared: Compared, folder: Path) -> None:
             for pairing in compared.pairings
         ],
     }
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(folder / COMPARE_FILE, text.encode())
+    write_json(folder / COMPARE_FILE, data)
 
 
 def _side_data(side: Side) -> dict[str, Any]:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
@@ -20,6 +17,7 @@ from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.harness.run_folder import LoadedRun, RunInfo, load
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples
+from airl_mav.versioned import read_versioned, write_json
 
 SCHEMA = 1
 """Version of `ladder.json`; docs/run-folder.md describes it."""
@@ -245,8 +243,7 @@ def write_ladder(ladder: Ladder) -> None:
             for seed, flights in ladder.split()
         ],
     }
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(ladder.path / LADDER_FILE, text.encode())
+    write_json(ladder.path / LADDER_FILE, data)
 
 
 def _level_data(level: Level) -> dict[str, Any]:
@@ -274,20 +271,5 @@ def read_ladder(path: Path) -> Ladder:
     Raises:
         UsageError: The folder holds none, or its runs cannot be read.
     """
-    file = path / LADDER_FILE
-    try:
-        data = json.loads(file.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{path}: no ladder here: {LADDER_FILE}: {error.strerror}") from None
-    except ValueError as error:
-        raise UsageError(f"{file}: not JSON: {error}") from None
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise UsageError(f"{file}: schema = {schema!r}: accepted: {SCHEMA}")
-    try:
-        held = _HELD.validate_python(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{file}: {field}: {first['msg']}") from None
+    held = read_versioned(path / LADDER_FILE, _HELD, SCHEMA, "ladder")
     return build_ladder(path, held.facts, held.levels)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from airl_mav.flight.paired import Change, Comparison
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.ladder import Ladder, Level
+from airl_mav.report.ladder.build import Ladder, Level
 from airl_mav.report.tables import FEW_FLIGHTS, NONE, OUTCOME_WORDS, Column, TableView, ms
 
 MAX_SPLIT = 50

@@ -11,8 +11,8 @@ from airl_mav.flight.gap import HardwareGap, MetricGap
 from airl_mav.flight.paired import Change
 from airl_mav.flight.paper import PaperFigures, PrintedGaps
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.gap import ArenaGap, Flown, Gap, GapStudy
-from airl_mav.report.ladder_tables import MEASURES, Measure, successes_in_words, with_interval
+from airl_mav.report.gap.build import ArenaGap, Flown, Gap, GapStudy
+from airl_mav.report.ladder.tables import MEASURES, Measure, successes_in_words, with_interval
 from airl_mav.report.tables import FEW_FLIGHTS, NONE, Column, TableView, ms
 
 COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2, "%")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.gap import WITH, WITH_TRAINED, WITHOUT, ArenaGap, Flown, GapStudy
+from airl_mav.report.gap.build import WITH, WITH_TRAINED, WITHOUT, ArenaGap, Flown, GapStudy
 from airl_mav.report.tables import US_PER_MS
 
 

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
 from airl_mav.flight.gap import HardwareGap
 from airl_mav.flight.paper import PaperFigures, PrintedGaps
 from airl_mav.flight.statistics import Aggregate, Estimate
-from airl_mav.report.gap import Flown, Gap, GapStudy, HeldArena, build_gap
+from airl_mav.report.gap.build import Flown, Gap, GapStudy, HeldArena, build_gap
+from airl_mav.versioned import read_versioned, write_json
 
 SCHEMA = 1
 """Version of `gap.json`; docs/run-folder.md describes it."""
@@ -61,8 +59,7 @@ def write_gap(study: GapStudy, answers: Sequence[str]) -> None:
             for arena in study.arenas
         ],
     }
-    text = json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
-    replace_file(study.path / GAP_FILE, text.encode())
+    write_json(study.path / GAP_FILE, data)
 
 
 def _column_data(column: Flown) -> dict[str, Any]:
@@ -111,20 +108,5 @@ def read_gap(path: Path) -> GapStudy:
     Raises:
         UsageError: The folder holds none, or its runs cannot be read.
     """
-    file = path / GAP_FILE
-    try:
-        data = json.loads(file.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{path}: no hardware gap here: {GAP_FILE}: {error.strerror}") from None
-    except ValueError as error:
-        raise UsageError(f"{file}: not JSON: {error}") from None
-    schema = data.get("schema") if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise UsageError(f"{file}: schema = {schema!r}: accepted: {SCHEMA}")
-    try:
-        held = _HELD.validate_python(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise UsageError(f"{file}: {field}: {first['msg']}") from None
+    held = read_versioned(path / GAP_FILE, _HELD, SCHEMA, "hardware gap")
     return build_gap(path, held.facts, held.arenas)

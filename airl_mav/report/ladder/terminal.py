@@ -8,15 +8,15 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.report.ladder import Ladder
-from airl_mav.report.ladder_tables import (
+from airl_mav.report.ladder.build import Ladder
+from airl_mav.report.ladder.tables import (
     comparison_tables,
     decisions_table,
     fact_rows,
     levels_table,
     start_table,
 )
-from airl_mav.report.ladder_words import differences_in_words
+from airl_mav.report.ladder.words import differences_in_words
 from airl_mav.report.terminal import print_table
 
 

@@ -10,8 +10,8 @@ from typing import Any
 from airl_mav.atomic import replace_file
 from airl_mav.report.html import Headline, environment
 from airl_mav.report.matrix import markdown_table
-from airl_mav.report.sweep_figures import sheet, size_figure, success_figure, trade_figure
-from airl_mav.report.sweep_tables import best_in_words, cells_table, fact_rows, percent
+from airl_mav.report.sweep.figures import sheet, size_figure, success_figure, trade_figure
+from airl_mav.report.sweep.tables import best_in_words, cells_table, fact_rows, percent
 from airl_mav.report.tables import NONE, TableView
 from airl_mav.report.theme import Picture
 from airl_mav.sweep.store import SWEEP_FILE, as_data

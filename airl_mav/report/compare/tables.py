@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.percentiles import MIN_SAMPLES
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES, Stage
-from airl_mav.report.compare import Compared, Pairing, Side
-from airl_mav.report.ladder_tables import MEASURES, Measure, comparison_table, with_interval
+from airl_mav.report.compare.build import Compared, Pairing, Side
+from airl_mav.report.ladder.tables import MEASURES, Measure, comparison_table, with_interval
 from airl_mav.report.tables import (
     FEW_FLIGHTS,
     NONE,

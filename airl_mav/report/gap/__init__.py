@@ -1,0 +1,1 @@
+"""The hardware gap: worked out, tabled, drawn."""

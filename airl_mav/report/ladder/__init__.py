@@ -1,0 +1,1 @@
+"""The fidelity ladder: worked out, tabled, drawn."""
