@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,18 +21,22 @@ from processes import ROOT
 from rich.console import Console
 from test_companion_light import BLOCK
 
-from airl_mav.cli import profile
+from airl_mav.cli import profile, profile_hil
 from airl_mav.cli.companion_command import CompanionCommand, sampler
 from airl_mav.cli.profile_command import ProfileCommand
-from airl_mav.cli.profile_plan import planned
-from airl_mav.cli.profile_report import correlation_line, verdict
+from airl_mav.cli.profile_plan import Measured, planned
+from airl_mav.cli.profile_report import correlation_line, stages_of, verdict
+from airl_mav.clock import WallClock
 from airl_mav.errors import UsageError
+from airl_mav.latency.clock_offset import Exchanges
 from airl_mav.latency.stages import STAGES
+from airl_mav.latency.stamps import DecisionLog
 from airl_mav.machine_state import MachineState
 from airl_mav.ports import Ports
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.computer_file import existing_profile, write_profile
 from airl_mav.profiles.loading import list_profiles
+from companion.mission import MissionResult
 
 SMALL = {"network": "2x4", "image": "64x48"}
 
@@ -314,12 +319,122 @@ def test_busy_machine_is_said_to_be_so() -> None:
     assert "load average 8.50 on 2 usable cores" in remark
 
 
+AHEAD_US = 5_000_000
+
+
+def flown_beside(simulator_us: Callable[[int], int]) -> profile_hil.Flown:
+    """A flight of 40 decisions against a simulator whose clock is a function of ours."""
+
+    def asked(start_us: int, n: int, interval_us: int, trip_us: int) -> Exchanges:
+        sent = start_us + interval_us * np.arange(n)
+        remote = np.array([simulator_us(int(t) + trip_us // 2) for t in sent])
+        return Exchanges(sent, remote, sent + trip_us)
+
+    log = DecisionLog()
+    for i in range(40):
+        seen_us = 2_000_000 + 60_000 * i
+        stamps = (np.array([8_000, 8_100, 9_000, 9_100, 59_100]) + seen_us).tolist()
+        log.record(simulator_us(seen_us), *stamps, (0.0, 0.0, 0.0, 0.0))
+    return profile_hil.Flown(
+        MissionResult("stopped", (), log),
+        asked(0, 100, 5_000, 400),
+        asked(1_000_000, 50, 100_000, 700),
+        asked(7_000_000, 100, 5_000, 600),
+    )
+
+
+def test_exposures_are_brought_to_this_computers_clock() -> None:
+    flown = flown_beside(lambda own_us: own_us + AHEAD_US)
+    stamps, seen, remarks = profile_hil.joined(flown, 10)
+    assert seen == "capture_us"
+    t1_us = stamps["decoded_us"] - stamps["capture_us"]
+    assert (np.abs(t1_us - 8_000) <= stamps["capture_uncertainty_us"]).all()
+    # Between half of 400 and half of 600, and 2 for two clocks of whole microseconds.
+    assert stamps["capture_uncertainty_us"].min() >= 200
+    assert stamps["capture_uncertainty_us"].max() <= 303
+    assert len(stamps["decoded_us"]) == 30
+    # Those of decisions only, not of take-off and landing.
+    first_us, last_us = stamps["exchange_sent_us"][[0, -1]]
+    assert stamps["infer_start_us"][0] <= first_us < last_us <= stamps["held_until_us"][-1]
+    assert "least round trip 0.400 ms" in remarks[0]
+    assert "least round trip 0.600 ms" in remarks[0]
+    assert "50 of 50 exchanges in flight agree" in remarks[0]
+    measured = Measured((stamps,), seen, 0, 0)
+    stages = stages_of(measured)
+    assert set(stages["mavlink_round_trip"].tolist()) == {700}
+    assert stages["t1_uncertainty"].max() == stamps["capture_uncertainty_us"].max()
+    assert stages["link"].size == stages["end_to_end"].size == 0
+
+
+@pytest.mark.parametrize(
+    ("simulator_us", "why"),
+    [
+        # It fell behind in flight, and gave up time.
+        (lambda own_us: own_us + AHEAD_US - 300_000 * (own_us > 3_000_000), "ppm"),
+        (lambda own_us: 2 * own_us, "as if a clock did not keep real time"),
+    ],
+)
+def test_clocks_that_cannot_be_related(simulator_us: Callable[[int], int], why: str) -> None:
+    stamps, seen, (remark,) = profile_hil.joined(flown_beside(simulator_us), 10)
+    assert seen == "decoded_us"
+    assert "capture_us" not in stamps
+    assert remark.startswith("t1, link, control and end to end were not measured (-)")
+    assert why in remark
+    assert "t1_uncertainty" not in stages_of(Measured((stamps,), seen, 0, 0))
+
+
+def test_an_autopilot_without_timesync() -> None:
+    none = Exchanges(*(np.zeros(0, np.int64) for _ in range(3)))
+    flown = replace(
+        flown_beside(lambda own_us: own_us + AHEAD_US), before=none, between=none, after=none
+    )
+    stamps, seen, (remark,) = profile_hil.joined(flown, 10)
+    assert (seen, len(stamps["exchange_sent_us"])) == ("decoded_us", 0)
+    assert "0 answers in a row" in remark
+
+
+def test_frames_of_yet_another_clock() -> None:
+    flown = flown_beside(lambda own_us: own_us + AHEAD_US)
+    shifted = [
+        Exchanges(row.sent_us, row.remote_us - 20_000, row.received_us)
+        for row in (flown.before, flown.between, flown.after)
+    ]
+    flown = profile_hil.Flown(flown.result, *shifted)
+    _, seen, (remark,) = profile_hil.joined(flown, 10)
+    assert seen == "decoded_us"
+    assert "30 frames would have been decoded before they were exposed" in remark
+
+
+FIRMWARE_THAT_TELLS_ITS_EPOCH = """
+import sys
+import airl_mav.cli.firmware as cli
+
+fly = cli.fly
+
+def told(firmware, *rest):
+    fly(firmware, *rest)
+    print("epoch_ns", firmware.epoch_ns, flush=True)
+    print("slipped_us", firmware.slipped_us, flush=True)
+
+cli.fly = told
+cli.main()
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
-def test_on_the_drones_computer(tmp_path: Path) -> None:
+def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks: list[WallClock] = []
+
+    def made() -> WallClock:
+        clocks.append(WallClock())
+        return clocks[-1]
+
+    monkeypatch.setattr(profile_hil, "WallClock", made)
     free = choose_ports()
-    words = [sys.executable, "-m", "airl_mav.cli.firmware", "--arena", "no-obstacles"]
-    with (tmp_path / "firmware.log").open("wb") as log:
+    words = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
+    log_path = tmp_path / "firmware.log"
+    with log_path.open("wb") as log:
         firmware = subprocess.Popen(
             [*words, *free.options()],
             cwd=tmp_path,
@@ -341,12 +456,32 @@ def test_on_the_drones_computer(tmp_path: Path) -> None:
             firmware.terminate()
             firmware.wait(30)
     stamps = np.load(tmp_path / "box.static-obstacles-hil.npz")
-    # Nothing relates the simulator's clock to ours: what lies between them is not written down.
-    assert "capture_us" not in stamps.files
-    assert "motor_us" not in stamps.files
-    assert len(stamps["sent_us"]) == 70
-    assert "t1, link, control and end to end were not measured" in printed
     facts = json.loads((tmp_path / "box.static-obstacles-hil.json").read_text())
     counts = {key: stage["n"] for key, stage in facts["stages_us"].items()}
+    assert "motor_us" not in stamps.files
+    assert len(stamps["sent_us"]) == 70
+    assert "link, control and end to end were not measured" in printed
     assert (counts["t2"], counts["t3"], counts["period"]) == (70, 70, 69)
-    assert (counts["t1"], counts["link"], counts["end_to_end"]) == (0, 0, 0)
+    assert (counts["link"], counts["end_to_end"]) == (0, 0)
+    trips = stamps["exchange_received_us"] - stamps["exchange_sent_us"]
+    assert counts["mavlink_round_trip"] == len(trips) >= 10
+    assert "MAVLink round trip" in printed
+    told = dict(re.findall(r"^(epoch_ns|slipped_us) (\d+)$", log_path.read_text(), re.MULTILINE))
+    if counts["t1"] == 0:
+        # Refused, and rightly: this host could not keep pace.
+        assert int(told["slipped_us"]) > 0
+        return
+    # Here both clocks are one, and the truth is known.
+    assert counts["t1"] == counts["t1_uncertainty"] == 70
+    assert re.search(r"t1 fetch ±\d+\.\d+", printed)
+    ahead_us = (clocks[0].epoch_ns - int(told["epoch_ns"])) / 1_000
+    error_us = stamps["capture_us"] - (stamps["capture_simulator_us"] - ahead_us)
+    within_us = stamps["capture_uncertainty_us"]
+    assert (np.abs(error_us) <= within_us).all()
+    assert (within_us < 4_000).all()
+    # What the true clock gives, as level sitl does, lies within what is printed.
+    true_t1_us = stamps["decoded_us"] - (stamps["capture_simulator_us"] - ahead_us)
+    shown, most_us = facts["stages_us"]["t1"], facts["stages_us"]["t1_uncertainty"]["max"]
+    true_p50_us = np.percentile(true_t1_us, 50.0, method="inverted_cdf")
+    assert abs(shown["p50"] - true_p50_us) <= most_us
+    assert abs(shown["mean"] - true_t1_us.mean()) <= most_us

@@ -30,9 +30,29 @@ NO_GAP, SMALL_GAP = 0.01, 0.1
 """t2 as a share of the decision period below which it adds no gap, or a small one."""
 
 
+ROUND_TRIP = "mavlink_round_trip"
+"""Key of the TIMESYNC exchanges in flight."""
+
+T1_UNCERTAINTY = "t1_uncertainty"
+"""Key of how far t1 of each decision may be off, either way."""
+
+
 def stages_of(measured: Measured) -> dict[str, Samples]:
-    """Return the durations [µs] of each stage, all flights together."""
-    return pool(stage_samples(flight) for flight in measured.flights)
+    """Return the durations [µs] of each stage, all flights together.
+
+    Where the simulator's clock was asked for (level hil) also `ROUND_TRIP`, and `T1_UNCERTAINTY` if
+    the clocks could be related.
+    """
+    stages = pool(stage_samples(flight) for flight in measured.flights)
+    if all("exchange_sent_us" in flight for flight in measured.flights):
+        stages[ROUND_TRIP] = np.concatenate(
+            [part["exchange_received_us"] - part["exchange_sent_us"] for part in measured.flights]
+        )
+    if all("capture_uncertainty_us" in flight for flight in measured.flights):
+        stages[T1_UNCERTAINTY] = np.concatenate(
+            [flight["capture_uncertainty_us"] for flight in measured.flights]
+        )
+    return stages
 
 
 def ages_of(plan: ProfilePlan, measured: Measured) -> CommandAges:
@@ -108,7 +128,13 @@ def _stage_table(plan: ProfilePlan, measured: Measured, stages: dict[str, Sample
         if not stages[stage.key].size and plan.command.level == "bare":
             continue
         s = summarize(stages[stage.key])
-        table.add_row(stage.title, f"{s.n:,}" if s.n else "-", *_cells(s))
+        title = stage.title
+        if stage.key == "t1" and T1_UNCERTAINTY in stages:
+            title = f"{title} ±{ms(float(stages[T1_UNCERTAINTY].max()))}"
+        table.add_row(title, f"{s.n:,}" if s.n else "-", *_cells(s))
+    if ROUND_TRIP in stages:
+        s = summarize(stages[ROUND_TRIP])
+        table.add_row("MAVLink round trip", f"{s.n:,}" if s.n else "-", *_cells(s))
     return table
 
 

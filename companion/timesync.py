@@ -1,0 +1,122 @@
+"""TIMESYNC exchanges with the flight controller: what its clock says, and how long asking takes.
+
+MAVSDK's own TIMESYNC keeps its result to itself, so the messages go through `mavlink_direct`.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+
+from airl_mav.clock import NS_PER_US
+from airl_mav.constants import US_PER_S
+from airl_mav.latency.clock_offset import Exchanges
+from companion.link import MavsdkLink
+
+MESSAGE = "TIMESYNC"
+
+AUTOPILOT_COMPONENT = 1
+"""MAV_COMP_ID_AUTOPILOT1: other components of the vehicle may answer too, by other clocks."""
+
+LAST_ANSWER_S = 0.2
+"""How long the last answer of a row is waited for [s]."""
+
+
+class TimesyncLink(MavsdkLink):
+    """A link that also asks the flight controller for its time."""
+
+    _direct: Any = None
+    _system_id: int
+    _pending: set[int]
+    """When questions without an answer were asked [µs]."""
+    _answered: list[tuple[int, int, int]]
+
+    def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
+        """Wait for a flight controller, as `MavsdkLink.connect`."""
+        super().connect(timeout_s, stop)
+        self._pending, self._answered = set(), []
+        self._system_id = self._system.get_system_id()
+        self._direct = MavlinkDirect(self._system)
+        self._direct.subscribe_message(MESSAGE, self._hear)
+
+    def close(self) -> None:
+        """Release MAVSDK."""
+        if self._direct is not None:
+            self._direct.destroy()
+        super().close()
+
+    def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
+        """Ask so often, and wait for the answers; `connect` comes first.
+
+        Args:
+            count: How often.
+            interval_s: From one question to the next [s].
+            stop: Set from outside to end early.
+        """
+        asked_us = self._clock.time_us()
+        for _ in range(count):
+            if stop.is_set():
+                return
+            self._ask()
+            asked_us += int(interval_s * US_PER_S)
+            self._clock.sleep_until(asked_us, stop)
+        self._clock.sleep_until(self._clock.time_us() + int(LAST_ANSWER_S * US_PER_S), stop)
+
+    @contextmanager
+    def exchanging(self, interval_s: float) -> Iterator[None]:
+        """Ask every so often [s] from a thread of its own, for as long as the context lasts."""
+        ended = threading.Event()
+
+        def ask_on() -> None:
+            due_us = self._clock.time_us()
+            while not ended.is_set():
+                self._ask()
+                # What was missed while the thread was held up is not made up for in a burst.
+                due_us = max(due_us + int(interval_s * US_PER_S), self._clock.time_us())
+                self._clock.sleep_until(due_us, ended)
+
+        thread = threading.Thread(target=ask_on, name="timesync", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+    def take_exchanges(self) -> Exchanges:
+        """Return the answered questions since the last call, in the order of the answers."""
+        # Another one may be heard meanwhile: it stays.
+        taken = self._answered[:]
+        del self._answered[: len(taken)]
+        columns = np.array(taken, np.int64).reshape(-1, 3)
+        return Exchanges(columns[:, 0], columns[:, 1], columns[:, 2])
+
+    def _ask(self) -> None:
+        sent_us = self._clock.time_us()
+        fields = {"tc1": 0, "ts1": sent_us * NS_PER_US}
+        self._pending.add(sent_us)
+        try:
+            self._direct.send_message(MavlinkMessage(MESSAGE, fields_json=json.dumps(fields)))
+        except MavlinkDirectError:
+            # As good as lost on the way.
+            self._pending.discard(sent_us)
+
+    def _hear(self, message: Any, _: object) -> None:
+        """Take an answer; called from a thread of MAVSDK's."""
+        received_us = self._clock.time_us()
+        sender = message.system_id, message.component_id
+        if sender != (self._system_id, AUTOPILOT_COMPONENT):
+            return
+        fields = json.loads(message.fields_json)
+        remote_ns, sent_us = fields["tc1"], fields["ts1"] // NS_PER_US
+        # Questions of the flight controller's own have no tc1; a second answer tells nothing new.
+        if remote_ns == 0 or sent_us not in self._pending:
+            return
+        self._pending.discard(sent_us)
+        self._answered.append((sent_us, remote_ns // NS_PER_US, received_us))
