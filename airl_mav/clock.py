@@ -16,6 +16,11 @@ from airl_mav.constants import US_PER_S
 NS_PER_US = 1_000
 
 
+def processor_time_us() -> int:
+    """Return the processor time that this process has used, all its threads together [µs]."""
+    return time.process_time_ns() // NS_PER_US
+
+
 class Clock(Protocol):
     """A source of simulated time."""
 

@@ -618,9 +618,10 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
         command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True
     )
     try:
-        second = out / "static-obstacles-target"
+        # Early: the whole of it takes but seconds, and this test may be starved meanwhile.
+        first = out / "static-obstacles-reference"
         deadline = time.monotonic() + 120.0
-        while not second.exists() and process.poll() is None and time.monotonic() < deadline:
+        while not first.exists() and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         text, _ = process.communicate(timeout=120.0)

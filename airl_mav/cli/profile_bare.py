@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 
 import numpy as np
@@ -11,8 +10,7 @@ import numpy as np
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.profile_plan import Measured, ProfilePlan
-from airl_mav.clock import Clock, WallClock
-from airl_mav.constants import US_PER_S
+from airl_mav.clock import Clock, WallClock, processor_time_us
 from airl_mav.policy.actions import Policy, limited
 from airl_mav.policy.layouts import camera_mismatch
 from airl_mav.policy.learned import LearnedPolicy, open_network
@@ -39,7 +37,7 @@ def measure(plan: ProfilePlan, progress: Callable[[int], None]) -> Measured:
     policy, load_us = opened(plan, clock)
     views = seen_by(plan)
     starts, ends = [], []
-    used = os.times()
+    used_us = processor_time_us()
     for k in range(command.warm_up + command.decisions + 1):
         view = views[k % SEEN]
         start_us = clock.time_us()
@@ -47,9 +45,8 @@ def measure(plan: ProfilePlan, progress: Callable[[int], None]) -> Measured:
         ends.append(clock.time_us())
         starts.append(start_us)
         progress(k)
-    done = os.times()
-    used_s = done.user + done.system - used.user - used.system
-    share = used_s / max((ends[-1] - starts[0]) / US_PER_S, 1e-6)
+    used_us = processor_time_us() - used_us
+    share = used_us / max(ends[-1] - starts[0], 1)
     first = 1 + command.warm_up
     stamps = {
         "infer_start_us": np.array(starts[first:], np.int64),
