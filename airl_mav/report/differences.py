@@ -8,15 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure, SubFigure
 
 from airl_mav.flight.paired import Comparison
-from airl_mav.report.figures import quiet
+from airl_mav.report.intervals import draw_estimate, finish_rows
 from airl_mav.report.ladder.tables import MEASURES, Measure, change_of
 from airl_mav.report.theme import (
-    INK,
     MARK,
-    MUTED,
     PAPER,
-    RULE,
-    SERIES,
     Picture,
     new_figure,
     render,
@@ -63,37 +59,11 @@ def _draw(
 ) -> None:
     """Draw one measure: rows from top to bottom, the reference as the line of zero."""
     ax = figure.subplots()
-    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
-    ends = [0.0]
+    ends: list[float] = []
     for row, (_, comparison) in enumerate(others):
         d = change_of(comparison, measure).difference
         told = f"n = {d.n:,}" if d.value is None else f"{d.value:+.2f}, n = {d.n:,}"
-        ax.annotate(
-            told,
-            (1.0, row - 0.14),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-            color=MARK,
-        )
-        if d.value is None:
-            continue
-        if d.low is not None and d.high is not None:
-            ax.plot([d.low, d.high], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
-            ends += [d.low, d.high]
-        ends.append(d.value)
-        ax.plot(d.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=3)
-    names = [name for name, _ in others]
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.5, -0.65)
-    # Zero stays inside, and a row without any difference still has an axis.
-    room = 0.08 * (max(ends) - min(ends)) or 1.0
-    ax.set_xlim(min(ends) - room, max(ends) + room)
-    ax.set_title(measure.title, loc="left", fontsize=10.5, color=INK, pad=6)
+        ends += draw_estimate(ax, row, d, told, MARK)
     unit = "percentage points" if measure.difference_unit == "points" else "%"
-    ax.set_xlabel(f"difference from {reference} [{unit}]", fontsize=8.5, color=MUTED)
-    quiet(ax)
-    ax.grid(False, axis="y")
-    ax.tick_params(axis="y", labelsize=9, labelcolor=INK)
-    ax.spines["bottom"].set_color(RULE)
+    names = [name for name, _ in others]
+    finish_rows(ax, names, ends, measure.title, f"difference from {reference} [{unit}]")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from pydantic import Field, model_validator
 
 from airl_mav.cli.cells import Cell
 from airl_mav.errors import UsageError
-from airl_mav.flight.gap import HardwareGap, hardware_gap, relative_gap
+from airl_mav.flight.gap import hardware_gap, relative_gap
 from airl_mav.flight.paper import DEGRADATION, PaperFigures
 from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import find_policy
@@ -30,7 +29,6 @@ from airl_mav.studies.parts import (
     gap_cells,
     made_of,
     metric,
-    path_lengths,
     quality_of,
     rate,
     runs_of,
@@ -41,13 +39,8 @@ from airl_mav.studies.parts import (
     with_range,
 )
 from airl_mav.studies.sheet import Gallery, Section, Sheet
+from airl_mav.studies.stair import BASE, Stair, fan_in_words, in_words, latency_name
 from airl_mav.studies.study import FanConfig, Flown, Study, StudyConfig
-
-BASE = "base"
-"""No latency added: 1 ms, as of a desktop computer."""
-
-FEWEST = 10
-"""Pairs from which on a step says something."""
 
 
 class DegradationConfig(StudyConfig):
@@ -74,19 +67,6 @@ class DegradationConfig(StudyConfig):
     def flown_policies(self) -> list[str]:
         """Return the policies, without those that are not there."""
         return [*self.policies, *(name for name in self.also_if_there if _there(name))]
-
-
-@dataclass(frozen=True)
-class Stair:
-    """A policy at all latencies."""
-
-    policy: str
-    flown: tuple[Flown, ...]
-    """In the order of the latencies, the reference first."""
-    gaps: tuple[HardwareGap, ...]
-    """Of every latency but the first against the first."""
-    steps: tuple[HardwareGap, ...]
-    """Of every latency but the first against the one before it."""
 
 
 def cells(config: DegradationConfig, _root: Path) -> list[Cell]:
@@ -137,7 +117,7 @@ def sheet(config: DegradationConfig, flown: Mapping[str, Flown]) -> Sheet:
     stairs = [_stair(config, policy, flown) for policy in config.flown_policies()]
     fans = {
         Path(policy).name: [
-            (_latency_name(latency), flown[_fan_key(policy, latency)])
+            (latency_name(latency), flown[_fan_key(policy, latency)])
             for latency in config.latencies
         ]
         for policy in config.flown_policies()
@@ -170,8 +150,8 @@ def sheet(config: DegradationConfig, flown: Mapping[str, Flown]) -> Sheet:
             line
             for stair in stairs
             for line in (
-                *_in_words(config, stair),
-                _fan_in_words(stair.policy, fans[stair.policy]),
+                *in_words(stair),
+                fan_in_words(stair.policy, fans[stair.policy]),
             )
         ),
         sections=tuple(sections),
@@ -192,14 +172,11 @@ def _stair(config: DegradationConfig, policy: str, flown: Mapping[str, Flown]) -
     first = held[0].run.episodes
     return Stair(
         Path(policy).name,
+        config.latencies,
         held,
         tuple(hardware_gap(first, each.run.episodes) for each in held[1:]),
         tuple(hardware_gap(a.run.episodes, b.run.episodes) for a, b in pairwise(held)),
     )
-
-
-def _latency_name(latency: str) -> str:
-    return latency if latency == BASE else latency.replace("ms", " ms")
 
 
 def _own_table(config: DegradationConfig, stair: Stair) -> TableView:
@@ -217,7 +194,7 @@ def _own_table(config: DegradationConfig, stair: Stair) -> TableView:
         q = quality_of(each)
         rows.append(
             (
-                _latency_name(latency),
+                latency_name(latency),
                 t2_ms(each),
                 rate(q.success_rate),
                 with_range(q.flight_time_s, 1.0, 2),
@@ -237,7 +214,7 @@ def _gap_table(config: DegradationConfig, stair: Stair) -> TableView:
     base = config.latencies[0]
     columns = (Column(f"against {base}", number=False), *GAP_COLUMNS)
     rows = tuple(
-        (_latency_name(latency), *gap_cells(gap))
+        (latency_name(latency), *gap_cells(gap))
         for latency, gap in zip(config.latencies[1:], stair.gaps, strict=True)
     )
     title = f"{stair.policy}: against {base}"
@@ -276,66 +253,11 @@ def _step_table(config: DegradationConfig, stair: Stair) -> TableView:
     """Return every latency against the one before it."""
     columns = (Column("step", number=False), *GAP_COLUMNS)
     rows = tuple(
-        (f"{_latency_name(a)} → {_latency_name(b)}", *gap_cells(gap))
+        (f"{latency_name(a)} → {latency_name(b)}", *gap_cells(gap))
         for (a, b), gap in zip(pairwise(config.latencies), stair.steps, strict=True)
     )
     title = f"{stair.policy}: step by step"
     return TableView(slug(title), title, columns, rows, (GAP_NOTE,))
-
-
-def _in_words(config: DegradationConfig, stair: Stair) -> list[str]:
-    """Return whether every step costs more, and how much all of them."""
-    lines = []
-    for key, title in GAP_METRICS:
-        lines.append(f"{stair.policy}, {title}: {_monotone(config, stair, key)}")
-    rates = [100.0 * (quality_of(each).success_rate.value or 0.0) for each in stair.flown]
-    told = ", ".join(f"{value:.1f}" for value in rates)
-    lines.append(f"{stair.policy}, success {_rises(config, stair)}: {told} %.")
-    return lines
-
-
-def _rises(config: DegradationConfig, stair: Stair) -> str:
-    """Return in words whether the success rate rises at any step."""
-    steps = [
-        (f"{a} → {b}", gap.success_rate.difference)
-        for (a, b), gap in zip(pairwise(config.latencies), stair.steps, strict=True)
-    ]
-    sure = [name for name, d in steps if d.low is not None and d.low > 0.0]
-    if sure:
-        return f"not monotone, it rises at {', '.join(sure)}"
-    rises = any(d.value is not None and d.value > 0.0 for _, d in steps)
-    return "rises nowhere beyond chance" if rises else "never rises"
-
-
-def _fan_in_words(policy: str, fans: Sequence[tuple[str, Flown]]) -> str:
-    """Return the path lengths of the flights to one goal."""
-    lengths = [(name, path_lengths(flown)) for name, flown in fans]
-    told = ", ".join(
-        f"{name} {'none reached it' if e.value is None else f'{e.value:.1f} m'}"
-        for name, e in lengths
-    )
-    return f"{policy}, mean path to one goal: {told}."
-
-
-def _monotone(config: DegradationConfig, stair: Stair, key: str) -> str:
-    """Return in words whether a metric grows with every step."""
-    steps = [
-        (f"{a} → {b}", metric(gap, key).change.difference)
-        for (a, b), gap in zip(pairwise(config.latencies), stair.steps, strict=True)
-    ]
-    known = [(name, d) for name, d in steps if d.value is not None and d.n >= FEWEST]
-    short = [name for name, d in steps if d.value is None or d.n < FEWEST]
-    told = ", ".join(f"{d.value:+.1f} % ({name})" for name, d in known)
-    if not known:
-        return f"fewer than {FEWEST} pairs at every step."
-    down = [name for name, d in known if (d.value or 0.0) <= 0.0]
-    sure = all(d.low is not None and d.low > 0.0 for _, d in known)
-    if down:
-        verdict = f"not monotone, it falls at {', '.join(down)}"
-    else:
-        verdict = "monotone, every step's interval above zero" if sure else "monotone"
-    rest = f" Fewer than {FEWEST} pairs: {', '.join(short)}." if short else ""
-    return f"{verdict}: {told}.{rest}"
 
 
 def _curves_section(stairs: Sequence[Stair]) -> Section:

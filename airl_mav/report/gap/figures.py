@@ -19,6 +19,7 @@ from airl_mav.report.fan import Panel
 from airl_mav.report.figures import OUTCOME_MARKERS, quiet
 from airl_mav.report.gap.build import OVERLAID, ArenaGap, Flown, Role
 from airl_mav.report.gap.tables import change_of, median_of_gap, paper_gap
+from airl_mav.report.intervals import draw_estimate, finish_rows
 from airl_mav.report.ladder.tables import MEASURES, Measure
 from airl_mav.report.overview import path_points
 from airl_mav.report.palette import look
@@ -28,7 +29,6 @@ from airl_mav.report.theme import (
     MARK,
     MUTED,
     PAPER,
-    RULE,
     SERIES,
     Picture,
     new_figure,
@@ -70,46 +70,21 @@ def gap_sheet(arena: ArenaGap) -> bytes:
 def _draw_gaps(figure: Figure | SubFigure, arena: ArenaGap, measure: Measure) -> None:
     """Draw one measure: gaps from top to bottom, no gap as the line of zero."""
     ax = figure.subplots()
-    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
-    ends = [0.0]
+    ends: list[float] = []
     for row, gap in enumerate(arena.gaps):
         d, median = change_of(gap.gap, measure).difference, median_of_gap(gap.gap, measure)
         told = f"n = {d.n:,}" if d.value is None else f"{d.value:+.1f}, n = {d.n:,}"
-        ax.annotate(
-            told,
-            (1.0, row - 0.16),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=8,
-            color=MUTED,
-        )
         paper = paper_gap(gap.paper, measure)
         if paper is not None:
             ends.append(paper)
             ax.plot(paper, row, "x", ms=6, mew=1.6, color=MARK, zorder=2)
-        if d.value is None:
-            continue
-        if d.low is not None and d.high is not None:
-            ax.plot([d.low, d.high], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
-            ends += [d.low, d.high]
         if median is not None and median.value is not None:
             ends.append(median.value)
             ax.plot(median.value, row, "D", ms=5, color="none", mec=SERIES, mew=1.1, zorder=3)
-        ends.append(d.value)
-        ax.plot(d.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=4)
-    names = [f"{gap.letters}\n{gap.short}" for gap in arena.gaps]
-    ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.5, -0.65)
-    room = 0.08 * (max(ends) - min(ends)) or 1.0
-    ax.set_xlim(min(ends) - room, max(ends) + room)
-    ax.set_title(measure.title, loc="left", fontsize=10.5, color=INK, pad=6)
+        ends += draw_estimate(ax, row, d, told, MUTED)
     unit = "percentage points" if measure.difference_unit == "points" else "%"
-    ax.set_xlabel(f"gap [{unit}]", fontsize=8.5, color=MUTED)
-    quiet(ax)
-    ax.grid(False, axis="y")
-    ax.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
-    ax.spines["bottom"].set_color(RULE)
+    names = [f"{gap.letters}\n{gap.short}" for gap in arena.gaps]
+    finish_rows(ax, names, ends, measure.title, f"gap [{unit}]")
 
 
 def flight_panels(arena: ArenaGap) -> list[Panel]:
