@@ -615,7 +615,13 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
     root = Path(__file__).parent.parent
     environment = os.environ | {"PYTHONPATH": str(root), "COLUMNS": "100"}
     process = subprocess.Popen(
-        command, cwd=root, env=environment, stdout=subprocess.PIPE, text=True
+        command,
+        cwd=root,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        # A shell that runs the tests in the background has them, and so this, ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     try:
         # Early: the whole of it takes but seconds, and this test may be starved meanwhile.

@@ -123,11 +123,13 @@ def _fly_alone(
         except WorkerError as error:
             _say(console, f"error: {error}", "red")
             broken = True
+        # Also when the last flight had ended by then: what would come after it must not begin.
+        stopped = stop()
     if left := len(flown) < planned:
         ended = "broken off" if broken else "interrupted"
         _say(console, f"{ended}: what was flown is kept; --out {folder.path} goes on", "yellow")
     episodes = tuple(sorted(flown, key=lambda record: record.index))
-    code = EXIT_BROKEN if broken else EXIT_INTERRUPTED if left else 0
+    code = EXIT_BROKEN if broken else EXIT_INTERRUPTED if left or stopped else 0
     return Result(folder.path, code, episodes, len(flown) - len(done))
 
 
