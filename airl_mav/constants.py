@@ -40,5 +40,8 @@ TICK_US: Final = 4_000
 TICK_S: Final = TICK_US / US_PER_S
 """Base tick [s]."""
 
+TICK_HZ: Final = US_PER_S // TICK_US
+"""Base ticks a second."""
+
 DEG: Final = math.pi / 180.0
 """One degree [rad]."""

@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from airl_mav.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
-from airl_mav.control.cascade import Demand, cascade, new_memory, reset_integrals
+from airl_mav.control.cascade import Demand, Output, cascade, new_memory, reset_integrals
 from airl_mav.control.controller import Controller
 from airl_mav.control.gains import Gains, pack, unpack
+from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
 from airl_mav.control.mixer import mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import (
@@ -40,13 +42,25 @@ quaternions = (
     .map(lambda q: tuple(c / math.hypot(*q) for c in q))
 )
 
-# PX4's normalised effectiveness of a quad X, motors FR, RL, FL, RR as columns: where each motor
-# stands decides the signs (roll right = less right lift; nose up = more front lift), a
-# counter-clockwise rotor yaws the body clockwise.
 S = math.sqrt(0.5)
-EFFECT = np.array([[-S, S, S, -S], [S, -S, S, -S], [1, 1, -1, -1], [1, 1, 1, 1]]) / np.array(
-    [[2.0], [2.0], [4.0], [4.0]]
-)
+ARMS = np.array([(0.13, 0.22), (-0.13, -0.22), (0.13, -0.22), (-0.13, 0.22)])
+"""Forward and right of motors FR, RL, FL, RR: vehicles/quad."""
+
+
+def px4_allocation(arms: np.ndarray) -> np.ndarray:
+    """ControlAllocationPseudoInverse of PX4 1.16: roll, pitch, yaw, lift (columns) of each motor.
+
+    Where each motor stands decides the signs (roll right = less right lift; nose up = more front
+    lift), a counter-clockwise rotor yaws the body clockwise. Roll and pitch share one scale.
+    """
+    turns = np.array([1.0, 1.0, -1.0, -1.0])
+    mixed = np.linalg.pinv(np.array([-arms[:, 1], arms[:, 0], turns, np.ones(4)]))
+    strongest = np.sqrt((mixed[:, :2] ** 2).sum(axis=0) / 2.0).max()
+    return mixed / [strongest, strongest, mixed[:, 2].max(), np.abs(mixed[:, 3]).mean()]
+
+
+ALLOCATION = px4_allocation(ARMS)
+EFFECT = np.linalg.inv(ALLOCATION)
 
 
 def scipy_of(q: tuple[float, ...]) -> Rotation:
@@ -56,20 +70,42 @@ def scipy_of(q: tuple[float, ...]) -> Rotation:
 # --- mixer
 
 
-def test_the_effect_matrix_of_this_test_is_a_quad_x() -> None:
-    """Its inverse must move motors by +-1 for yaw and +-0.707 for roll and pitch, as PX4 scales."""
-    inverse = np.linalg.pinv(EFFECT)
-    np.testing.assert_allclose(np.abs(inverse), np.tile([S, S, 1, 1], (4, 1)), atol=1e-12)
+def test_the_weaker_axis_moves_a_motor_by_sin_45_deg() -> None:
+    """Arms further out to the side than ahead: roll needs less of each motor than pitch."""
+    expected = [S * 0.13 / 0.22, S, 1.0, 1.0]
+    np.testing.assert_allclose(np.abs(ALLOCATION), np.tile(expected, (4, 1)), atol=1e-12)
+    assert (GAINS.mix_roll, GAINS.mix_pitch) == pytest.approx(expected[:2])
+
+
+@pytest.mark.parametrize(("forward", "right"), [(0.2, 0.2), (0.3, 0.1), (0.1, 0.11)])
+def test_allocation_follows_the_arms(forward: float, right: float) -> None:
+    parameters = Parameters()
+    arms = ARMS / np.abs(ARMS) * [forward, right]
+    for i, (x, y) in enumerate(arms.tolist()):
+        parameters.set(f"CA_ROTOR{i}_PX", x)
+        parameters.set(f"CA_ROTOR{i}_PY", y)
+    gains = Gains.from_parameters(parameters.__getitem__)
+    torque = (0.05, -0.1, 0.02)
+    expected = px4_allocation(arms) @ [*torque, 0.5]
+    np.testing.assert_allclose(mix(0.5, torque, gains)[0], expected, atol=1e-12)
+
+
+def test_unknown_arms_are_equal_ones() -> None:
+    parameters = Parameters()
+    for i in range(4):
+        parameters.set(f"CA_ROTOR{i}_PY", 0.0)
+    gains = Gains.from_parameters(parameters.__getitem__)
+    assert (gains.mix_roll, gains.mix_pitch) == (S, S)
 
 
 @given(st.floats(0.2, 0.8), st.tuples(*[st.floats(-0.25, 0.25)] * 3))
 def test_inside_the_limits_the_allocation_is_exact(thrust, torque) -> None:
-    expected = np.linalg.pinv(EFFECT) @ [*torque, thrust]
+    expected = ALLOCATION @ [*torque, thrust]
     # PX4 fits roll, pitch and thrust into the limits first, yaw after them.
-    without_yaw = np.linalg.pinv(EFFECT) @ [torque[0], torque[1], 0.0, thrust]
+    without_yaw = ALLOCATION @ [torque[0], torque[1], 0.0, thrust]
     for commands in (expected, without_yaw):
         assume(commands.min() >= 0.0 and commands.max() <= 1.0)
-    motors, missing = mix(thrust, torque)
+    motors, missing = mix(thrust, torque, GAINS)
     np.testing.assert_allclose(motors, expected, atol=1e-12)
     np.testing.assert_allclose(EFFECT @ motors, [*torque, thrust], atol=1e-12)
     assert missing == ZERO
@@ -77,7 +113,7 @@ def test_inside_the_limits_the_allocation_is_exact(thrust, torque) -> None:
 
 @given(st.floats(-0.5, 1.5), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
 def test_outputs_are_commands(thrust, torque) -> None:
-    motors, missing = mix(thrust, torque)
+    motors, missing = mix(thrust, torque, GAINS)
     assert all(0.0 <= m <= 1.0 for m in motors)
     delivered = EFFECT @ motors
     np.testing.assert_allclose(np.array(missing) + delivered[:3], torque, atol=2e-6)
@@ -85,8 +121,8 @@ def test_outputs_are_commands(thrust, torque) -> None:
 
 @given(st.floats(0.0, 1.0), st.tuples(*[st.floats(-2.0, 2.0)] * 3))
 def test_thrust_is_lowered_never_raised(thrust, torque) -> None:
-    motors, _ = mix(thrust, torque)
-    asked_without_limits = np.linalg.pinv(EFFECT) @ [*torque, thrust]
+    motors, _ = mix(thrust, torque, GAINS)
+    asked_without_limits = ALLOCATION @ [*torque, thrust]
     # Clipping the last bit of a motor at 0 may add lift that nobody asked for, but no more than
     # the negative command that it removes.
     clipped = np.clip(-asked_without_limits, 0.0, None).sum() / 4
@@ -101,7 +137,7 @@ def test_thrust_is_lowered_never_raised(thrust, torque) -> None:
 )
 def test_yaw_never_costs_roll_or_pitch(thrust, roll, pitch, yaw) -> None:
     """Around half thrust yaw may fill the range from both ends; PX4 then clips a little."""
-    motors, _ = mix(thrust, (roll, pitch, yaw))
+    motors, _ = mix(thrust, (roll, pitch, yaw), GAINS)
     delivered = EFFECT @ motors
     np.testing.assert_allclose(delivered[:2], [roll, pitch], atol=1e-9)
     assert abs(delivered[2]) <= abs(yaw) + 1e-9
@@ -110,16 +146,16 @@ def test_yaw_never_costs_roll_or_pitch(thrust, roll, pitch, yaw) -> None:
 
 @given(st.floats(0.75, 1.0), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_roll_and_pitch_are_kept_at_full_thrust(thrust, roll, pitch) -> None:
-    motors, missing = mix(thrust, (roll, pitch, 0.0))
+    motors, missing = mix(thrust, (roll, pitch, 0.0), GAINS)
     delivered = EFFECT @ motors
     np.testing.assert_allclose(delivered[:2], [roll, pitch], atol=1e-9)
-    room = 1.0 - S * (abs(roll) + abs(pitch))
+    room = 1.0 - ALLOCATION[:, :2].max(axis=0) @ [abs(roll), abs(pitch)]
     assert delivered[3] == pytest.approx(min(thrust, room), abs=1e-9)
     assert missing == ZERO
 
 
 def test_some_yaw_is_left_at_full_thrust() -> None:
-    motors, _ = mix(1.0, (0.0, 0.0, 0.5))
+    motors, _ = mix(1.0, (0.0, 0.0, 0.5), GAINS)
     delivered = EFFECT @ motors
     assert delivered[2] == pytest.approx(0.15, abs=0.01)  # PX4's MINIMUM_YAW_MARGIN
     assert delivered[3] == pytest.approx(0.85, abs=0.01)
@@ -130,19 +166,19 @@ def px4_mix(thrust: float, torque: tuple[float, float, float]) -> np.ndarray:
 
     There thrust points down: its column is -1 and "increase only" means less lift.
     """
-    columns = {"roll": [-S, S, S, -S], "pitch": [S, -S, S, -S], "yaw": [1, 1, -1, -1]}
-    effect = {name: np.array(c, float) for name, c in columns.items()} | {"thrust": -np.ones(4)}
+    effect = dict(zip(("roll", "pitch", "yaw"), ALLOCATION.T, strict=False))
+    effect["thrust"] = -np.ones(4)
 
     def gain(sp: np.ndarray, vector: np.ndarray, top: float) -> float:
         k_min = k_max = 0.0
-        for command, weight in zip(sp, vector, strict=True):
-            if abs(weight) < 0.2:
+        for command, share in zip(sp, vector, strict=True):
+            if abs(share) < 0.2:
                 continue
             if command < 0.0:
-                k = (0.0 - command) / weight
+                k = (0.0 - command) / share
                 k_min, k_max = min(k_min, k), max(k_max, k)
             if command > top:
-                k = (top - command) / weight
+                k = (top - command) / share
                 k_min, k_max = min(k_min, k), max(k_max, k)
         return k_min + k_max
 
@@ -166,7 +202,7 @@ def px4_mix(thrust: float, torque: tuple[float, float, float]) -> np.ndarray:
 
 @given(st.floats(-0.2, 1.3), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
 def test_saturation_is_px4s(thrust, torque) -> None:
-    np.testing.assert_allclose(mix(thrust, torque)[0], px4_mix(thrust, torque), atol=1e-9)
+    np.testing.assert_allclose(mix(thrust, torque, GAINS)[0], px4_mix(thrust, torque), atol=1e-9)
 
 
 # --- attitude setpoint
@@ -297,7 +333,18 @@ def test_position_comes_before_feed_forward(position, feed) -> None:
 def test_nan_axes_take_no_part() -> None:
     sp = velocity_setpoint((1.0, 2.0, 3.0), (NAN, 4.0, NAN), (1.5, NAN, NAN), GAINS)
     np.testing.assert_allclose(sp, [1.5, 0.95 * 2.0, 0.0])
-    assert velocity_setpoint((1.0, 2.0, 3.0), NAN3, NAN3, GAINS) == ZERO
+    # Nothing is said of the horizontal: it is not controlled.
+    open_sp = velocity_setpoint((1.0, 2.0, 3.0), NAN3, (NAN, NAN, 0.5), GAINS)
+    np.testing.assert_array_equal(open_sp, [NAN, NAN, 0.5])
+
+
+def test_what_is_not_controlled_stays_level() -> None:
+    """PX4's FlightTaskDescend: no horizontal acceleration, whatever the velocity and its past."""
+    sp, slope = (NAN, NAN, 0.75), (0.3, -0.2, 0.0)
+    thrust, integral = velocity_control((3.0, -2.0, 0.75), slope, sp, (0.4, 0.1, 0.2), GAINS, 0.008)
+    assert thrust[:2] == (0.0, 0.0)
+    assert integral[:2] == (0.0, 0.0)
+    assert integral[2] == pytest.approx(0.2)
 
 
 # --- velocity control
@@ -457,6 +504,81 @@ def test_any_state_gives_commands(position, velocity, q, omega, p_sp, v_sp, yaw)
         out = cascade(position, velocity, q, omega, demand, memory, GAINS, TICK_S)
         assert all(0.0 <= m <= 1.0 for m in out.motors)
         assert np.all(np.isfinite(memory))
+
+
+def test_loops_hand_over_as_px4s_do() -> None:
+    """The position loop runs at every second tick; each loop flies what was published before."""
+    memory, climb = new_memory(), Demand(NAN3, (0.0, 0.0, -1.0), 0.0, NAN)
+
+    def fly(demand: Demand) -> Output:
+        return cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+
+    fly(hover())
+    steps = [fly(hover()), *(fly(climb) for _ in range(8))]
+    # The position loop ran at the very first tick, so it does at the second climbing one, too.
+    assert [out.velocity[2] for out in steps[:3]] == [0.0, -1.0, -1.0]
+    thrusts = [out.thrust for out in steps]
+    assert thrusts[:3] == [0.52, 0.52, 0.52]
+    expected = 0.52 * (1.0 + 4.0 / GRAVITY_M_S2)
+    assert thrusts[3] == thrusts[4] == pytest.approx(expected)
+    assert thrusts[5] == thrusts[6] > thrusts[4]
+    np.testing.assert_allclose(steps[3].motors, thrusts[3], atol=1e-12)
+
+
+def test_a_turn_reaches_the_motors_after_three_loops() -> None:
+    memory, turn = new_memory(), Demand(NAN3, ZERO, 1.0, NAN)
+    wanted, yaw_torques = [], []
+    for demand in (hover(), hover(), turn, turn, turn, turn):
+        out = cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+        wanted.append(out.rates[2])
+        yaw_torques.append((EFFECT @ out.motors)[2])
+    assert wanted[:3] == [0.0, 0.0, 0.0]
+    assert wanted[3] > 1.0
+    np.testing.assert_allclose(yaw_torques[:4], 0.0, atol=1e-12)
+    assert yaw_torques[4] > 0.01
+
+
+def test_the_integral_grows_with_time() -> None:
+    memory, error = new_memory(), Demand(NAN3, (0.01, 0.0, 0.0), 0.0, NAN)
+    seconds = 2.0
+    for _ in range(round(seconds / TICK_S)):
+        out = cascade(ZERO, ZERO, LEVEL, ZERO, error, memory, GAINS, TICK_S)
+    lean = math.atan((GAINS.vel_p_xy + GAINS.vel_i_xy * seconds) * 0.01 / GRAVITY_M_S2)
+    assert -scipy_of(out.attitude).as_euler("ZYX")[1] == pytest.approx(lean, rel=0.01)
+
+
+# --- filters
+
+
+def run(f: Biquad, samples: np.ndarray, first: float) -> list[float]:
+    newer = older = settled(f, first)
+    outputs = []
+    for sample in samples.tolist():
+        output, held = filtered(f, sample, newer, older)
+        newer, older = held, newer
+        outputs.append(output)
+    return outputs
+
+
+@pytest.mark.parametrize("cutoff_hz", [20.0, 40.0, 100.0])
+def test_the_gyro_filter_is_a_butterworth(cutoff_hz: float) -> None:
+    samples = np.random.default_rng(0).standard_normal(100) + 0.3
+    b, a = signal.butter(2, cutoff_hz, fs=1.0 / TICK_S)
+    expected, _ = signal.lfilter(b, a, samples, zi=0.3 * signal.lfilter_zi(b, a))
+    found = run(butterworth(cutoff_hz, TICK_S), samples, 0.3)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, 125.0, 1000.0])
+def test_a_cutoff_that_cannot_be_filters_nothing(cutoff_hz: float) -> None:
+    samples = np.random.default_rng(0).standard_normal(10)
+    assert run(butterworth(cutoff_hz, TICK_S), samples, 0.0) == samples.tolist()
+
+
+def test_a_weight_is_an_alpha_filters() -> None:
+    assert weight(0.0, TICK_S) == 1.0
+    # One time constant of 8 ms, sampled once in it: half of the way.
+    assert weight(1.0 / (2.0 * math.pi * 0.008), 0.008) == pytest.approx(0.5)
 
 
 def test_heading_is_kept_without_a_heading() -> None:

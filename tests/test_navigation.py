@@ -33,7 +33,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.camera import ReceivedFrame
-from companion.link import BodyVelocity
+from companion.interfaces import BodyVelocity
 from companion.pilot import Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 

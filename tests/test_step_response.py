@@ -1,8 +1,9 @@
-"""Step responses against PX4's, measured on an external airframe like the shipped quad.
+"""Step responses against PX4's.
 
-The reference: PX4 1.16 on a 1.5 kg quad with 0.25 N/(m/s) of drag and 30 ms rotors, setpoints at
-20 Hz through MAVSDK, read from LOCAL_POSITION_NED and ATTITUDE at 100 Hz. Measured in the same way
-here: from sending (at any time between two ticks) to the message that shows it.
+Two references. The stored column: PX4 1.16 on a 1.5 kg quad with 0.25 N/(m/s) of drag and 30 ms
+rotors, one run, setpoints at 20 Hz through MAVSDK, read from LOCAL_POSITION_NED and ATTITUDE at
+100 Hz. And PX4 1.16 flown on this project's own plant, five seeds, the truth at every tick. Here:
+from sending (at any time between two ticks) to the message, or the tick, that shows it.
 """
 
 from __future__ import annotations
@@ -10,26 +11,43 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from flight_rig import NAN, Rig, flight, velocity_setpoint
+from flight_rig import NAN, SETPOINT_US, Rig, flight, velocity_setpoint
 
 from airl_mav.constants import TICK_US, US_PER_S
-from airl_mav.frames import quat_yaw, wrap_pi
+from airl_mav.frames import heading_to_ned, quat_yaw, wrap_pi
 from firmware_sim.autopilot.state import Setpoint
 
 MESSAGE_US = 10_000
-NORTH, DOWN = 0, 2
+NORTH, EAST, DOWN = 0, 1, 2
 Reading = Callable[[Rig], float]
+Command = Callable[[Rig], Setpoint]
 
-TOLERANCE = 0.15
-"""What may lie between us and a single run of PX4."""
+TOLERANCE = 0.10
+"""Of rise and latency."""
+
+POINTS = 0.05
+"""Of overshoot."""
+
+RESOLUTION_S = 0.010
+"""Of times in the stored column: messages of one run."""
+
+
+class Figures(NamedTuple):
+    latency: float
+    """From sending to a change of 50 mm/s, 0.5 deg or 0.5 deg/s [s]."""
+    rise: float
+    """From 10 to 90 % of the step [s]."""
+    overshoot: float
+    """Share of the step."""
 
 
 @dataclass
 class Response:
-    """One step as a ground station sees it: times [s] from sending, values as 0 -> 1."""
+    """One step: times [s] from sending, values as 0 -> 1."""
 
     times: np.ndarray
     share: np.ndarray
@@ -39,201 +57,282 @@ class Response:
     def first(self, share: float) -> float:
         return float(self.times[np.argmax(self.share >= share)])
 
-    def latency(self, change: float) -> float:
-        """Return when the value has moved by `change` towards the setpoint."""
-        return self.first(self.share[0] + change / abs(self.size))
+    def figures(self, change: float) -> Figures:
+        """Return the figures; the latency is to a value moved by `change`."""
+        return Figures(
+            self.first(self.share[0] + change / abs(self.size)),
+            self.first(0.9) - self.first(0.1),
+            float(self.share.max()) - 1.0,
+        )
 
     @property
-    def rise(self) -> float:
-        return self.first(0.9) - self.first(0.1)
-
-    @property
-    def overshoot(self) -> float:
-        return float(self.share.max()) - 1.0
-
-    def settled(self, band: float) -> float:
-        outside = np.nonzero(np.abs(self.share - 1.0) > band)[0]
-        return float(self.times[outside[-1]])
+    def end(self) -> float:
+        """Where it settles: the mean of its last second."""
+        return float(self.share[self.times > self.times[-1] - 1.0].mean())
 
 
-class Telemetry:
-    """Messages at 100 Hz: the newest state at the first tick at or after they are due."""
+class Quantity(NamedTuple):
+    """What a step is a step of."""
 
-    def __init__(self, rig: Rig, *readings: Reading) -> None:
-        self._rig, self._readings = rig, readings
-        self._due_us = rig.sim.time_us
-        self.rows: list[tuple[float, ...]] = []
+    told: Reading
+    """As telemetry has it."""
+    true: Reading
+    change: float
+    """What counts as a reaction."""
+
+
+def velocity(axis: int) -> Quantity:
+    return Quantity(
+        lambda rig: float(rig.ap.state().estimate.velocity[axis]),
+        lambda rig: float(rig.truth.velocity[axis]),
+        0.05,
+    )
+
+
+HEADING = Quantity(
+    lambda rig: wrap_pi(quat_yaw(rig.ap.state().estimate.quaternion)),
+    lambda rig: wrap_pi(quat_yaw(rig.truth.quaternion)),
+    math.radians(0.5),
+)
+TURNING = Quantity(
+    lambda rig: float(rig.ap.state().estimate.angular_velocity[2]),
+    lambda rig: float(rig.truth.angular_velocity[2]),
+    math.radians(0.5),
+)
+
+
+def ned(north: float, east: float, down: float, yaw: float = 0.0) -> Command:
+    """Command as set_velocity_ned does."""
+    setpoint = velocity_setpoint(north, east, down, yaw=yaw)
+    return lambda rig: setpoint
+
+
+def body(forward: float, yaw_rate: float) -> Command:
+    """Command as set_velocity_body does: turned by the heading when it arrives."""
+
+    def command(rig: Rig) -> Setpoint:
+        heading = quat_yaw(rig.ap.state().estimate.quaternion)
+        north, east, down = heading_to_ned(np.array([forward, 0.0, 0.0]), heading)
+        return velocity_setpoint(north, east, down, yaw=NAN, yaw_rate=yaw_rate)
+
+    return command
+
+
+class Pilot:
+    """Sends a command at 20 Hz; writes down telemetry at 100 Hz and the truth at every tick."""
+
+    def __init__(self, rig: Rig, quantity: Quantity, command: Command) -> None:
+        self._rig, self._quantity = rig, quantity
+        self._told_us = rig.sim.time_us
+        self.told: list[tuple[int, float]] = []
+        self.true: list[tuple[int, float]] = []
+        self.order(command)
+
+    def order(self, command: Command) -> None:
+        self._command, self._next_us = command, self._rig.sim.time_us
 
     def tick(self) -> None:
-        now = self._rig.sim.time_us
-        self._rig.tick()
-        if now >= self._due_us:
-            self._due_us += MESSAGE_US
-            self.rows.append((now, *(read(self._rig) for read in self._readings)))
+        rig, now = self._rig, self._rig.sim.time_us
+        if now >= self._next_us:
+            self._next_us += SETPOINT_US
+            rig.ap.offer_setpoint(self._command(rig), now)
+        rig.tick()
+        if now >= self._told_us:
+            self._told_us += MESSAGE_US
+            self.told.append((now, self._quantity.told(rig)))
+        self.true.append((rig.sim.time_us, self._quantity.true(rig)))
+
+    def fly(self, ticks: int) -> None:
+        for _ in range(ticks):
+            self.tick()
+
+
+class Row(NamedTuple):
+    """What PX4 does."""
+
+    stored: Figures
+    """On an external airframe, in its telemetry."""
+    here: Figures
+    """On this plant, in truth."""
+
+
+class Step(NamedTuple):
+    """A step of one quantity from 0, and the way back."""
+
+    quantity: Quantity
+    size: float
+    there: Command
+    back: Command
+    seconds: float
+    up: Row
+    down: Row | None = None
+    """None = not measured on PX4."""
 
 
 def respond(
-    rig: Rig,
+    pilot: Pilot,
     rng: np.random.Generator,
-    setpoint: Setpoint,
-    before: float,
-    after: float,
+    command: Command,
     seconds: float,
-    *readings: Reading,
-) -> list[Response]:
-    """Fly a step from a steady state and return what each reading shows of it."""
-    messages = Telemetry(rig, *readings)
-    for _ in range(int(rng.integers(50, 60))):
-        messages.tick()
-    quiet = len(messages.rows)
-    sent_us = rig.sim.time_us - int(rng.integers(TICK_US))
-    rig.stream(setpoint)
-    while rig.sim.time_us < sent_us + seconds * US_PER_S:
-        messages.tick()
-    rows = np.array(messages.rows)
-    times = (rows[quiet:, 0] - sent_us) / US_PER_S
-    responses = []
-    for column in range(1, rows.shape[1]):
-        share = (rows[:, column] - before) / (after - before)
-        # One value from before the step, averaged: the latency counts from there.
-        share = np.concatenate([[share[:quiet].mean()], share[quiet:]])
-        responses.append(Response(np.concatenate([[0.0], times]), share, after - before))
-    return responses
+    span: tuple[float, float],
+) -> tuple[Response, Response]:
+    """Fly a step from a steady state; return what telemetry and what the truth shows of it."""
+    pilot.fly(int(rng.integers(50, 60)))
+    sent_us = pilot.true[-1][0] - int(rng.integers(TICK_US))
+    pilot.order(command)
+    pilot.fly(round(seconds * US_PER_S / TICK_US))
+    before, after = span
+    told, true = (_response(rows, sent_us, before, after) for rows in (pilot.told, pilot.true))
+    return told, true
 
 
-def estimated_velocity(axis: int) -> Reading:
-    return lambda rig: float(rig.ap.state().estimate.velocity[axis])
+def _response(rows: list[tuple[int, float]], sent_us: int, before: float, after: float) -> Response:
+    series = np.array(rows)
+    times = (series[:, 0] - sent_us) / US_PER_S
+    share = (series[:, 1] - before) / (after - before)
+    # One value from before the step, averaged: the latency counts from there.
+    quiet = share[(times > -0.2) & (times <= 0.0)].mean()
+    late = times > 0.0
+    return Response(
+        np.concatenate([[0.0], times[late]]), np.concatenate([[quiet], share[late]]), after - before
+    )
 
 
-def true_velocity(axis: int) -> Reading:
-    return lambda rig: float(rig.truth.velocity[axis])
+Shown = list[tuple[Response, Response]]
+"""Of several steps, what telemetry and what the truth shows."""
 
 
-def estimated_heading(rig: Rig) -> float:
-    return wrap_pi(quat_yaw(rig.ap.state().estimate.quaternion))
-
-
-def true_heading(rig: Rig) -> float:
-    return wrap_pi(quat_yaw(rig.truth.quaternion))
-
-
-def velocity_steps(
-    axis: int, speed: float, seconds: float, seeds: range
-) -> tuple[list[list[Response]], list[list[Response]]]:
-    """Fly 0 -> speed -> 0 twice a seed; return the steps up and down, each (estimate, truth)."""
-    up, down = [], []
-    for seed in seeds:
+def fly(step: Step) -> tuple[Shown, Shown]:
+    """Fly a step twice with each of three seeds; return the ways there and back."""
+    up: Shown = []
+    down: Shown = []
+    for seed in range(3):
         rng = np.random.default_rng(1000 + seed)
-        readings = estimated_velocity(axis), true_velocity(axis)
-        go = [0.0, 0.0, 0.0]
-        go[axis] = speed
         with flight(seed) as rig:
-            rig.take_off(4.0, settle_s=1.0)
-            rig.go_offboard(velocity_setpoint(0, 0, 0))
-            rig.run(3.0)
+            rig.take_off(12.0, settle_s=1.0)
+            rig.go_offboard(step.back(rig))
+            rig.stream(None)
+            pilot = Pilot(rig, step.quantity, step.back)
+            pilot.fly(round(3.0 * US_PER_S / TICK_US))
             for _ in range(2):
-                sp = velocity_setpoint(*go)
-                up.append(respond(rig, rng, sp, 0.0, speed, seconds, *readings))
-                sp = velocity_setpoint(0, 0, 0)
-                down.append(respond(rig, rng, sp, speed, 0.0, seconds, *readings))
+                up.append(respond(pilot, rng, step.there, step.seconds, (0.0, step.size)))
+                down.append(respond(pilot, rng, step.back, step.seconds, (step.size, 0.0)))
     return up, down
 
 
-def mean(responses: list[list[Response]], column: int, what: Callable[[Response], float]) -> float:
-    return float(np.mean([what(r[column]) for r in responses]))
+def mean(shown: Shown, which: int, change: float) -> Figures:
+    return Figures(*np.mean([s[which].figures(change) for s in shown], axis=0).tolist())
 
 
-ESTIMATE, TRUTH = 0, 1
+TOLD, TRUE = 0, 1
+STOP, TURN_STOP = ned(0.0, 0.0, 0.0), body(0.0, 0.0)
+QUARTER, RATE = math.pi / 2, math.radians(30.0)
+STEPS = {
+    "north 2": Step(
+        velocity(NORTH),
+        2.0,
+        ned(2.0, 0.0, 0.0),
+        STOP,
+        6.0,
+        Row(Figures(0.141, 1.02, 0.033), Figures(0.140, 1.035, 0.022)),
+        Row(Figures(0.144, 1.02, 0.027), Figures(0.140, 1.057, 0.012)),
+    ),
+    "north 5": Step(
+        velocity(NORTH),
+        5.0,
+        ned(5.0, 0.0, 0.0),
+        STOP,
+        6.0,
+        Row(Figures(0.112, 1.08, 0.031), Figures(0.116, 1.083, 0.019)),
+        Row(Figures(0.124, 1.06, 0.032), Figures(0.124, 1.101, 0.017)),
+    ),
+    "east 2": Step(
+        velocity(EAST),
+        2.0,
+        ned(0.0, 2.0, 0.0),
+        STOP,
+        6.0,
+        Row(Figures(0.141, 1.03, 0.034), Figures(0.142, 1.037, 0.022)),
+    ),
+    "forward 2": Step(
+        velocity(NORTH),
+        2.0,
+        body(2.0, 0.0),
+        TURN_STOP,
+        6.0,
+        Row(Figures(0.139, 1.01, 0.034), Figures(0.143, 1.034, 0.021)),
+    ),
+    "up 2": Step(
+        velocity(DOWN),
+        -2.0,
+        ned(0.0, 0.0, -2.0),
+        STOP,
+        4.0,
+        Row(Figures(0.035, 0.53, 0.094), Figures(0.035, 0.375, 0.053)),
+    ),
+    "down 1": Step(
+        velocity(DOWN),
+        1.0,
+        ned(0.0, 0.0, 1.0),
+        STOP,
+        4.0,
+        Row(Figures(0.050, 0.37, 0.058), Figures(0.043, 0.375, 0.071)),
+    ),
+    "yaw 90": Step(
+        HEADING,
+        QUARTER,
+        ned(0.0, 0.0, 0.0, QUARTER),
+        STOP,
+        5.0,
+        Row(Figures(0.100, 0.41, 0.159), Figures(0.096, 0.396, 0.147)),
+    ),
+    "yaw rate 30": Step(
+        TURNING,
+        RATE,
+        body(0.0, RATE),
+        TURN_STOP,
+        3.0,
+        Row(Figures(0.057, 0.26, 0.138), Figures(0.053, 0.240, 0.156)),
+    ),
+}
+
+# Climbing at 2 m/s, the stored airframe ran out of thrust: it takes 0.31 s to half of the step,
+# against 0.18 s down, where a linear controller takes as long. On this plant PX4's own climb, as
+# its telemetry shows it, rises in 0.371 s.
+# On its way to 5 m/s its telemetry here shows 50 mm/s after 123 ms (standard deviation of a step:
+# 7 ms), as ours does; the stored run, after 112 ms.
+NOT_AS_STORED = {"up 2": ("rise",), "north 5": ("latency",)}
 
 
-@pytest.mark.slow
+def differences(found: Figures, expected: Figures, resolution_s: float) -> list[str]:
+    """Return what is outside the tolerances."""
+    wrong = []
+    for name in ("latency", "rise"):
+        wanted = getattr(expected, name)
+        if abs(getattr(found, name) - wanted) > max(TOLERANCE * wanted, resolution_s):
+            wrong.append(name)
+    if abs(found.overshoot - expected.overshoot) > POINTS:
+        wrong.append("overshoot")
+    return wrong
+
+
+def check(shown: Shown, row: Row, change: float, excused: tuple[str, ...]) -> None:
+    told, true = mean(shown, TOLD, change), mean(shown, TRUE, change)
+    wrong = differences(told, row.stored, RESOLUTION_S)
+    assert set(wrong) <= set(excused), (told, row.stored)
+    assert not differences(true, row.here, 0.0), (true, row.here)
+
+
 @pytest.mark.parametrize(
-    ("speed", "latency_up", "latency_down", "rise", "overshoot"),
-    [(2.0, 0.141, 0.144, 1.02, 0.033), (5.0, 0.112, 0.124, 1.07, 0.031)],
+    "name", [pytest.param(n, marks=() if n == "down 1" else pytest.mark.slow) for n in STEPS]
 )
-def test_horizontal_velocity(
-    speed: float, latency_up: float, latency_down: float, rise: float, overshoot: float
-) -> None:
-    up, down = velocity_steps(NORTH, speed, 6.0, range(2))
-    for column in (ESTIMATE, TRUTH):
-        for steps, latency in ((up, latency_up), (down, latency_down)):
-            found = mean(steps, column, lambda r: r.latency(0.05))
-            assert found == pytest.approx(latency, rel=TOLERANCE)
-            assert mean(steps, column, lambda r: r.rise) == pytest.approx(rise, rel=TOLERANCE)
-            assert abs(mean(steps, column, lambda r: r.overshoot) - overshoot) < 0.02
-            assert max(r[column].overshoot for r in steps) <= 0.10
-            assert mean(steps, column, lambda r: float(r.share[-100:].mean())) == pytest.approx(
-                1.0, abs=0.03
-            )
-
-
-def yaw_steps(seeds: range) -> list[list[Response]]:
-    quarter = math.pi / 2
-    steps = []
-    for seed in seeds:
-        rng = np.random.default_rng(2000 + seed)
-        with flight(seed) as rig:
-            rig.take_off(4.0, settle_s=1.0)
-            rig.go_offboard(velocity_setpoint(0, 0, 0))
-            rig.run(2.0)
-            for before, after in ((0.0, quarter), (quarter, 0.0)) * 2:
-                sp = velocity_setpoint(0, 0, 0, yaw=after)
-                readings = estimated_heading, true_heading
-                steps.append(respond(rig, rng, sp, before, after, 5.0, *readings))
-    return steps
-
-
-@pytest.mark.slow
-def test_heading() -> None:
-    steps = yaw_steps(range(2))
-    half_a_degree = math.radians(0.5)
-    assert mean(steps, ESTIMATE, lambda r: r.latency(half_a_degree)) == pytest.approx(
-        0.100, rel=TOLERANCE
-    )
-    for column in (ESTIMATE, TRUTH):
-        assert mean(steps, column, lambda r: r.rise) == pytest.approx(0.41, rel=TOLERANCE)
-        assert mean(steps, column, lambda r: r.first(0.5)) == pytest.approx(0.46, rel=TOLERANCE)
-        assert mean(steps, column, lambda r: r.overshoot) == pytest.approx(0.159, abs=0.04)
-        assert max(r[column].overshoot for r in steps) <= 0.20
-        # The heading error left at the end: half a degree of magnetometer and gyro bias.
-        end = mean(steps, column, lambda r: float(r.share[-100:].mean()))
-        assert abs(end - 1.0) * 90.0 < 1.0
-
-
-def heading_rate(rig: Rig) -> float:
-    return float(rig.ap.state().estimate.angular_velocity[2])
-
-
-@pytest.mark.slow
-def test_heading_rate() -> None:
-    steps = []
-    rate = math.radians(30.0)
-    for seed in range(2):
-        rng = np.random.default_rng(3000 + seed)
-        with flight(seed) as rig:
-            rig.take_off(4.0, settle_s=1.0)
-            rig.go_offboard(velocity_setpoint(0, 0, 0, yaw=NAN, yaw_rate=0.0))
-            rig.run(2.0)
-            for before, after in ((0.0, rate), (rate, 0.0)) * 2:
-                sp = velocity_setpoint(0, 0, 0, yaw=NAN, yaw_rate=after)
-                steps.append(respond(rig, rng, sp, before, after, 3.0, heading_rate))
-    assert mean(steps, ESTIMATE, lambda r: r.rise) == pytest.approx(0.26, rel=TOLERANCE)
-    assert mean(steps, ESTIMATE, lambda r: r.first(0.5)) == pytest.approx(0.23, rel=TOLERANCE)
-    assert mean(steps, ESTIMATE, lambda r: r.overshoot) == pytest.approx(0.138, abs=0.05)
-
-
-def test_descent() -> None:
-    steps = []
-    for seed in range(2):
-        rng = np.random.default_rng(4000 + seed)
-        with flight(seed) as rig:
-            rig.take_off(10.0, settle_s=1.0)
-            rig.go_offboard(velocity_setpoint(0, 0, 0))
-            rig.run(2.0)
-            readings = estimated_velocity(DOWN), true_velocity(DOWN)
-            sp = velocity_setpoint(0, 0, 1.0)
-            steps.append(respond(rig, rng, sp, 0.0, 1.0, 4.0, *readings))
-    for column in (ESTIMATE, TRUTH):
-        assert mean(steps, column, lambda r: r.rise) == pytest.approx(0.37, rel=TOLERANCE)
-        assert mean(steps, column, lambda r: r.first(0.5)) == pytest.approx(0.18, rel=TOLERANCE)
-        assert mean(steps, column, lambda r: r.overshoot) == pytest.approx(0.058, abs=0.03)
+def test_steps_are_px4s(name: str) -> None:
+    step = STEPS[name]
+    up, down = fly(step)
+    check(up, step.up, step.quantity.change, NOT_AS_STORED.get(name, ()))
+    if step.down is not None:
+        check(down, step.down, step.quantity.change, ())
+    for told, true in up:
+        # What is left at the end: the integral's, half a degree of heading.
+        assert told.end == pytest.approx(1.0, abs=0.05)
+        assert true.end == pytest.approx(1.0, abs=0.05)

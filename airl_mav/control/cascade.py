@@ -1,5 +1,10 @@
 """The whole cascade, one tick: state and setpoint -> motor commands.
 
+The loops hand over to each other as PX4's do in lockstep. The position loop runs whenever its
+estimator publishes a position, at every second sample of the IMU; each loop flies the setpoint
+that the loop above it published at an earlier sample, as the inner ones are scheduled first. From
+a new position to the motors that takes two ticks.
+
 One vehicle's memory is a row of `MEMORY_SIZE` floats, so that N vehicles are an (N, MEMORY_SIZE)
 array and the flight controller holds a single row.
 """
@@ -15,6 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.control.attitude import attitude_towards, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
+from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
 from airl_mav.control.mixer import Motors, mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import velocity_control, velocity_setpoint
@@ -23,10 +29,21 @@ from airl_mav.vehicle.rotation import Quat, Vec
 
 Memory = NDArray[np.float64]
 
+HANDOVER_TICKS = 2
+"""From the tick of the position loop to that whose motor commands reflect it: attitude, rates."""
+
+POSITION_TICKS = 2
+"""PX4's EKF (EKF2_PREDICT_US = 10 ms) publishes positions at every second 4 ms sample, measured."""
+
 # Layout of a memory row.
-_VEL_INT, _VEL_LP, _VEL_DOT, _RATE_INT, _GYRO, _DGYRO, _SAT = 0, 3, 6, 9, 12, 15, 18
-_YAW_TORQUE, _PRIMED = 21, 22
-MEMORY_SIZE = 23
+_VEL_INT, _VEL_LP, _VEL_DOT, _RATE_INT, _SAT = 0, 3, 6, 9, 12
+_GYRO, _GYRO_NEWER, _GYRO_OLDER, _DGYRO = 15, 18, 21, 24
+_YAW_TORQUE, _PRIMED, _WAIT = 27, 28, 29
+# What the position loop published: velocity and attitude setpoint, yaw rate, collective.
+_VELOCITY_SP, _ATTITUDE_SP, _YAW_RATE_SP, _THRUST_SP = 30, 33, 37, 38
+# What the attitude loop published: rates and, passed on, collective.
+_RATES_SP, _THRUST_ON = 39, 42
+MEMORY_SIZE = 43
 
 
 class Demand(NamedTuple):
@@ -47,13 +64,18 @@ class Output(NamedTuple):
 
     motors: Motors
     thrust: float
-    """Collective 0..1."""
+    """Collective 0..1 in the motor commands."""
     attitude: Quat
-    """Attitude setpoint."""
+    """Newest attitude setpoint."""
     rates: Vec
-    """Rate setpoint FRD [rad/s]."""
+    """Newest rate setpoint FRD [rad/s]."""
     velocity: Vec
-    """Velocity setpoint after limits NED [m/s]."""
+    """Newest velocity setpoint after limits NED [m/s]."""
+
+
+def ticks_to_motors(memory: Memory) -> int:
+    """Return after how many more ticks the motors reflect what is demanded in the next one."""
+    return int(memory[_WAIT]) + HANDOVER_TICKS if memory[_PRIMED] else 0
 
 
 def new_memory(n: int | None = None) -> Memory:
@@ -75,38 +97,35 @@ def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
 
 @kernel
 def reset_integrals(memory: Memory) -> None:
-    """Forget what the integrators learned: on the ground they wind up against the floor."""
+    """Forget what the integrators learned: on the ground they wind up against the floor.
+
+    The loops forget their setpoints and begin anew.
+    """
     for i in range(3):
         memory[_VEL_INT + i] = 0.0
         memory[_RATE_INT + i] = 0.0
         memory[_SAT + i] = 0.0
-
-
-@kernel
-def _weight(cutoff_hz: float, dt: float) -> float:
-    """Return the weight of a new sample in a first-order low-pass; cut-off 0 = no filter."""
-    if cutoff_hz <= 0.0:
-        return 1.0
-    return 1.0 - math.exp(-2.0 * math.pi * cutoff_hz * dt)
+    memory[_PRIMED] = 0.0
 
 
 class Filters(NamedTuple):
-    """Weight of a new sample in each low-pass of the cascade, for a fixed tick."""
+    """The low-passes of the cascade, for a fixed tick."""
 
     velocity: float
-    gyro: float
+    """Weight of a new sample, as of the others below."""
+    gyro: Biquad
     angular_acceleration: float
     yaw_torque: float
 
 
 @kernel
 def filters(gains: Gains, dt: float) -> Filters:
-    """Return the weights for a tick of dt [s]."""
+    """Return the filters for a tick of dt [s]."""
     return Filters(
-        _weight(gains.vel_d_cutoff_hz, dt),
-        _weight(gains.gyro_cutoff_hz, dt),
-        _weight(gains.dgyro_cutoff_hz, dt),
-        _weight(gains.yaw_torque_cutoff_hz, dt),
+        weight(gains.vel_d_cutoff_hz, POSITION_TICKS * dt),
+        butterworth(gains.gyro_cutoff_hz, dt),
+        weight(gains.dgyro_cutoff_hz, dt),
+        weight(gains.yaw_torque_cutoff_hz, dt),
     )
 
 
@@ -150,22 +169,74 @@ def cascade_tick(
         weights: `filters(gains, dt)`: the same at every tick.
         dt: Tick [s].
     """
+    first = memory[_PRIMED] == 0.0
+    if first:
+        _prime(velocity, omega, memory, weights)
+    # What an outer loop publishes at this tick is for the next one, but for the very first.
+    q_sp, yaw_rate, thrust_sp = _attitude_sp(memory)
+    if memory[_WAIT] == 0.0:
+        _position_loop(position, velocity, q, demand, memory, gains, weights, dt)
+        memory[_WAIT] = POSITION_TICKS
+        if first:
+            q_sp, yaw_rate, thrust_sp = _attitude_sp(memory)
+    memory[_WAIT] -= 1.0
+    wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
+    rates_sp, collective = wanted, thrust_sp
+    if not first:
+        rates_sp = (memory[_RATES_SP], memory[_RATES_SP + 1], memory[_RATES_SP + 2])
+        collective = memory[_THRUST_ON]
+    memory[_THRUST_ON] = thrust_sp
+    for i in range(3):
+        memory[_RATES_SP + i] = wanted[i]
+    motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
+    v = _VELOCITY_SP
+    return Output(
+        motors,
+        collective,
+        _attitude_sp(memory)[0],
+        wanted,
+        (memory[v], memory[v + 1], memory[v + 2]),
+    )
+
+
+@kernel
+def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
+    """Begin: the filters have long seen the first sample, the position loop is due."""
+    memory[_PRIMED] = 1.0
+    memory[_WAIT] = 0.0
+    for i in range(3):
+        memory[_VEL_LP + i] = velocity[i]
+        memory[_GYRO + i] = omega[i]
+        held = settled(weights.gyro, omega[i])
+        memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = held, held
+
+
+@kernel
+def _attitude_sp(memory: Memory) -> tuple[Quat, float, float]:
+    """Return attitude setpoint, yaw rate and collective as the position loop published them."""
+    a = _ATTITUDE_SP
+    q_sp = (memory[a], memory[a + 1], memory[a + 2], memory[a + 3])
+    return q_sp, memory[_YAW_RATE_SP], memory[_THRUST_SP]
+
+
+@kernel
+def _position_loop(
+    position: Vec,
+    velocity: Vec,
+    q: Quat,
+    demand: Demand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> None:
+    """Publish the attitude and thrust that fly the demand."""
+    period = POSITION_TICKS * dt
     velocities = (velocity[0], velocity[1], velocity[2])
-    rates_now = (omega[0], omega[1], omega[2])
-    if memory[_PRIMED] == 0.0:
-        memory[_PRIMED] = 1.0
-        for i in range(3):
-            memory[_VEL_LP + i] = velocities[i]
-            memory[_GYRO + i] = rates_now[i]
     for i in range(3):
         before = memory[_VEL_LP + i]
         memory[_VEL_LP + i] = before + weights.velocity * (velocities[i] - before)
-        memory[_VEL_DOT + i] = (memory[_VEL_LP + i] - before) / dt
-        before = memory[_GYRO + i]
-        memory[_GYRO + i] = before + weights.gyro * (rates_now[i] - before)
-        slope = (memory[_GYRO + i] - before) / dt
-        memory[_DGYRO + i] += weights.angular_acceleration * (slope - memory[_DGYRO + i])
-
+        memory[_VEL_DOT + i] = (memory[_VEL_LP + i] - before) / period
     velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
     thrust, integral = velocity_control(
         velocity,
@@ -173,16 +244,41 @@ def cascade_tick(
         velocity_sp,
         (memory[_VEL_INT], memory[_VEL_INT + 1], memory[_VEL_INT + 2]),
         gains,
-        dt,
+        period,
     )
     if math.isnan(demand.yaw):
         cos_yaw, sin_yaw = heading_of(q)
     else:
         cos_yaw, sin_yaw = math.cos(demand.yaw), math.sin(demand.yaw)
-    yaw_rate = 0.0 if math.isnan(demand.yaw_rate) else demand.yaw_rate
     q_sp = attitude_towards(thrust, cos_yaw, sin_yaw)
-    rates_sp = rate_setpoint(q, q_sp, yaw_rate, gains)
-    torque, rate_integral = rate_control(
+    for i in range(3):
+        memory[_VEL_INT + i] = integral[i]
+        memory[_VELOCITY_SP + i] = velocity_sp[i]
+    for i in range(4):
+        memory[_ATTITUDE_SP + i] = q_sp[i]
+    memory[_YAW_RATE_SP] = 0.0 if math.isnan(demand.yaw_rate) else demand.yaw_rate
+    memory[_THRUST_SP] = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
+
+
+@kernel
+def _rate_loop(
+    omega: Vec,
+    rates_sp: Vec,
+    collective: float,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Motors:
+    """Return the motor commands that turn as wanted, with a collective 0..1."""
+    rates_now = (omega[0], omega[1], omega[2])
+    for i in range(3):
+        before, newer = memory[_GYRO + i], memory[_GYRO_NEWER + i]
+        rate, held = filtered(weights.gyro, rates_now[i], newer, memory[_GYRO_OLDER + i])
+        memory[_GYRO + i], memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = rate, held, newer
+        slope = (rate - before) / dt
+        memory[_DGYRO + i] += weights.angular_acceleration * (slope - memory[_DGYRO + i])
+    torque, integral = rate_control(
         (memory[_GYRO], memory[_GYRO + 1], memory[_GYRO + 2]),
         (memory[_DGYRO], memory[_DGYRO + 1], memory[_DGYRO + 2]),
         rates_sp,
@@ -192,10 +288,8 @@ def cascade_tick(
         dt,
     )
     memory[_YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[_YAW_TORQUE])
-    collective = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
-    motors, missing = mix(collective, (torque[0], torque[1], memory[_YAW_TORQUE]))
+    motors, missing = mix(collective, (torque[0], torque[1], memory[_YAW_TORQUE]), gains)
     for i in range(3):
-        memory[_VEL_INT + i] = integral[i]
-        memory[_RATE_INT + i] = rate_integral[i]
+        memory[_RATE_INT + i] = integral[i]
         memory[_SAT + i] = missing[i]
-    return Output(motors, collective, q_sp, rates_sp, velocity_sp)
+    return motors

@@ -11,7 +11,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.cascade import Demand, Memory, cascade, new_memory, reset_integrals
+from airl_mav.control.cascade import (
+    Demand,
+    Memory,
+    cascade,
+    new_memory,
+    reset_integrals,
+    ticks_to_motors,
+)
 from airl_mav.control.gains import Gains, pack, unpack
 from airl_mav.control.mixer import Motors
 from airl_mav.kernels import kernel
@@ -116,6 +123,11 @@ class Controller:
         reset_integrals(self._memory)
         self._output[:] = 0.0
         self._output[_ATTITUDE] = 1.0
+
+    @property
+    def ticks_to_motors(self) -> int:
+        """After how many more ticks the motors reflect what is demanded in the next one."""
+        return ticks_to_motors(self._memory)
 
     @property
     def thrust(self) -> float:

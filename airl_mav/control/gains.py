@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -55,6 +56,8 @@ class Gains(NamedTuple):
     gyro_cutoff_hz: float  # IMU_GYRO_CUTOFF
     dgyro_cutoff_hz: float  # IMU_DGYRO_CUTOFF
     yaw_torque_cutoff_hz: float  # MC_YAW_TQ_CUTOFF
+    mix_roll: float  # of a roll torque in each motor's command, CA_ROTORn_PX, CA_ROTORn_PY
+    mix_pitch: float  # of a pitch torque
 
     @classmethod
     def from_parameters(cls, value: Callable[[str], float]) -> Gains:
@@ -63,6 +66,10 @@ class Gains(NamedTuple):
             value("MC_ROLLRATE_K"),
             value("MC_PITCHRATE_K"),
             value("MC_YAWRATE_K"),
+        )
+        mix_roll, mix_pitch = _allocation(
+            sum(abs(value(f"CA_ROTOR{i}_PX")) for i in range(4)),
+            sum(abs(value(f"CA_ROTOR{i}_PY")) for i in range(4)),
         )
         return cls(
             pos_p_xy=value("MPC_XY_P"),
@@ -104,7 +111,21 @@ class Gains(NamedTuple):
             gyro_cutoff_hz=value("IMU_GYRO_CUTOFF"),
             dgyro_cutoff_hz=value("IMU_DGYRO_CUTOFF"),
             yaw_torque_cutoff_hz=value("MC_YAW_TQ_CUTOFF"),
+            mix_roll=mix_roll,
+            mix_pitch=mix_pitch,
         )
+
+
+def _allocation(forward: float, right: float) -> tuple[float, float]:
+    """Return what a motor gets of a roll and of a pitch torque, for arms in any one unit.
+
+    The pseudo-inverse of a quad X, normalised as PX4's ControlAllocationPseudoInverse does it: one
+    scale for both axes, so that the weaker one moves a motor by sin 45 deg.
+    """
+    weaker = min(forward, right)
+    if weaker <= 0.0:
+        return math.sqrt(0.5), math.sqrt(0.5)
+    return math.sqrt(0.5) * weaker / right, math.sqrt(0.5) * weaker / forward
 
 
 _COUNT = len(Gains._fields)

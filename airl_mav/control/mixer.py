@@ -6,19 +6,16 @@ thrust is lowered but never raised to make room.
 
 from __future__ import annotations
 
-import math
-
+from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
 from airl_mav.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 Motors = tuple[float, float, float, float]
 
-# Normalised allocation matrix of a symmetric quad X (PX4 scales roll and pitch by the rms of
-# their columns): command = thrust + SIN45 roll + SIN45 pitch + yaw, motors FR, RL, FL, RR.
-SIN45 = math.sqrt(0.5)
-ROLL: Motors = (-SIN45, SIN45, SIN45, -SIN45)
-PITCH: Motors = (SIN45, -SIN45, SIN45, -SIN45)
+# Motors FR, RL, FL, RR: command = thrust + arm_roll roll + arm_pitch pitch + yaw.
+ROLL: Motors = (-1.0, 1.0, 1.0, -1.0)
+PITCH: Motors = (1.0, -1.0, 1.0, -1.0)
 YAW: Motors = (1.0, 1.0, -1.0, -1.0)
 THRUST: Motors = (1.0, 1.0, 1.0, 1.0)
 # Yaw may push motors beyond their limit by this share before thrust gives way.
@@ -68,20 +65,25 @@ def _in_range(m: Motors) -> bool:
 
 
 @kernel
-def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
+def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
     """Return motor commands 0..1 and the torque that could not be delivered, per axis.
 
     Args:
         thrust: Collective 0..1.
         torque: Normalised roll, pitch, yaw torque, -1..1.
+        gains: Hold how much of roll and pitch the motors get.
     """
-    m = _add(_add(_add((0.0, 0.0, 0.0, 0.0), THRUST, thrust), ROLL, torque[0]), PITCH, torque[1])
+    r, p = gains.mix_roll, gains.mix_pitch
+    rolling = (r * ROLL[0], r * ROLL[1], r * ROLL[2], r * ROLL[3])
+    pitching = (p * PITCH[0], p * PITCH[1], p * PITCH[2], p * PITCH[3])
+    level = (thrust, thrust, thrust, thrust)
+    m = _add(_add(level, rolling, torque[0]), pitching, torque[1])
     turning = _add(m, YAW, torque[2])
     if _in_range(m) and _in_range(turning):
         return turning, (0.0, 0.0, 0.0)  # nothing is saturated, which is the rule
     m = _desaturate(m, THRUST, 1.0, True)
-    m = _desaturate(m, ROLL, 1.0, False)
-    m = _desaturate(m, PITCH, 1.0, False)
+    m = _desaturate(m, rolling, 1.0, False)
+    m = _desaturate(m, pitching, 1.0, False)
     m = _add(m, YAW, torque[2])
     m = _desaturate(m, YAW, 1.0 + YAW_MARGIN, False)
     m = _desaturate(m, THRUST, 1.0, True)
@@ -91,8 +93,8 @@ def mix(thrust: float, torque: Vec) -> tuple[Motors, Vec]:
         clamp(m[2], 0.0, 1.0),
         clamp(m[3], 0.0, 1.0),
     )
-    roll = (-out[0] + out[1] + out[2] - out[3]) / (4.0 * SIN45)
-    pitch = (out[0] - out[1] + out[2] - out[3]) / (4.0 * SIN45)
+    roll = (-out[0] + out[1] + out[2] - out[3]) / (4.0 * r)
+    pitch = (out[0] - out[1] + out[2] - out[3]) / (4.0 * p)
     yaw = 0.25 * (out[0] + out[1] - out[2] - out[3])
     missing = (torque[0] - roll, torque[1] - pitch, torque[2] - yaw)
     return out, (_dead(missing[0]), _dead(missing[1]), _dead(missing[2]))

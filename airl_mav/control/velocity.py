@@ -25,6 +25,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     """Return the velocity to fly NED [m/s]: position error x gain + feed-forward, limited.
 
     A NaN axis of `position_sp` has no position loop; a NaN axis of `velocity_ff` adds nothing.
+    Where neither says anything of the horizontal, nor does the result: NaN, not controlled.
     The horizontal limit gives the position correction priority over the feed-forward.
     """
     px = 0.0 if math.isnan(position_sp[0]) else gains.pos_p_xy * (position_sp[0] - position[0])
@@ -45,6 +46,13 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
         b = px * fx + py * fy
         s = (-b + math.sqrt(b * b + a * (limit * limit - square_p))) / a
         vx, vy = px + s * fx, py + s * fy
+    if (
+        math.isnan(position_sp[0])
+        and math.isnan(position_sp[1])
+        and math.isnan(velocity_ff[0])
+        and math.isnan(velocity_ff[1])
+    ):
+        vx, vy = math.nan, math.nan
     return vx, vy, clamp(pz + fz, -gains.vel_max_up, gains.vel_max_down)
 
 
@@ -79,6 +87,7 @@ def velocity_control(
 ) -> tuple[Vec, Vec]:
     """Return the thrust vector (3,) NED and the new integral (3,) [m/s²].
 
+    A NaN horizontal setpoint is not controlled: the vehicle stays level.
     PID on velocity with anti-windup: vertical integration stops at the thrust limits; horizontal
     integration is pulled back by what saturation takes away (tracking anti-windup, gain 2/P).
     """
@@ -87,6 +96,10 @@ def velocity_control(
     ez = velocity_sp[2] - velocity[2]
     ax = gains.vel_p_xy * ex + integral[0] - gains.vel_d_xy * velocity_dot[0]
     ay = gains.vel_p_xy * ey + integral[1] - gains.vel_d_xy * velocity_dot[1]
+    if math.isnan(velocity_sp[0]):
+        # Not controlled: level. What was learned against the drag would accelerate it for ever.
+        ax, ay, ex, ey = 0.0, 0.0, 0.0, 0.0
+        integral = (0.0, 0.0, integral[2])
     az = gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]
     tx, ty, tz = thrust_from_acceleration((ax, ay, az), gains)
     if (tz >= -gains.thrust_min and ez >= 0.0) or (tz <= -gains.thrust_max and ez <= 0.0):

@@ -114,7 +114,7 @@ class Navigation:
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
         self._arena_seed = arena_seed
         self._trace = trace
-        parameters = parameter_values(self.vehicle.parameters)
+        parameters = parameter_values(self.vehicle.autopilot_parameters())
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__)
         rules = spec.episode
         self._rules = Rules(rules.goal_radius_m, round(rules.time_limit_s * US_PER_S))
