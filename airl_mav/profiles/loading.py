@@ -18,7 +18,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "studies"]
+Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "studies", "conformance"]
 _SINGULAR: dict[Kind, str] = {
     "vehicles": "vehicle",
     "computers": "computer",
@@ -26,6 +26,7 @@ _SINGULAR: dict[Kind, str] = {
     "training": "training",
     "sweeps": "sweep",
     "studies": "study",
+    "conformance": "conformance",
 }
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -26,7 +26,8 @@ class ParameterSpec:
 _s = ParameterSpec
 
 
-# Names, meanings, defaults and ranges are PX4's (parameter reference of v1.16).
+# Names, meanings, defaults and ranges are PX4's (parameter reference of v1.16). It leaves where the
+# rotors are (CA_ROTORn_PX, _PY) to the airframe: here as in vehicles/quad.
 SPECS: tuple[ParameterSpec, ...] = (
     _s("BAT1_CAPACITY", 5200.0, -1, 1e6, "mAh", "battery capacity"),
     _s("BAT1_N_CELLS", 4, 0, 16, "", "cells in series"),
@@ -36,6 +37,14 @@ SPECS: tuple[ParameterSpec, ...] = (
     _s("CAL_ACC0_ID", 1310988, 0, 2**31 - 1, "", "calibrated accelerometer (simulated)"),
     _s("CAL_GYRO0_ID", 1310988, 0, 2**31 - 1, "", "calibrated gyroscope (simulated)"),
     _s("CAL_MAG0_ID", 197388, 0, 2**31 - 1, "", "calibrated magnetometer (simulated)"),
+    _s("CA_ROTOR0_PX", 0.13, -100, 100, "m", "rotor 0: how far forward of the centre"),
+    _s("CA_ROTOR0_PY", 0.22, -100, 100, "m", "rotor 0: how far right of the centre"),
+    _s("CA_ROTOR1_PX", -0.13, -100, 100, "m", "rotor 1: how far forward of the centre"),
+    _s("CA_ROTOR1_PY", -0.22, -100, 100, "m", "rotor 1: how far right of the centre"),
+    _s("CA_ROTOR2_PX", 0.13, -100, 100, "m", "rotor 2: how far forward of the centre"),
+    _s("CA_ROTOR2_PY", -0.22, -100, 100, "m", "rotor 2: how far right of the centre"),
+    _s("CA_ROTOR3_PX", -0.13, -100, 100, "m", "rotor 3: how far forward of the centre"),
+    _s("CA_ROTOR3_PY", 0.22, -100, 100, "m", "rotor 3: how far right of the centre"),
     _s("COM_DISARM_LAND", 2.0, -1, 20, "s", "time to disarm after landing; <= 0 never"),
     _s("COM_DISARM_PRFLT", 10.0, -1, 30, "s", "time to disarm without take-off; <= 0 never"),
     _s("COM_DL_LOSS_T", 10, 5, 300, "s", "ground station loss timeout"),

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
-from pydantic import Field, Strict
+from pydantic import Field, Strict, model_validator
 
 from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.parameters import SPECS, parameter_values
 
 
 class Body(ProfileModel):
@@ -22,6 +22,16 @@ class Body(ProfileModel):
     inertia_zz_kg_m2: float = quantity("inertia about the down axis", "kg m²", gt=1e-6, le=100)
     width_m: float = quantity("width across the propellers, for clearances", "m", gt=0.02, le=10)
     height_m: float = quantity("height of the collision body", "m", gt=0.01, le=5)
+
+
+Corner = Literal["front right", "rear left", "front left", "rear right"]
+"""Where a motor sits. Front right and rear left turn counter-clockwise seen from above."""
+
+CORNERS: tuple[Corner, ...] = ("front right", "rear left", "front left", "rear right")
+"""The project's order of motors, which is PX4's for a quad X."""
+
+COUNTER_CLOCKWISE: tuple[Corner, ...] = ("front right", "rear left")
+"""Those whose rotor turns that way, seen from above."""
 
 
 class Rotor(ProfileModel):
@@ -46,6 +56,18 @@ class Rotor(ProfileModel):
         le=1,
     )
     speed_max_rad_s: float = quantity("rotor speed at full command", "rad/s", gt=10, le=20000)
+
+    def px4_geometry(self) -> dict[str, float]:
+        """Return where the rotors sit and how they turn, as PX4's parameters CA_ROTORn_*."""
+        values = {}
+        for i, corner in enumerate(CORNERS):
+            forward = 1.0 if corner.startswith("front") else -1.0
+            right = 1.0 if corner.endswith("right") else -1.0
+            turn = 1.0 if corner in COUNTER_CLOCKWISE else -1.0
+            values[f"CA_ROTOR{i}_PX"] = self.arm_forward_m * forward
+            values[f"CA_ROTOR{i}_PY"] = self.arm_right_m * right
+            values[f"CA_ROTOR{i}_KM"] = self.torque_per_thrust_m * turn
+        return values
 
 
 class Drag(ProfileModel):
@@ -169,6 +191,41 @@ class Estimation(ProfileModel):
     heading_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
 
 
+# Strict, or true and "0.5" would pass; a whole number passes for a float.
+ParameterTable = dict[str, Annotated[float, Strict()]]
+
+
+class RealFirmware(ProfileModel):
+    """What real firmware must be set to, to fly this vehicle."""
+
+    motors: tuple[Corner, Corner, Corner, Corner] = Field(
+        description="which motor hangs on each of the firmware's outputs 1 to 4"
+    )
+    parameters: ParameterTable = Field(
+        default_factory=dict, description="set where we start the firmware, checked where not"
+    )
+
+    @model_validator(mode="after")
+    def _every_corner_once(self) -> RealFirmware:
+        if len(set(self.motors)) != len(CORNERS):
+            corners = ", ".join(CORNERS)
+            raise ValueError(f"motors = {list(self.motors)}: accepted: each once of {corners}")
+        return self
+
+
+class Px4(RealFirmware):
+    """What PX4 needs; rotor geometry and thrust curve follow from the vehicle itself."""
+
+    airframe: int = quantity("SYS_AUTOSTART, airframe of PX4's simulator", "1", ge=1, le=99_999)
+
+
+class ArduPilot(RealFirmware):
+    """What ArduCopter needs."""
+
+    frame_class: int = quantity("FRAME_CLASS, 1 = quad", "1", ge=1, le=1)
+    frame_type: int = quantity("FRAME_TYPE, 1 = X", "1", ge=0, le=20)
+
+
 class VehicleProfile(ProfileModel):
     """Everything about the aircraft that is not its companion computer."""
 
@@ -184,10 +241,21 @@ class VehicleProfile(ProfileModel):
     estimation: Estimation | None = Field(
         default=None, description="error of the estimator on these sensors; absent = not known"
     )
-    # Strict, or true and "0.5" would pass; a whole number passes for a float.
-    parameters: dict[str, Annotated[float, Strict()]] = Field(
-        default_factory=dict, description="PX4-named parameters that differ from the defaults"
+    parameters: ParameterTable = Field(
+        default_factory=dict,
+        description="PX4-named parameters of the built-in autopilot that differ from the defaults",
     )
+    px4: Px4 | None = Field(default=None, description="for --firmware px4 and px4-hitl")
+    ardupilot: ArduPilot | None = Field(default=None, description="for --firmware ardupilot")
+
+    def autopilot_parameters(self) -> dict[str, float]:
+        """Return what the built-in autopilot is set to: its rotors' places, what `parameters` say.
+
+        By PX4's names; only those that it has.
+        """
+        known = {spec.name for spec in SPECS}
+        places = {n: v for n, v in self.rotor.px4_geometry().items() if n in known}
+        return {**places, **self.parameters}
 
 
 def load_vehicle(name: str) -> VehicleProfile:
