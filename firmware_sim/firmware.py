@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 from airl_mav.camera.frame import Frame
 from airl_mav.constants import TICK_US, US_PER_S
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.state import Message
+from firmware_sim.flight_controller import FlightController
+from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 IDLE_S = 0.02
 """How often requests are looked for while no episode stands [s]."""
@@ -35,6 +38,87 @@ class FrameServer(Protocol):
         ...
 
 
+class Avionics(Protocol):
+    """What is aboard beside sensors and motors: a flight controller and its MAVLink links.
+
+    The links stay; the flight controller is booted anew for each episode. Nothing here raises
+    while flying, but for `boot`.
+    """
+
+    def boot(self, setup: EpisodeSetup) -> FlightController:
+        """Boot the flight controller of an episode, and wait until it can be stepped.
+
+        Raises:
+            UsageError: The vehicle's parameters are wrong, or there is no such firmware.
+            FirmwareLostError: Real firmware died on the way.
+        """
+        ...
+
+    def connect(self, tick: Callable[[], int]) -> None:
+        """Let it talk: it has had its first tick.
+
+        Args:
+            tick: Flies one more and returns its simulated time [µs], for what takes its time.
+
+        Raises:
+            UsageError: Real firmware is silent, or is set up for another vehicle.
+            FirmwareLostError: Real firmware died.
+        """
+        ...
+
+    def filenos(self) -> Sequence[int]:
+        """Return the descriptors that become readable when MAVLink arrives."""
+        ...
+
+    def receive(self, now_us: int) -> int:
+        """Take what has arrived at simulated time `now_us` [µs]; return how much took effect."""
+        ...
+
+    def send(self, now_us: int) -> None:
+        """Send what is due; once a tick."""
+        ...
+
+    def log_to(self, tlog: TlogWriter | None) -> None:
+        """Write the onboard link to a tlog from now on; None ends it."""
+        ...
+
+    def counters(self) -> dict[str, LinkCounters]:
+        """Return the traffic per link name."""
+        ...
+
+    def close(self) -> None:
+        """Release everything."""
+        ...
+
+
+class BuiltinAvionics:
+    """The built-in autopilot behind our own MAVLink server. Implements `Avionics`."""
+
+    def __init__(self, server: MavlinkServer) -> None:
+        self._server = server
+        self._autopilot: BuiltinAutopilot | None = None
+        self.filenos = server.filenos
+        self.receive = server.receive
+        self.send = server.send
+        self.counters = server.counters
+        self.close = server.close
+
+    def boot(self, setup: EpisodeSetup) -> BuiltinAutopilot:
+        """Boot the autopilot of an episode. Raises UsageError for a wrong parameter."""
+        self._autopilot = builtin_autopilot(setup)
+        return self._autopilot
+
+    def connect(self, tick: Callable[[], int]) -> None:
+        """Let it talk."""
+        del tick
+        if self._autopilot is not None:
+            self._server.attach(self._autopilot)
+
+    def log_to(self, tlog: TlogWriter | None) -> None:
+        """Write the onboard link to a tlog from now on; None ends it."""
+        self._server.log_to(tlog)
+
+
 @dataclass(frozen=True)
 class Loaded:
     """An episode that has just been set up."""
@@ -47,8 +131,8 @@ class Loaded:
 class Firmware:
     """Flies one episode after the other; its links and its camera stay."""
 
-    def __init__(self, server: MavlinkServer, camera: FrameServer | None, pacing: Pacing) -> None:
-        self.server = server
+    def __init__(self, avionics: Avionics, camera: FrameServer | None, pacing: Pacing) -> None:
+        self.avionics = avionics
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
@@ -57,7 +141,7 @@ class Firmware:
         """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
         self._pacing = pacing
-        self._sockets = server.filenos()
+        self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
 
     @property
@@ -82,17 +166,32 @@ class Firmware:
             setup: The episode.
             tlog: Where its MAVLink log goes; None = no log.
             start_unix_us: Calendar time of this moment [µs since 1970].
+
+        Raises:
+            UsageError: The episode cannot be flown, or there is no such firmware.
+            FirmwareLostError: Real firmware died on the way.
         """
         self.discard()
+        autopilot = self.avionics.boot(setup)
+        autopilot.on_message = self.on_message
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
-        simulation = Simulation(setup, start_us=start_us, clock=self.clock)
+        try:
+            simulation = Simulation(setup, start_us=start_us, clock=self.clock, autopilot=autopilot)
+        except BaseException:
+            autopilot.close()
+            raise
         self.simulation = simulation
-        simulation.autopilot.on_message = self.on_message
         simulation.tick()
-        self.server.attach(simulation.autopilot)
+        powered_us = simulation.time_us
+        self.avionics.connect(self._tick_on_the_ground)
+        if simulation.time_us > powered_us:
+            # The time that real firmware took to boot is no part of the episode.
+            simulation.begin()
+            start_us = simulation.start_us
+        self._sockets = self.avionics.filenos()
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
-            self.server.log_to(self._tlog)
+            self.avionics.log_to(self._tlog)
         if self.epoch_ns is not None:
             # What lives for the whole episode need not be searched by the garbage collector: a
             # full collection would stall the 250 Hz loop by tens of milliseconds.
@@ -102,18 +201,29 @@ class Firmware:
         self._pacing.restart(simulation.time_us)
         return Loaded(start_us, self.epoch_ns)
 
+    def _tick_on_the_ground(self) -> int:
+        simulation = self.simulation
+        if simulation is None:
+            return 0
+        simulation.tick()
+        return simulation.time_us
+
     def step(self) -> None:
-        """Wait for the next tick's wall time, then run it."""
-        simulation, server = self.simulation, self.server
+        """Wait for the next tick's wall time, then run it.
+
+        Raises FirmwareLostError when real firmware does not answer.
+        """
+        simulation, avionics = self.simulation, self.avionics
         if simulation is None:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
-        server.receive(self._pacing.wait(simulation.time_us, self._sockets, server.receive))
+        receive = avionics.receive
+        receive(self._pacing.wait(simulation.time_us, self._sockets, receive))
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
         simulation.tick()
-        server.send(simulation.time_us)
+        avionics.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
 
@@ -130,7 +240,7 @@ class Firmware:
 
     def _close_tlog(self) -> None:
         if self._tlog is not None:
-            self.server.log_to(None)
+            self.avionics.log_to(None)
             self._tlog.close()
             self._tlog = None
 
@@ -146,6 +256,6 @@ class Firmware:
     def close(self) -> None:
         """Release everything."""
         self.discard()
-        self.server.close()
+        self.avionics.close()
         if self._camera is not None:
             self._camera.close()

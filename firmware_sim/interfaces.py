@@ -65,6 +65,18 @@ class ActuatorControls(NamedTuple):
     armed: bool
 
 
+class Truth(NamedTuple):
+    """What really is; never shown to the autopilot."""
+
+    time_us: int
+    position: Vector  # (3,) NED [m]
+    velocity: Vector  # (3,) NED [m/s]
+    quaternion: Vector  # (4,) body -> NED
+    angular_velocity: Vector  # (3,) FRD [rad/s]
+    power_w: float
+    battery_remaining: float
+
+
 class Autopilot(Protocol):
     """A flight controller: the built-in one, or a bridge to real firmware."""
 

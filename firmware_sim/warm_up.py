@@ -15,7 +15,7 @@ from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.wind import WindSettings
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 TICKS = 400
 """Enough for the estimator to converge and the vehicle to arm and spin."""
@@ -26,15 +26,16 @@ def warm_up(vehicle: VehicleProfile) -> None:
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
     setup = EpisodeSetup(vehicle, arena, 0, WindSettings())
-    simulation = Simulation(setup, start_us=0, clock=SimClock())
+    autopilot = builtin_autopilot(setup)
+    simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
-    server = MavlinkServer(links, simulation.autopilot, boot_unix_us=0)
+    server = MavlinkServer(links, autopilot, boot_unix_us=0)
     try:
         for _ in range(TICKS):
             simulation.tick()
             server.send(simulation.time_us)
             simulation.capture_due(lambda _frame: None)
-            if simulation.autopilot.arm(force=False) == 0:
-                simulation.autopilot.takeoff(2.0)
+            if autopilot.arm(force=False) == 0:
+                autopilot.takeoff(2.0)
     finally:
         simulation.close()

@@ -97,7 +97,7 @@ def test_parameters_are_live_in_flight() -> None:
         hovering(rig)
         thrust = rig.ap.state().thrust_setpoint
         rig.ap.parameters.set("MPC_THR_HOVER", 0.8 * rig.ap.parameters["MPC_THR_HOVER"])
-        rig.tick()
+        rig.run(0.02)
         assert rig.ap.state().thrust_setpoint < 0.9 * thrust
         rig.ap.parameters.set("MPC_LAND_SPEED", 0.6)
         assert rig.ap.parameters.value("MPC_LAND_SPEED") == 0.6

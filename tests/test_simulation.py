@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flight_rig import CALM, Rig, quad, velocity_setpoint
+from flight_rig import CALM, Rig, flight, quad, velocity_setpoint
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
@@ -152,7 +152,7 @@ def test_the_file_has_the_arrays_and_more(tmp_path: Path) -> None:
             assert file[name].dtype == values.dtype
             np.testing.assert_array_equal(file[name], values)
     n = len(arrays["setpoints/accepted_us"])
-    assert n == 21  # at 20 Hz, the first at once
+    assert n == 20  # at 20 Hz, the first at once; the last has not reached the motors
     assert arrays["setpoints/setpoint"].shape == (n, 4)
 
 
@@ -201,7 +201,7 @@ def test_what_is_recorded_is_what_was() -> None:
         np.testing.assert_array_equal(arrays["estimate/quaternion"][i], estimate.quaternion)
 
 
-def test_the_motors_reflect_a_setpoint_in_the_tick_after_it() -> None:
+def test_on_the_ground_a_setpoint_is_taken_in_the_tick_after_it() -> None:
     clock = SimClock()
     simulation = Simulation(EpisodeSetup(quad(), None, 1, CALM), start_us=0, clock=clock)
     for i in range(6):
@@ -217,6 +217,32 @@ def test_the_motors_reflect_a_setpoint_in_the_tick_after_it() -> None:
     assert arrays["setpoints/accepted_us"].tolist() == [4000, 4001, 12_000, 12_001]
     assert arrays["setpoints/motor_us"].tolist() == [8000, 8000, 16_000, 16_000]
     assert arrays["setpoints/setpoint"][:, 0].tolist() == [1, 1, 3, 3]
+
+
+@pytest.mark.parametrize("ticks", [100, 101])
+def test_in_flight_a_setpoint_is_stamped_when_the_motors_first_differ(ticks: int) -> None:
+    """Against the same flight without it: whichever of two ticks the position loop runs in."""
+    motors: list[list[tuple[float, ...]]] = []
+    flown: list[int] = []
+    for north in (0.0, 2.0):
+        with flight(3) as rig:
+            rig.take_off(4.0, settle_s=1.0)
+            rig.go_offboard(velocity_setpoint(0.0, 0.0, 0.0))
+            rig.stream(None)
+            for _ in range(ticks):
+                rig.tick()
+            assert not rig.sim.setpoints.pending
+            rig.ap.offer_setpoint(velocity_setpoint(north, 0.0, 0.0), rig.sim.time_us)
+            rows, pending = [], []
+            for _ in range(10):
+                rig.tick()
+                rows.append(rig.ap.state().motors)
+                pending.append(rig.sim.setpoints.pending)
+            motors.append(rows)
+            flown.append(pending.index(False))
+    differ = [a != b for a, b in zip(*motors, strict=True)].index(True)
+    assert differ in (2, 3)
+    assert flown == [differ, differ]
 
 
 # --- camera

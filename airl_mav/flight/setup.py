@@ -10,6 +10,10 @@ from airl_mav.latency.injection import Injection
 Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
 
 
+BUILT_IN = "built-in"
+"""The firmware of all levels but one."""
+
+
 @dataclass(frozen=True)
 class Part:
     """One part of a rehearsal: the vehicle, the arena, the policy, the computer."""
@@ -36,3 +40,5 @@ class Setup:
     """Simulated seconds per wall second; None where time is not paced (lockstep)."""
     between_commands: str
     """What the vehicle does between commands: `persist`, `hover-after 60 ms`."""
+    firmware: str = BUILT_IN
+    """What flew: the built-in autopilot, or the name of real firmware."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from airl_mav.constants import TICK_S
+from airl_mav.constants import TICK_HZ, TICK_S
 from airl_mav.control.cascade import Demand
 from airl_mav.control.controller import Controller
 from airl_mav.control.gains import Gains
@@ -32,7 +32,7 @@ from firmware_sim.autopilot.state import (
     Setpoint,
     Severity,
 )
-from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample
+from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 
@@ -49,7 +49,9 @@ _MODE_EVENT = {
 
 
 class BuiltinAutopilot:
-    """Implements `interfaces.Autopilot` towards the plant and `port.AutopilotPort` to MAVLink."""
+    """Implements `FlightController` towards the plant and `port.AutopilotPort` to MAVLink."""
+
+    rate_hz = TICK_HZ
 
     def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
         """Boot: not armable until the estimator has converged.
@@ -189,6 +191,22 @@ class BuiltinAutopilot:
     def flight(self) -> Flight:
         """The commander's state."""
         return self._flight
+
+    @property
+    def ticks_to_motors(self) -> int:
+        """After how many more ticks the motors reflect what is demanded in the next one."""
+        return self._controller.ticks_to_motors
+
+    @property
+    def inside(self) -> BuiltinAutopilot:
+        """Itself: everything can be looked at."""
+        return self
+
+    def see(self, truth: Callable[[], Truth]) -> None:
+        """Do nothing: it never sees the truth."""
+
+    def close(self) -> None:
+        """Do nothing: it holds nothing."""
 
     def take_messages(self) -> list[Message]:
         """Return texts for the operator since the last call."""

@@ -18,7 +18,8 @@ NAN = math.nan
 _FREE = (NAN, NAN, NAN)
 
 FALLBACK_DESCENT_M_S = 0.75
-"""Descent in Position mode without a pilot's sticks (measured on PX4 1.16)."""
+"""Descent in Position mode without a pilot's sticks (measured on PX4 1.16). It stays level: drag
+alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
 
 TAKEOFF_REACHED_M = 0.2
 """Closer than this to the take-off altitude, take-off is done."""
@@ -32,6 +33,10 @@ _GROUND, _AIR = Phase.GROUND, Phase.AIR
 def _triple(state: Vector, start: int) -> Vec:
     north, east, down = state[start : start + 3].tolist()
     return north, east, down
+
+
+def _or_zero(value: float) -> float:
+    return 0.0 if math.isnan(value) else value
 
 
 @dataclass
@@ -75,12 +80,11 @@ class Guidance:
         self._spool_since_us = None
 
     def offer(self, setpoint: Setpoint) -> None:
-        """From now on this is what offboard flies."""
+        """From now on this is what offboard flies; an axis that it leaves open stands still."""
+        north, east, down = _triple(setpoint.velocity, 0)
+        velocity = _or_zero(north), _or_zero(east), _or_zero(down)
         self._offboard = Demand(
-            _triple(setpoint.position, 0),
-            _triple(setpoint.velocity, 0),
-            setpoint.yaw,
-            setpoint.yaw_rate,
+            _triple(setpoint.position, 0), velocity, setpoint.yaw, setpoint.yaw_rate
         )
 
     def takeoff_done(self, state: Vector) -> bool:
@@ -141,7 +145,7 @@ class Guidance:
         if mode is _RETURN:
             return self._return(state)
         if mode is _POSITION:
-            return Demand(_FREE, (0.0, 0.0, FALLBACK_DESCENT_M_S), self._anchor.yaw, NAN)
+            return Demand(_FREE, (NAN, NAN, FALLBACK_DESCENT_M_S), self._anchor.yaw, NAN)
         return self._hold(state)
 
     def _height(self, state: Vector) -> float:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from firmware_sim.mavlink.endpoint import Address, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 
-def px4_server(
+class Px4Ends(NamedTuple):
+    """The vehicle's ends of both links."""
+
+    api: UdpEndpoint
+    gcs: UdpEndpoint
+
+
+def px4_ends(
     *,
     bind: str,
     api_remote: Address,
@@ -15,9 +24,8 @@ def px4_server(
     gcs_remote: Address,
     gcs_local_port: int,
     insecure: bool,
-    boot_unix_us: int,
-) -> MavlinkServer:
-    """Bind both links and return the server, still without an autopilot.
+) -> Px4Ends:
+    """Bind the vehicle's ports of both links.
 
     Raises:
         UsageError: A port is taken, or an address can be reached from other machines without
@@ -41,4 +49,14 @@ def px4_server(
     except Exception:
         api.close()
         raise
-    return MavlinkServer([onboard_link(api), gcs_link(gcs)], boot_unix_us=boot_unix_us)
+    return Px4Ends(api, gcs)
+
+
+def px4_server(ends: Px4Ends, boot_unix_us: int) -> MavlinkServer:
+    """Return the server of both links, still without an autopilot.
+
+    Args:
+        ends: The vehicle's ends.
+        boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+    """
+    return MavlinkServer([onboard_link(ends.api), gcs_link(ends.gcs)], boot_unix_us=boot_unix_us)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from airl_mav.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.frames import Vector
 from airl_mav.kernels import kernel
 from airl_mav.profiles.vehicle import Battery, Power
@@ -97,6 +97,7 @@ def absorb(
     airframe: Vector,
     power: Vector,
     pack: Vector,
+    tick_s: float,
 ) -> tuple[float, Supply, float]:
     """Take in pybullet's state after a tick: the motion, what it took, what is left.
 
@@ -114,14 +115,15 @@ def absorb(
         airframe: (13,) as `Airframe`.
         power: (10,) as `power_row`.
         pack: (4,) as `pack_row`.
+        tick_s: How long the tick was [s].
 
     Returns:
         Power over the tick [W], what the battery's monitor reads, the state of charge after it.
     """
     accel = (
-        (linear[1] - before[3]) / TICK_S,
-        (linear[0] - before[4]) / TICK_S,
-        (-linear[2] - before[5]) / TICK_S,
+        (linear[1] - before[3]) / tick_s,
+        (linear[0] - before[4]) / tick_s,
+        (-linear[2] - before[5]) / tick_s,
     )
     from_bullet(at, orientation, linear, angular, accel, row)
     b = power
@@ -135,4 +137,4 @@ def absorb(
     else:
         load = power_w(velocity(row), accel, (wind[0], wind[1], wind[2]), b[9], model)
     reading = supply(load, charge, pack)
-    return load, reading, drain(charge, reading[1], pack[3], TICK_S)
+    return load, reading, drain(charge, reading[1], pack[3], tick_s)

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import TICK_S, TICK_US
+from airl_mav.constants import TICK_HZ, US_PER_S
 from airl_mav.frames import Vector
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotor import lag
-from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
+from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.dynamics import (
     IDLE_POWER_W,
@@ -45,18 +45,6 @@ _ANY_LINK = -2
 """pybullet's filter of contacts that lets all links pass."""
 
 
-class Truth(NamedTuple):
-    """What really is; never shown to the autopilot."""
-
-    time_us: int
-    position: Vector  # (3,) NED [m]
-    velocity: Vector  # (3,) NED [m/s]
-    quaternion: Vector  # (4,) body -> NED
-    angular_velocity: Vector  # (3,) FRD [rad/s]
-    power_w: float
-    battery_remaining: float
-
-
 class Collision(NamedTuple):
     """The vehicle began to touch something; the floor only when faster than REST_SPEED_M_S."""
 
@@ -77,6 +65,7 @@ class Plant:
         *,
         start_us: int = 0,
         wind: WindSettings | None = None,
+        rate_hz: int = TICK_HZ,
     ) -> None:
         """Put the vehicle at rest on the floor at the start, facing north.
 
@@ -86,23 +75,28 @@ class Plant:
             rng: All randomness of sensors and wind.
             start_us: Simulated time of the first state [µs].
             wind: None = calm.
+            rate_hz: Ticks a second.
         """
+        tick_s = 1.0 / rate_hz
         body = profile.body
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
-        self.world = World(arena, 0.5 * diagonal_m)
+        self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self.collisions: list[Collision] = []
         """Latched collision events, oldest first."""
         airframe = Airframe.from_profile(profile)
         sensor_rng, wind_rng = rng.spawn(2)
-        self._sensors = SensorSuite(profile.sensors, sensor_rng)
-        self._wind = Wind(wind or WindSettings(), wind_rng)
+        self._sensors = SensorSuite(profile.sensors, sensor_rng, tick_s)
+        self._wind = Wind(wind or WindSettings(), wind_rng, tick_s)
         self._start_us = start_us
+        self._moves_us = start_us
+        """When moving obstacles set out."""
         self._time_us = start_us
+        self._rate_hz, self._tick_s, self._ticks = rate_hz, tick_s, 0
         # What kernels take, as arrays: names would cost their callers a microsecond each.
         self._airframe = np.array(airframe)
         self._power = np.array(power_row(profile.power))
         self._pack = np.array(pack_row(profile.battery))
-        self._left = lag(airframe, TICK_S)
+        self._left = lag(airframe, tick_s)
         self._speeds = STOPPED
         self._remaining = 1.0
         self._power_w = IDLE_POWER_W
@@ -111,9 +105,19 @@ class Plant:
         self._motion = self._read()
         self._battery = BatterySample(*supply(self._power_w, self._remaining, self._pack))
 
+    def begin(self) -> None:
+        """Let what moves set out now; contacts so far are forgotten."""
+        self._moves_us = self._time_us
+        self.collisions.clear()
+
     def close(self) -> None:
         """Release the physics server."""
         self.world.close()
+
+    @property
+    def time_us(self) -> int:
+        """Simulated time of the newest tick [µs]."""
+        return self._time_us
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -147,8 +151,10 @@ class Plant:
         )
         pybullet.applyExternalForce(body, -1, force, here, pybullet.WORLD_FRAME, client)
         pybullet.applyExternalTorque(body, -1, torque, pybullet.WORLD_FRAME, client)
-        self._time_us += TICK_US
-        world.move_obstacles(self._time_us - self._start_us, before)
+        self._ticks += 1
+        # Of the count: not every rate has a period of whole microseconds.
+        self._time_us = self._start_us + self._ticks * US_PER_S // self._rate_hz
+        world.move_obstacles(self._time_us - self._moves_us, before)
         pybullet.stepSimulation(client)
         contacts = pybullet.getContactPoints(body, -1, _ANY_LINK, _ANY_LINK, client)
         if contacts or self._touching:
@@ -170,6 +176,7 @@ class Plant:
             self._airframe,
             self._power,
             self._pack,
+            self._tick_s,
         )
         self._speeds, self._battery = speeds, BatterySample(*reading)
         return self.sense()

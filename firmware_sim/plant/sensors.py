@@ -169,14 +169,16 @@ class SensorSuite:
     often another does.
     """
 
-    def __init__(self, profile: Sensors, rng: np.random.Generator) -> None:
+    def __init__(self, profile: Sensors, rng: np.random.Generator, tick_s: float = TICK_S) -> None:
         imu = profile.imu
         inertial, compass, barometer, gps = rng.spawn(4)
-        walk = math.sqrt(TICK_S)
+        walk = math.sqrt(tick_s)
+        # The profile's noise is that of a sample at the base tick: its density stays.
+        white = math.sqrt(TICK_S / tick_s)
         self._sigma = np.repeat(
             [
-                imu.accel_noise_m_s2,
-                imu.gyro_noise_rad_s,
+                imu.accel_noise_m_s2 * white,
+                imu.gyro_noise_rad_s * white,
                 imu.accel_walk_m_s2_sqrt_s * walk,
                 imu.gyro_walk_rad_s_sqrt_s * walk,
             ],

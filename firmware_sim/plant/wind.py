@@ -41,10 +41,12 @@ def _blow(noise: Vector, gust: Vector, keep: float, drive: Vector, steady: Vecto
 class Wind:
     """Steady wind plus first-order Gauss-Markov gusts (the first-order form of Dryden's model)."""
 
-    def __init__(self, settings: WindSettings, rng: np.random.Generator) -> None:
+    def __init__(
+        self, settings: WindSettings, rng: np.random.Generator, tick_s: float = TICK_S
+    ) -> None:
         self._steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
         sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
-        self._keep = math.exp(-TICK_S / settings.gust_time_s)
+        self._keep = math.exp(-tick_s / settings.gust_time_s)
         self._drive = math.sqrt(1.0 - self._keep**2) * sigma
         self._calm = settings.gust_m_s == 0.0
         self._rng = rng

@@ -35,18 +35,21 @@ LEVEL = facing(0.0)
 class World:
     """A pybullet world: floor, walls, obstacles. ENU inside, NED outside."""
 
-    def __init__(self, arena: Arena | None, vehicle_radius_m: float) -> None:
+    def __init__(
+        self, arena: Arena | None, vehicle_radius_m: float, tick_s: float = TICK_S
+    ) -> None:
         """Build the bodies of an arena.
 
         Args:
             arena: None = an endless floor.
             vehicle_radius_m: No part of the vehicle is further from its centre than this [m].
+            tick_s: What a step of the physics is long [s].
         """
         self.client: Any = connect()
         self.number: int = number_of(self.client)
         """Of the client, for direct calls of pybullet's functions."""
         self.client.setGravity(0.0, 0.0, -GRAVITY_M_S2)
-        self.client.setTimeStep(TICK_S)
+        self.client.setTimeStep(tick_s)
         self.names: dict[int, str] = {}
         """What each body is called in a collision event."""
         self._movers: Movers | None = None
