@@ -7,16 +7,13 @@ this process hangs; `watchdog.py` is there for that.
 
 from __future__ import annotations
 
-import ctypes
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
-from mavsdk.logging import log_subscribe
+from mavsdk import ComponentType
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
@@ -24,17 +21,14 @@ from mavsdk.plugins.telemetry import LandedState, Telemetry, TelemetryError
 
 from airl_mav.clock import Clock, WallClock
 from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
 from airl_mav.policy.observation import Kinematics
-
-RATE_HZ = 50.0
-"""Rate asked for position, velocity and attitude [Hz]."""
+from companion import raw_bytes
+from companion.connection import first_autopilot, open_connection
+from companion.dialects import PX4, Dialect, dialect_of
+from companion.interfaces import STOP, BodyVelocity, LinkError
 
 POLL_S = 0.1
 """How often a condition is looked at while waiting for it [s]."""
-
-CONNECT_SLICE_S = 0.5
-"""Longest single wait for a flight controller [wall s]."""
 
 HEALTH_SETTLE_S = 0.5
 """Good health must last so long before arming: more than two of PX4's 5 Hz reports [s]."""
@@ -42,57 +36,18 @@ HEALTH_SETTLE_S = 0.5
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
+STREAM_TIMEOUT_S = 10.0
+"""One that is heard, but still boots, may take so long to grant its streams [wall s]."""
+
+STREAM_RETRY_S = 0.2
+"""Time between two requests for a stream [wall s]."""
+
 RAW_URL = "raw://"
 """Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
-
-RAW_CHUNK = 65_536
-"""Bytes that are fed at a time; MAVSDK's parser puts a divided frame together again."""
 
 RAW_TIMEOUT_S = 3600.0
 """MAVSDK's time-out of a command on a raw connection [wall s]. Its answer is certain, but not when
 by the wall clock: a stopped process must not repeat commands when it goes on."""
-
-
-class LinkError(Exception):
-    """The flight controller refused, or is gone."""
-
-
-@dataclass(frozen=True)
-class BodyVelocity:
-    """A velocity setpoint in the heading frame, with a yaw rate."""
-
-    forward_m_s: float
-    right_m_s: float
-    down_m_s: float
-    yaw_rate_rad_s: float
-
-    def wire(self) -> tuple[float, float, float, float]:
-        """Return the four numbers in the order in which they are sent."""
-        return self.forward_m_s, self.right_m_s, self.down_m_s, self.yaw_rate_rad_s
-
-
-STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
-
-
-class Link(Protocol):
-    """What the pilot needs of a flight controller. Calls raise LinkError when refused."""
-
-    @property
-    def connected(self) -> bool:
-        """Whether the flight controller is heard."""
-        ...
-
-    def kinematics(self) -> Kinematics:
-        """Return the newest telemetry."""
-        ...
-
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
-        """Send a velocity setpoint; it is repeated until the next one."""
-        ...
-
-    def leave_offboard(self) -> None:
-        """Switch to Hold."""
-        ...
 
 
 class MavsdkLink:
@@ -124,41 +79,76 @@ class MavsdkLink:
         self._heard = heard
         self.setpoints_sent = 0
         """Setpoints handed to MAVSDK so far, its own repetitions not counted."""
-        # MAVSDK's own log goes to standard output; its findings reach us as results.
-        log_subscribe(lambda *_: True)
-        configuration = Configuration.create_with_component_type(ComponentType.COMPANION_COMPUTER)
-        self._mavsdk = Mavsdk(configuration)
-        result = self._mavsdk.add_any_connection(url)
-        if result != ConnectionResult.SUCCESS:
-            self._mavsdk.destroy()
-            raise UsageError(_connection_problem(url, result))
+        self._mavsdk = open_connection(url, ComponentType.COMPANION_COMPUTER)
         self._system: Any = None
         self._telemetry: Any = None
         self._action: Any = None
         self._offboard: Any = None
         self._texts: Any = None
+        self._dialect: Dialect = PX4
+        self._asked = False
+        """The streams have been asked for since the last mission."""
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Wait for a flight controller. Raises LinkError when none is heard in time [wall s].
 
         `stop`, set from outside, breaks off the wait.
         """
-        stopwatch = WallClock()
-        system = None
-        while system is None:
-            if stop is not None and stop.is_set():
-                raise LinkError("stopped")
-            left_s = timeout_s - stopwatch.time_us() / US_PER_S
-            if left_s <= 0.0:
-                raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
-            # In slices: a signal is only noticed between two calls into MAVSDK.
-            system = self._mavsdk.first_autopilot(min(left_s, CONNECT_SLICE_S))
+        system = first_autopilot(self._mavsdk, timeout_s, stop)
+        if system is None:
+            raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+        self._release_plugins()
         self._system = system
         self._telemetry = Telemetry(system)
         self._action = Action(system)
         self._offboard = Offboard(system)
-        self._call("telemetry", lambda: self._telemetry.set_rate_position_velocity_ned(RATE_HZ))
-        self._call("telemetry", lambda: self._telemetry.set_rate_attitude_quaternion(RATE_HZ))
+        self._ask_for_streams(stop)
+        self._asked = True
+
+    def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
+        """Make ready for a mission, on a connection that may have seen others.
+
+        The flight controller may be another one by now, or have been powered up again: nothing that
+        was heard before counts, and the streams are asked for anew. Right after `connect` there is
+        nothing to do.
+
+        Args:
+            timeout_s: How long to wait until one is heard [wall s].
+            stop: Set from outside to break off the wait.
+
+        Raises:
+            LinkError: None is heard, or it grants no streams.
+        """
+        if self._asked:
+            self._asked = False
+            return
+        stopwatch = WallClock()
+        while not self.connected:
+            if stopwatch.time_us() > timeout_s * US_PER_S:
+                raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+            self._pause_wall(stop)
+        # Telemetry of its own making knows nothing but what comes from now on.
+        self._telemetry.destroy()
+        self._telemetry = Telemetry(self._system)
+        self._ask_for_streams(stop)
+
+    def _ask_for_streams(self, stop: threading.Event | None) -> None:
+        self._dialect = dialect_of(self._system.autopilot_type())
+        stopwatch = WallClock()
+        for ask in self._dialect.requests(self._telemetry):
+            while True:
+                try:
+                    ask()
+                    break
+                except TelemetryError as error:
+                    if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
+                        raise LinkError(f"telemetry failed: {_reason(error)}") from None
+                self._pause_wall(stop)
+
+    def _pause_wall(self, stop: threading.Event | None) -> None:
+        if self._abandon.is_set() or (stop is not None and stop.is_set()):
+            raise LinkError("stopped")
+        WallClock().sleep_until(int(STREAM_RETRY_S * US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """Take over the bytes of a `raw://` connection.
@@ -171,26 +161,11 @@ class MavsdkLink:
             What to feed MAVSDK with, whole frames, from one thread at a time.
         """
         self.set_timeout(RAW_TIMEOUT_S)
-        library, handle = self._mavsdk._lib, self._mavsdk._handle
-        self._mavsdk.subscribe_raw_bytes_to_be_sent(sent)
-        # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
-        buffer = (ctypes.c_uint8 * RAW_CHUNK)()
-        pass_bytes = library.mavsdk_pass_received_raw_bytes
-
-        def feed(data: bytes) -> None:
-            for start in range(0, len(data), RAW_CHUNK):
-                chunk = data[start : start + RAW_CHUNK]
-                ctypes.memmove(buffer, chunk, len(chunk))
-                pass_bytes(handle, buffer, len(chunk))
-
-        return feed
+        return raw_bytes.exchange(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
         """Let MAVSDK repeat what has not been answered after so long [wall s], not after 0.5 s."""
-        # Exported by the library, not wrapped by MAVSDK-Python 4.1.
-        set_timeout = self._mavsdk._lib.mavsdk_set_timeout_s
-        set_timeout.argtypes = [ctypes.c_void_p, ctypes.c_double]
-        set_timeout(self._mavsdk._handle, seconds)
+        raw_bytes.set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Exchange STATUSTEXTs with the flight controller; `connect` comes first.
@@ -212,10 +187,19 @@ class MavsdkLink:
 
     def close(self) -> None:
         """Release MAVSDK."""
+        self._release_plugins()
+        self._mavsdk.destroy()
+
+    def _release_plugins(self) -> None:
         for plugin in (self._texts, self._offboard, self._action, self._telemetry):
             if plugin is not None:
                 plugin.destroy()
-        self._mavsdk.destroy()
+        self._texts = self._offboard = self._action = self._telemetry = None
+
+    @property
+    def dialect(self) -> Dialect:
+        """What kind of flight controller is flown; PX4's before `connect`."""
+        return self._dialect
 
     @property
     def connected(self) -> bool:
@@ -227,8 +211,7 @@ class MavsdkLink:
     @property
     def healthy(self) -> bool:
         """Whether the flight controller reports good sensors and that it may be armed."""
-        telemetry = self._telemetry
-        return bool(telemetry.health_all_ok() and telemetry.health().is_armable)
+        return self._dialect.ready(self._telemetry)
 
     @property
     def armed(self) -> bool:
@@ -351,13 +334,3 @@ def _reason(error: Exception) -> str:
     """Return MAVSDK's result name."""
     result = error.args[0] if error.args else error
     return str(getattr(result, "name", result)).lower().replace("_", " ")
-
-
-def _connection_problem(url: str, result: Any) -> str:
-    name = result.name.lower().replace("_", " ")
-    if result == ConnectionResult.BIND_ERROR:
-        return (
-            f"--connect {url}: the port is taken (another companion?): choose another "
-            "(airl-sitl: --api-port)"
-        )
-    return f"--connect {url}: {name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"

@@ -17,11 +17,14 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
 from companion.camera import FrameSource
 from companion.guard import Guard
-from companion.link import STOP, LinkError, MavsdkLink
+from companion.interfaces import STOP, LinkError
+from companion.link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 
-ARM_TIMEOUT_S = 20.0
+PREPARE_TIMEOUT_S = 10.0
+"""How long a flight controller may be silent when a mission begins [wall s]."""
+
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
 LINK_LOST = "link lost"
@@ -81,7 +84,8 @@ def fly_mission(
     pilot = Pilot(link, frames, policy, watchdog, clock, pilot_settings, latency=latency)
     try:
         progress("arming")
-        link.arm(ARM_TIMEOUT_S, stop)
+        link.prepare(PREPARE_TIMEOUT_S, stop)
+        link.arm(link.dialect.arm_timeout_s, stop)
         progress("taking off")
         link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
         link.enter_offboard()

@@ -18,7 +18,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action, Policy, limited, vertical_speed
 from airl_mav.policy.observation import Kinematics, encode
 from companion.camera import FrameSource
-from companion.link import BodyVelocity, Link
+from companion.interfaces import BodyVelocity, Link
 from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from airl_mav.clock import Clock
 from airl_mav.constants import US_PER_S
-from companion.link import STOP, BodyVelocity, Link, LinkError
+from companion.interfaces import STOP, BodyVelocity, Link, LinkError
 
 
 @dataclass(frozen=True)

@@ -174,5 +174,5 @@ def test_rehearsal_hands_it_on_and_writes_it_down(permitted: None) -> None:
     assert setup.injection.origin == "measured"
     assert "held to 20 % of a core" in setup.injection.label
     assert settings(command, setup, pilot)["cpu_quota"] == 20.0
-    words = plan(command, setup, pilot).companion.arguments
+    words = plan(command, setup, pilot, Path()).companion.arguments
     assert words[words.index("--cpu-quota") + 1] == "20.0"

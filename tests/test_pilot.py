@@ -25,7 +25,7 @@ from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from companion.camera import ReceivedFrame
 from companion.guard import ThreadGuard
-from companion.link import STOP, BodyVelocity, LinkError
+from companion.interfaces import STOP, BodyVelocity, LinkError
 from companion.pilot import Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 

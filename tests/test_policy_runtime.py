@@ -333,7 +333,7 @@ def test_sitl_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> No
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.4, 2.0, 2.5)
     assert (setup.policy.name, setup.policy.description) == ("discrete", "random weights")
     words = sitl.plan(
-        sitl_command.SitlCommand(policy=path, threads=2), setup, pilot
+        sitl_command.SitlCommand(policy=path, threads=2), setup, pilot, Path()
     ).companion.arguments
     for option, value in (
         ("--policy", path),

@@ -30,7 +30,7 @@ from airl_mav.clock import WallClock
 from airl_mav.cpu_quota import held_to
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
-from companion.link import LinkError
+from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.pilot import PilotSettings
 

@@ -46,7 +46,7 @@ from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
-from companion.link import LinkError
+from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.pilot import PilotSettings
 

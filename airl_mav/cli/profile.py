@@ -26,7 +26,7 @@ from airl_mav.machine_state import MachineState, machine_state
 from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
 from airl_mav.profiles.computer_file import with_workload, write_profile, write_samples
 from airl_mav.provenance import describe_machine, package_versions
-from companion.link import LinkError
+from companion.interfaces import LinkError
 
 SCHEMA = 1
 """Version of the .json beside the samples."""

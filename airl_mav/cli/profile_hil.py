@@ -29,7 +29,7 @@ from airl_mav.latency.stamps import STAMPS
 from airl_mav.policy.actions import Action, CameraBound, Policy
 from airl_mav.policy.observation import Observation
 from companion.guard import ThreadGuard
-from companion.link import LinkError
+from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.timesync import TimesyncLink
 

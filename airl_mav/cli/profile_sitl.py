@@ -160,7 +160,7 @@ def _fly(
 ) -> dict[str, NDArray[np.int64]]:
     """Fly once; return the stamps by the simulator's clock."""
     setup, pilot = check(command)
-    flown = rehearsal_plan(command, setup, pilot)
+    flown = rehearsal_plan(command, setup, pilot, path)
     slow = [*flown.companion.arguments, "--max-speed-m-s", f"{PACE_M_S!r}"]
     flown = replace(flown, companion=replace(flown.companion, arguments=slow))
     folder = RunFolder.create(path, "profile", {}, setup=setup, seeds=(command.seed,))

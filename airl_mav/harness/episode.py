@@ -48,6 +48,9 @@ class Plan:
     time_limit_s: float
     speed: float
     computer_watts: float
+    load_timeout_s: float | None = None
+    """Longest wait for the vehicle to stand ready at the start [wall s]; None: as for any answer.
+    Real firmware must be started, or is waited for."""
     arena_seed: int | None = None
     """Of the arena of all episodes; None: each one's own seed."""
 
@@ -195,10 +198,12 @@ def join_stamps(
 
     Args:
         decisions: The companion's log, by column.
-        setpoints: The firmware's log, by column.
+        setpoints: The firmware's log, by column; empty where nobody can look into it.
         slips: (k, 2) times at which simulated time was given up, and how much [µs].
     """
     by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
+    if not setpoints:
+        return {**decisions, **by_simulator}
     index = match_setpoints(
         by_simulator["sent_us"],
         decisions["setpoint"],

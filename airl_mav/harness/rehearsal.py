@@ -166,7 +166,7 @@ class Rehearsal:
                 record=str(record_path.absolute()),
             ),
         )
-        loaded = crew.wait_for(Loaded, self._look)
+        loaded = crew.wait_for(Loaded, self._look, plan.load_timeout_s)
         task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
         follower = Follower(Referee(task), loaded.time_us)
         episode = Episode(index, seed, loaded, follower, WallClock(), notes=list(notes))

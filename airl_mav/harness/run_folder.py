@@ -34,8 +34,10 @@ RUN_FILE = "run.json"
 EPISODES_FILE = "episodes.jsonl"
 LATENCY_FILE = "latency.npz"
 TRAJECTORIES_FILE = "trajectories.npz"
-LOG_FILES = ("firmware.log", "companion.log")
-"""What the processes have to say to people: empty when all is well."""
+FIRMWARE_PRINTS = "autopilot.log"
+"""What real firmware prints, where it was started for the run."""
+LOG_FILES = ("firmware.log", "companion.log", FIRMWARE_PRINTS)
+"""What the processes have to say to people; the first two are empty when all is well."""
 
 TICK_LATENESS = "tick_lateness_us"
 """Name of the array of a paced run that says how late each tick began [µs]."""

@@ -1,0 +1,50 @@
+"""What the pilot needs of a flight controller, as plain data and a protocol."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from airl_mav.policy.observation import Kinematics
+
+
+class LinkError(Exception):
+    """The flight controller refused, or is gone."""
+
+
+@dataclass(frozen=True)
+class BodyVelocity:
+    """A velocity setpoint in the heading frame, with a yaw rate."""
+
+    forward_m_s: float
+    right_m_s: float
+    down_m_s: float
+    yaw_rate_rad_s: float
+
+    def wire(self) -> tuple[float, float, float, float]:
+        """Return the four numbers in the order in which they are sent."""
+        return self.forward_m_s, self.right_m_s, self.down_m_s, self.yaw_rate_rad_s
+
+
+STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
+
+
+class Link(Protocol):
+    """What the pilot needs of a flight controller. Calls raise LinkError when refused."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the flight controller is heard."""
+        ...
+
+    def kinematics(self) -> Kinematics:
+        """Return the newest telemetry."""
+        ...
+
+    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+        """Send a velocity setpoint; it is repeated until the next one."""
+        ...
+
+    def leave_offboard(self) -> None:
+        """Switch to Hold."""
+        ...
