@@ -206,7 +206,8 @@ class ChildChannel:
         """
         outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
         os.dup2(2, 1)
-        return cls(sys.stdin.buffer, outgoing)
+        # Unbuffered: the reading thread must hold no lock that the end of the interpreter wants.
+        return cls(os.fdopen(os.dup(0), "rb", buffering=0), outgoing)
 
     def send(self, event: _Line) -> None:
         """Send one event; a harness that is gone is no error here (its end of file is)."""

@@ -26,7 +26,16 @@ from airl_mav.cli.common import (
     check_wind,
     run_command,
 )
+from airl_mav.cli.firmware_avionics import Wanted, real_avionics
 from airl_mav.cli.firmware_lockstep import LockstepBench, LockstepOptions, Sockets, remote_plan
+from airl_mav.cli.firmware_options import (
+    TITLES,
+    FirmwareName,
+    RealFirmwareOptions,
+    api_port,
+    check_firmware,
+    how_to_start,
+)
 from airl_mav.cli.firmware_service import Bench, Service, WallBench, unix_us
 from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
@@ -38,8 +47,9 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
-from firmware_sim.firmware import Firmware
-from firmware_sim.mavlink.px4_links import px4_server
+from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware
+from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.mavlink.px4_links import Px4Ends, px4_ends, px4_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.plant.wind import WindSettings
@@ -76,6 +86,19 @@ class FirmwareCommand:
     estimator: FilterName = "kernel"
     """Filter of the estimator: compiled, or filterpy's, the reference, some twenty times slower."""
 
+    firmware: FirmwareName = "builtin"
+    """What flies: the built-in autopilot, or real firmware on this vehicle and its sensors; see
+    docs/real-firmware.md."""
+
+    real: tyro.conf.OmitArgPrefixes[RealFirmwareOptions] = field(
+        default_factory=RealFirmwareOptions
+    )
+    """Real firmware."""
+
+    firmware_log: Path | None = None
+    """With real firmware that is started here: what it prints goes to this file. None: to one in
+    its folder."""
+
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports."""
 
@@ -110,9 +133,22 @@ def check(command: FirmwareCommand) -> None:
     """Check what can be wrong before a port is bound. Raises UsageError."""
     check_ports(command.ports, free=True)
     check_range("--seed", command.seed, 0, GREATEST_SEED)
+    hosts = {command.bind, command.companion_host, command.gcs_host}
+    if command.firmware in ("px4", "ardupilot") and hosts != {LOOPBACK}:
+        raise UsageError(
+            f"--firmware {command.firmware} with --bind, --companion-host or --gcs-host: accepted: "
+            "without; its links are its own, on this machine"
+        )
     if command.duration is not None:
         check_range("--duration", command.duration, 0.0, 1e6)
     check_wind(command.wind)
+    check_firmware(
+        command.firmware,
+        command.real,
+        command.ports,
+        lockstep=command.lockstep,
+        speed=command.speed,
+    )
     if command.tlog is not None and not command.tlog.parent.is_dir():
         raise UsageError(f"--tlog {command.tlog}: no folder {command.tlog.parent}")
 
@@ -125,22 +161,40 @@ def build(command: FirmwareCommand) -> Firmware:
     """
     check(command)
     pacing = pacing_of(1.0 if command.speed is None else command.speed)
+    avionics = _avionics(command)
+    try:
+        camera = CameraServer(f"tcp://{command.bind}:{command.ports.camera_port or '*'}")
+    except UsageError:
+        avionics.close()
+        raise
+    return Firmware(avionics, camera, pacing)
+
+
+def _avionics(command: FirmwareCommand) -> Avionics:
+    """Bind the MAVLink ports and return what flies. Raises UsageError as `build`."""
+    if command.firmware != "builtin":
+        wanted = Wanted(
+            command.real,
+            load_vehicle(command.vehicle),
+            command.ports,
+            command.firmware_log,
+            lambda: _ends(command),
+        )
+        return real_avionics(command.firmware, wanted)
+    return BuiltinAvionics(px4_server(_ends(command), unix_us()))
+
+
+def _ends(command: FirmwareCommand) -> Px4Ends:
+    """Bind the ports of the onboard and the ground station's link. Raises UsageError."""
     ports = command.ports
-    server = px4_server(
+    return px4_ends(
         bind=command.bind,
         api_remote=(command.companion_host, ports.api_port),
         api_local_port=ports.api_local_port,
         gcs_remote=(command.gcs_host, ports.gcs_port),
         gcs_local_port=ports.gcs_local_port,
         insecure=command.insecure,
-        boot_unix_us=unix_us(),
     )
-    try:
-        camera = CameraServer(f"tcp://{command.bind}:{ports.camera_port or '*'}")
-    except UsageError:
-        server.close()
-        raise
-    return Firmware(server, camera, pacing)
 
 
 def open_sockets(command: FirmwareCommand) -> Sockets:
@@ -186,10 +240,16 @@ def stand_alone(command: FirmwareCommand) -> int:
     try:
         episode = setup(command, vehicle, command.arena, command.seed, command.seed)
         warm_up(vehicle)
+        hint = how_to_start(command.real, vehicle, command.ports)
+        if hint is not None:
+            console.print(f"waiting for {hint}", soft_wrap=True, markup=False, highlight=False)
         firmware.load(episode, command.tlog, unix_us())
         _print_addresses(command, firmware.camera_endpoint, episode, console)
         console.print("Ctrl-C ends it.")
         fly(firmware, stop, command.duration, console)
+    except FirmwareLostError as error:
+        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
+        return EXIT_BROKEN
     finally:
         firmware.close()
     return 0
@@ -211,7 +271,7 @@ def fly(
     if firmware.slipped_us:
         given_up_s = firmware.slipped_us / US_PER_S
         console.print(f"{given_up_s:.2f} s given up: this host could not keep up", style="yellow")
-    for name, link in firmware.server.counters().items():
+    for name, link in firmware.avionics.counters().items():
         console.print(
             f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
             f"sent {link.tx}, not sent {link.send_errors}"
@@ -260,10 +320,13 @@ def _print_addresses(
     command: FirmwareCommand, camera: str, episode: EpisodeSetup, console: Console
 ) -> None:
     """Say where to connect, and where to fly."""
-    console.print(f"MAVSDK            udpin://{command.companion_host}:{command.ports.api_port}")
+    port = api_port(command.firmware, command.real, command.ports)
+    console.print(f"MAVSDK            udpin://{command.companion_host}:{port}")
     if not command.lockstep:
         console.print(f"QGroundControl    UDP port {command.ports.gcs_port} (connects by itself)")
     console.print(f"depth camera      {camera}")
+    if command.firmware != "builtin":
+        console.print(f"firmware          {TITLES[command.firmware]}")
     if episode.arena is not None:
         goal = [float(metres) for metres in episode.arena.goal]
         # In lockstep the last digit counts.
@@ -290,7 +353,7 @@ def serve(command: FirmwareCommand) -> int:
             warm_up(vehicle)
             channel.send(Ready(details={"camera": bench.camera_endpoint}))
             Service(bench, channel, episode).run(requests)
-    except (UsageError, LockstepError) as error:
+    except (UsageError, LockstepError, FirmwareLostError) as error:
         usage = isinstance(error, UsageError)
         channel.send(Failed(message=str(error), usage=usage))
         return EXIT_USAGE if usage else EXIT_BROKEN

@@ -27,8 +27,8 @@ from firmware_sim.autopilot.state import Message
 from firmware_sim.crash import CrashWatch
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
-STATE_EVERY = 10
-"""The harness hears the true state every so many ticks: 25 Hz."""
+STATE_EVERY_US = 40_000
+"""The harness hears the true state so often: 25 Hz."""
 
 
 class Bench(Protocol):
@@ -142,7 +142,7 @@ class Service:
         self._channel = channel
         self._setup = setup
         self._record = Path()
-        self._ticks = 0
+        self._reported = 0
         self._crash = CrashWatch()
         self._handlers: dict[type, Callable[[Any], None]] = {
             LoadEpisode: self._load,
@@ -192,9 +192,10 @@ class Service:
         self._channel.send(Saved(path=str(self._record), sha256=sha256))
 
     def _report(self, simulation: Simulation) -> None:
-        self._ticks += 1
-        if not self._crash.look(simulation) and self._ticks % STATE_EVERY:
+        period = simulation.time_us // STATE_EVERY_US
+        if not self._crash.look(simulation) and period == self._reported:
             return
+        self._reported = period
         self._channel.send(state_of(simulation, self._crash.hit, self._bench.slipped_us))
 
     def _tell(self, message: Message) -> None:

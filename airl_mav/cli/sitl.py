@@ -20,6 +20,7 @@ from airl_mav.cli.common import (
     run_command,
 )
 from airl_mav.cli.evaluate_settings import fingerprint
+from airl_mav.cli.firmware_options import api_port, arguments, how_to_start, load_timeout_s
 from airl_mav.cli.sitl_command import ARRIVAL_SHARE, SitlCommand, check, wall_speed
 from airl_mav.cpu_quota import remove_left
 from airl_mav.errors import UsageError
@@ -30,7 +31,7 @@ from airl_mav.harness.lock import locked
 from airl_mav.harness.lockstep.errors import LockstepError
 from airl_mav.harness.progress import RichObserver
 from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
-from airl_mav.harness.run_folder import RUN_FILE, RunFolder
+from airl_mav.harness.run_folder import FIRMWARE_PRINTS, RUN_FILE, RunFolder
 from airl_mav.policy.registry import find_policy
 from airl_mav.ports import LOOPBACK
 from airl_mav.profiles.arena import ArenaSpec
@@ -128,7 +129,7 @@ def fly(command: SitlCommand, console: Console, label: str | None = None) -> Flo
                 if command.lockstep:
                     _rehearse_in_lockstep(command, setup, pilot, jobs, folder, observer)
                 else:
-                    planned = plan(command, setup, pilot)
+                    planned = plan(command, setup, pilot, folder.path)
                     with Rehearsal(planned, folder, observer, keeps=(keeps,)) as rehearsal:
                         rehearsal.run(done={record.index for record in done})
                 code = 0
@@ -200,13 +201,20 @@ def _say_what_flies(command: SitlCommand, setup: Setup, console: Console) -> Non
     if command.lockstep:
         console.print("lockstep   one process, one simulated clock, MAVSDK on raw bytes")
         return
-    console.print(f"MAVSDK     udpin://{LOOPBACK}:{command.ports.api_port} (the companion's)")
+    port = api_port(command.firmware, command.real, command.ports)
+    console.print(f"MAVSDK     udpin://{LOOPBACK}:{port} (the companion's)")
     console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
+    if setup.level == "firmware":
+        console.print(f"firmware   {setup.firmware}")
+        hint = how_to_start(command.real, load_vehicle(command.vehicle), command.ports)
+        if hint is not None:
+            _say(console, f"           start one for every flight: {hint}")
 
 
-def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
-    """Turn the command into the arguments of the two processes."""
+def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings, folder: Path) -> Plan:
+    """Turn the command into the arguments of the two processes of a run folder."""
     ports, wind, watchdog = command.ports, command.wind, command.watchdog
+    port = api_port(command.firmware, command.real, ports)
     firmware = [
         *("--control", "stdio"),
         *("--vehicle", command.vehicle),
@@ -218,7 +226,10 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         *("--api-port", f"{ports.api_port}", "--api-local-port", f"{ports.api_local_port}"),
         *("--gcs-port", f"{ports.gcs_port}", "--gcs-local-port", f"{ports.gcs_local_port}"),
         *("--camera-port", f"{ports.camera_port}"),
+        *arguments(command.firmware, command.real),
     ]
+    if command.firmware != "builtin":
+        firmware += ["--firmware-log", str((folder / FIRMWARE_PRINTS).absolute())]
     companion = [
         *("--control", "stdio"),
         *("--policy", command.policy, "--runtime", command.runtime),
@@ -228,7 +239,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         *(("--workload", command.workload) if command.workload is not None else ()),
         *(("--latency", command.latency) if command.latency is not None else ()),
         *("--latency-seed", f"{command.latency_seed}"),
-        *("--connect", f"udpin://{LOOPBACK}:{ports.api_port}"),
+        *("--connect", f"udpin://{LOOPBACK}:{port}"),
         *("--camera", f"tcp://{LOOPBACK}:{ports.camera_port}"),
         *("--speed", f"{wall_speed(command)!r}"),
         *("--hold-s", f"{pilot.hold_s!r}", "--altitude-m", f"{pilot.altitude_m!r}"),
@@ -248,6 +259,7 @@ def plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> Plan:
         time_limit_s=command.time_limit,
         speed=wall_speed(command),
         computer_watts=setup.computer_watts,
+        load_timeout_s=load_timeout_s(command.firmware, command.real),
     )
 
 

@@ -23,10 +23,17 @@ from airl_mav.cli.companion_command import (
     hover_after_s,
     pilot_settings,
 )
+from airl_mav.cli.firmware_options import (
+    TITLES,
+    FirmwareName,
+    RealFirmwareOptions,
+    check_firmware,
+    check_program,
+)
 from airl_mav.envs.spec import Delay
 from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
-from airl_mav.flight.setup import Part, Setup
+from airl_mav.flight.setup import Level, Part, Setup
 from airl_mav.latency.injection import without_timing
 from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
@@ -133,6 +140,15 @@ class SitlCommand:
     estimator: FilterName = "kernel"
     """Filter of the estimator: compiled, or filterpy's, the reference, some twenty times slower."""
 
+    firmware: FirmwareName = "builtin"
+    """What flies: the built-in autopilot, or real firmware on this vehicle and its sensors; see
+    docs/real-firmware.md."""
+
+    real: tyro.conf.OmitArgPrefixes[RealFirmwareOptions] = field(
+        default_factory=RealFirmwareOptions
+    )
+    """Real firmware."""
+
     ports: tyro.conf.OmitArgPrefixes[Ports] = field(default_factory=Ports)
     """Ports."""
 
@@ -164,6 +180,14 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     check_range("--altitude", pilot.altitude_m, 0.5, 100.0)
     check_holding("--hold", pilot.hold_s, command.watchdog)
     check_wind(command.wind)
+    check_firmware(
+        command.firmware,
+        command.real,
+        command.ports,
+        lockstep=command.lockstep,
+        speed=command.speed,
+    )
+    check_program(command.real)
     if not command.lockstep:
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(command.ports, free=False)
@@ -192,7 +216,8 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     if command.lockstep:
         injection = without_timing(injection, Delay().native_ms, "lockstep")
     setup = Setup(
-        level="lockstep" if command.lockstep else "sitl",
+        level=_level(command),
+        firmware=TITLES[command.firmware],
         vehicle=Part(command.vehicle, vehicle.description),
         arena=Part(command.arena, arena.description),
         policy=Part(policy.name, policy.description),
@@ -203,6 +228,12 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
         between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
     )
     return setup, pilot
+
+
+def _level(command: SitlCommand) -> Level:
+    if command.firmware != "builtin":
+        return "firmware"
+    return "lockstep" if command.lockstep else "sitl"
 
 
 def held_label(percent: float) -> str:

@@ -1,0 +1,171 @@
+"""What real firmware takes its vehicle for, against what the vehicle is: found out on the ground.
+
+A wrong order of motors flips a vehicle the moment it lifts off, and the log then shows nothing but
+a controller that fights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from airl_mav.profiles.vehicle import (
+    CORNERS,
+    COUNTER_CLOCKWISE,
+    ArduPilot,
+    Corner,
+    Px4,
+    VehicleProfile,
+)
+from firmware_sim.bridges.parameter_client import Value, same
+from firmware_sim.flight_controller import FirmwareMissingError
+
+MOTORS = range(4)
+
+Outputs = str
+"""Name of the parameter that says what hangs on output {}: PWM_MAIN_FUNC{}, HIL_ACT_FUNC{}."""
+
+GROUND_LOSS = "NAV_DLL_ACT"
+"""PX4's parameter of what the loss of the ground station does; 0 = nothing."""
+
+_PX4_MOTOR_1 = 101
+"""PX4's output function of motor 1 (docs: Actuator Configuration)."""
+
+_ARDUPILOT_MOTOR_1 = 33
+"""ArduPilot's SERVOn_FUNCTION of motor 1."""
+
+_ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
+"""Corner of each motor of ArduCopter's quad X: AP_MotorsMatrix, MOTOR_FRAME_TYPE_X."""
+
+
+class Airframe(Protocol):
+    """What one kind of firmware must be set to."""
+
+    @property
+    def settings(self) -> Mapping[str, Value]:
+        """Parameters and what they must be: set where we may, checked otherwise."""
+        ...
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        ...
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that the firmware flies, in words."""
+        ...
+
+
+class Px4Airframe:
+    """A quad by PX4's control allocation: rotor positions and turns, output functions."""
+
+    def __init__(self, vehicle: VehicleProfile, px4: Px4, outputs: Outputs) -> None:
+        """Take the vehicle.
+
+        Args:
+            vehicle: Its rotors.
+            px4: What is said of PX4.
+            outputs: Parameter of an output's function, with {} for its number.
+        """
+        self._motors = px4.motors
+        self._outputs = outputs
+        self.settings: dict[str, Value] = {
+            "THR_MDL_FAC": vehicle.rotor.thrust_curve,
+            **vehicle.rotor.px4_geometry(),
+            **px4.parameters,
+        }
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        rotors = [f"CA_ROTOR{i}_{key}" for i in MOTORS for key in ("PX", "PY", "KM")]
+        outputs = [self._outputs.format(i + 1) for i in MOTORS]
+        frame = ["CA_AIRFRAME", "CA_ROTOR_COUNT", GROUND_LOSS]
+        return list(dict.fromkeys([*frame, *outputs, *rotors, *self.settings]))
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that PX4 flies, in words."""
+        if held["CA_AIRFRAME"] != 0 or held["CA_ROTOR_COUNT"] != len(MOTORS):
+            return (
+                f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
+                f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
+            )
+        for output, expected in enumerate(self._motors, start=1):
+            name = self._outputs.format(output)
+            motor = int(held[name]) - _PX4_MOTOR_1
+            if motor not in MOTORS:
+                return f"PX4's {name} is {held[name]}: expected a motor, 101 to 104"
+            found = _corner(held, motor)
+            if found != expected:
+                return (
+                    f"PX4's output {output} ({name} = {held[name]}) turns the motor {found} "
+                    f"(CA_ROTOR{motor}_PX, _PY), the vehicle's is {expected}: wrong motor order"
+                )
+            turn, positive = float(held[f"CA_ROTOR{motor}_KM"]), expected in COUNTER_CLOCKWISE
+            if (turn > 0.0) != positive:
+                way = "counter-clockwise" if turn > 0.0 else "clockwise"
+                return (
+                    f"PX4's motor {expected} turns {way} (CA_ROTOR{motor}_KM = {turn:g}), the "
+                    "vehicle's the other way: wrong motor order"
+                )
+        return None
+
+
+class ArduPilotAirframe:
+    """A quad by ArduCopter's frame class and type, and its output functions."""
+
+    def __init__(self, ardupilot: ArduPilot) -> None:
+        self._ardupilot = ardupilot
+        self._frame: dict[str, int] = {
+            "FRAME_CLASS": ardupilot.frame_class,
+            "FRAME_TYPE": ardupilot.frame_type,
+        }
+        self.settings: dict[str, Value] = {**self._frame, **ardupilot.parameters}
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        return [*(f"SERVO{i + 1}_FUNCTION" for i in MOTORS), *self.settings]
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that ArduCopter flies, in words."""
+        for name, expected in self._frame.items():
+            if held[name] != expected:
+                return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
+        for output, corner in enumerate(self._ardupilot.motors, start=1):
+            function = int(held[f"SERVO{output}_FUNCTION"])
+            found = _ARDUPILOT_QUAD_X.get(function - _ARDUPILOT_MOTOR_1 + 1)
+            if found != corner:
+                return (
+                    f"ArduPilot's output {output} (SERVO{output}_FUNCTION = {function}) turns "
+                    f"{'no motor' if found is None else 'the motor ' + found}, the vehicle's is "
+                    f"{corner}: wrong motor order"
+                )
+        return None
+
+
+def px4_airframe(name: str, vehicle: VehicleProfile, outputs: Outputs) -> Px4Airframe:
+    """Return what PX4 must be set to. Raises UsageError when the profile does not say it."""
+    if vehicle.px4 is None:
+        raise FirmwareMissingError(f"--firmware {name}: the vehicle's profile has no table [px4]")
+    return Px4Airframe(vehicle, vehicle.px4, outputs)
+
+
+def ardupilot_airframe(name: str, vehicle: VehicleProfile) -> ArduPilotAirframe:
+    """Return what ArduPilot must be set to. Raises UsageError when the profile does not say it."""
+    if vehicle.ardupilot is None:
+        raise FirmwareMissingError(
+            f"--firmware {name}: the vehicle's profile has no table [ardupilot]"
+        )
+    return ArduPilotAirframe(vehicle.ardupilot)
+
+
+def differences(held: Mapping[str, Value], wanted: Mapping[str, Value]) -> list[str]:
+    """Return what is set otherwise than wanted, in words, one each."""
+    return [
+        f"{name} = {held[name]:g} (vehicle: {value:g})"
+        for name, value in wanted.items()
+        if name in held and not same(held[name], value)
+    ]
+
+
+def _corner(held: Mapping[str, Value], motor: int) -> str:
+    forward, right = float(held[f"CA_ROTOR{motor}_PX"]), float(held[f"CA_ROTOR{motor}_PY"])
+    return f"{'front' if forward > 0.0 else 'rear'} {'right' if right > 0.0 else 'left'}"

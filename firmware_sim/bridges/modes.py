@@ -1,0 +1,53 @@
+"""What the heartbeat of real firmware says, in the words of the built-in commander."""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.state import Mode
+from firmware_sim.mavlink import modes as px4_modes
+from firmware_sim.mavlink.codec import dialect
+
+_PX4_MODES = {px4_modes.custom_mode(mode): mode for mode in Mode}
+
+# ArduCopter's mode numbers: ArduCopter/mode.h, enum class Number.
+GUIDED = 4
+_ARDUCOPTER_MODES = {
+    3: Mode.TAKEOFF,  # AUTO: a mission
+    GUIDED: Mode.OFFBOARD,
+    5: Mode.HOLD,  # LOITER
+    6: Mode.RETURN,
+    9: Mode.LAND,
+    17: Mode.HOLD,  # BRAKE
+}
+
+_IN_AIR = (
+    dialect.MAV_LANDED_STATE_IN_AIR,
+    dialect.MAV_LANDED_STATE_TAKEOFF,
+    dialect.MAV_LANDED_STATE_LANDING,
+)
+
+
+def flight_of(
+    autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
+) -> Flight:
+    """Return phase and mode.
+
+    Args:
+        autopilot: HEARTBEAT's MAV_AUTOPILOT.
+        custom_mode: HEARTBEAT's.
+        landed_state: EXTENDED_SYS_STATE's MAV_LANDED_STATE.
+        armed: Whether motors may turn.
+        ready: Whether it may be armed.
+    """
+    if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)
+        # GUIDED takes off as well: coming from the ground is no flight by setpoints.
+        if mode is Mode.OFFBOARD and landed_state == dialect.MAV_LANDED_STATE_TAKEOFF:
+            mode = Mode.TAKEOFF
+    else:
+        mode = _PX4_MODES.get(custom_mode, Mode.POSITION)
+    if not armed:
+        phase = Phase.STANDBY if ready else Phase.BOOT
+    else:
+        phase = Phase.AIR if landed_state in _IN_AIR else Phase.GROUND
+    return Flight(phase=phase, mode=mode, intended=mode, after_disarm=mode)

@@ -1,0 +1,102 @@
+"""Reads and sets parameters of real firmware over MAVLink."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Mapping
+
+from firmware_sim.mavlink.codec import WireMessage, dialect, payload
+
+BURST = 10
+"""Requests under way at once: the link may be a slow one."""
+
+Value = int | float
+
+_INTEGERS = {
+    dialect.MAV_PARAM_TYPE_INT8: "<b3x",
+    dialect.MAV_PARAM_TYPE_UINT8: "<B3x",
+    dialect.MAV_PARAM_TYPE_INT16: "<h2x",
+    dialect.MAV_PARAM_TYPE_UINT16: "<H2x",
+    dialect.MAV_PARAM_TYPE_INT32: "<i",
+    dialect.MAV_PARAM_TYPE_UINT32: "<I",
+}
+"""How an integer's bytes lie in the field of a value (bytewise encoding)."""
+
+_FLOAT = struct.Struct("<f")
+_VALUE_BYTES = 4
+
+
+class ParameterClient:
+    """What is known of a vehicle's parameters. Asks when told to; the caller keeps the time."""
+
+    def __init__(self, send: Callable[[WireMessage], None]) -> None:
+        """Take what sends a message."""
+        self._send = send
+        self._target: tuple[int, int] | None = None
+        self._bytewise = True
+        self._values: dict[str, Value] = {}
+        self._kinds: dict[str, int] = {}
+
+    @property
+    def values(self) -> Mapping[str, Value]:
+        """What has been heard so far."""
+        return self._values
+
+    def address(self, system: int, component: int, autopilot: int) -> None:
+        """Say whom to ask. PX4 sends integers bytewise, ArduPilot casts them to a float."""
+        self._target = system, component
+        self._bytewise = autopilot != dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
+
+    def take(self, message: WireMessage) -> None:
+        """Take a PARAM_VALUE."""
+        name, kind = str(message.param_id), int(message.param_type)
+        self._kinds[name] = kind
+        if kind not in _INTEGERS:
+            self._values[name] = float(message.param_value)
+        elif self._bytewise:
+            raw = payload(message).ljust(_VALUE_BYTES, b"\0")[:_VALUE_BYTES]
+            (self._values[name],) = struct.unpack(_INTEGERS[kind], raw)
+        else:
+            self._values[name] = int(message.param_value)
+
+    def ask(self, names: Iterable[str]) -> list[str]:
+        """Ask for those not heard yet, a burst of them; return all that are missing."""
+        missing = [name for name in names if name not in self._values]
+        if self._target is not None:
+            for name in missing[:BURST]:
+                self._send(
+                    dialect.MAVLink_param_request_read_message(
+                        *self._target, name.encode("ascii"), -1
+                    )
+                )
+        return missing
+
+    def set(self, wanted: Mapping[str, Value]) -> list[str]:
+        """Set those that differ, a burst of them; return all that still do.
+
+        Each must have been heard before: its type tells how its value is sent.
+        """
+        differing = [name for name in wanted if not same(self._values[name], wanted[name])]
+        if self._target is not None:
+            for name in differing[:BURST]:
+                kind = self._kinds[name]
+                self._send(
+                    dialect.MAVLink_param_set_message(
+                        *self._target, name.encode("ascii"), self._encoded(kind, wanted[name]), kind
+                    )
+                )
+        return differing
+
+    def _encoded(self, kind: int, value: Value) -> float:
+        if self._bytewise and kind in _INTEGERS:
+            (number,) = _FLOAT.unpack(struct.pack(_INTEGERS[kind], int(value)))
+            return float(number)
+        return float(value)
+
+
+def same(held: Value, wanted: Value) -> bool:
+    """Return whether a parameter holds a value: to the precision of a 32-bit float."""
+    if isinstance(held, int):
+        return held == wanted
+    (rounded,) = _FLOAT.unpack(_FLOAT.pack(wanted))
+    return bool(abs(held - rounded) <= 1e-6 * max(1.0, abs(rounded)))
