@@ -1,0 +1,112 @@
+"""Stored step responses of real firmware, and how near to them is near enough."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from pydantic import Field
+
+from airl_mav.conformance.step_response import StepResponse
+from airl_mav.conformance.steps import StepName
+from airl_mav.errors import UsageError
+from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.profiles.loading import list_profiles, load_profile
+
+AUTO = "auto"
+"""The stored column of the autopilot that is heard; of several the first by name."""
+
+
+JUDGED = ("latency_s", "rise_s", "overshoot_percent")
+"""What a verdict hangs on; the other figures follow from these, or are noise."""
+
+
+class Tolerance(ProfileModel):
+    """How far a figure may lie from the stored one."""
+
+    latency_share: float = quantity("latency, of the stored one", "1", gt=0, le=1, default=0.10)
+    rise_share: float = quantity("rise time, of the stored one", "1", gt=0, le=1, default=0.10)
+    floor_s: float = quantity(
+        "any time may be so far off: one sample of telemetry", "s", ge=0, le=1, default=0.010
+    )
+    overshoot_points: float = quantity("overshoot", "% of step", gt=0, le=100, default=5.0)
+
+
+class StoredStep(ProfileModel):
+    """One step as it was measured; what was not measured is left out."""
+
+    latency_s: float | None = quantity("until the first movement", "s", gt=0, default=None)
+    t10_s: float | None = quantity("until 10 %", "s", gt=0, default=None)
+    t50_s: float | None = quantity("until 50 %", "s", gt=0, default=None)
+    rise_s: float | None = quantity("10 % to 90 %", "s", gt=0, default=None)
+    overshoot_percent: float | None = quantity("overshoot", "% of step", ge=0, default=None)
+    error: float | None = quantity("size of the error at the end", "unit", ge=0, default=None)
+    settle_s: float | None = quantity("until within 5 %", "s", gt=0, default=None)
+
+
+class Reference(ProfileModel):
+    """One firmware's column."""
+
+    title: str = Field(description="whose figures these are, in a word or two")
+    source: str = Field(description="where the figures come from")
+    autopilot: int = Field(description="HEARTBEAT.autopilot, a MAV_AUTOPILOT")
+    tolerance: Tolerance = Field(default_factory=Tolerance, description="what is near enough")
+    streams_hz: Mapping[str, float] = Field(
+        description="what a fresh link over UDP carries unasked [Hz]"
+    )
+    steps: Mapping[StepName, StoredStep] = Field(description="step responses")
+
+
+class Miss(NamedTuple):
+    """A figure that lies outside its tolerance."""
+
+    figure: str
+    measured: float
+    stored: float
+    allowed: float
+    """Greatest difference allowed, in the figure's unit."""
+
+
+def misses(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Miss]:
+    """Return which of latency, rise time and overshoot lie outside; NaN always does."""
+    judged = (
+        ("latency_s", tolerance.latency_share, tolerance.floor_s),
+        ("rise_s", tolerance.rise_share, tolerance.floor_s),
+        ("overshoot_percent", 0.0, tolerance.overshoot_points),
+    )
+    found = []
+    for figure, share, floor in judged:
+        held: float | None = getattr(stored, figure)
+        if held is None:
+            continue
+        allowed = max(share * held, floor)
+        value: float = getattr(measured, figure)
+        # Staying short of the new value is no overshoot: the error at the end tells that.
+        compared = max(value, 0.0) if figure == "overshoot_percent" else value
+        if math.isnan(value) or abs(compared - held) > allowed:
+            found.append(Miss(figure, value, held, allowed))
+    return found
+
+
+def load_reference(name: str, autopilot: int) -> Reference:
+    """Return a stored column: `auto`, a shipped name, or a path to a .toml.
+
+    Args:
+        name: Which one.
+        autopilot: HEARTBEAT.autopilot of the vehicle that is heard, for `auto`.
+
+    Raises:
+        UsageError: There is none, or it cannot be used.
+    """
+    if name != AUTO:
+        return load_profile("conformance", name, Reference)
+    for shipped in list_profiles("conformance"):
+        reference = load_profile("conformance", shipped, Reference)
+        if reference.autopilot == autopilot:
+            return reference
+    known = ", ".join(list_profiles("conformance"))
+    raise UsageError(
+        f"--reference {AUTO}: nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: "
+        f"{known}, or a path to a .toml"
+    )
