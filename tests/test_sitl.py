@@ -135,8 +135,8 @@ def test_every_decision_is_followed_to_the_motors(done: Done, index: int) -> Non
     assert np.all(np.diff(stamps["sent_us"]) >= least_us)
     held = archive[f"{index:03d}/held_until_us"] - stamps["sent_us"]
     assert np.all(held >= least_us)
-    # The motors follow within two ticks of 4 ms, but where the host was busy.
-    assert np.median(stamps["motor_us"] - stamps["accepted_us"]) <= 8_000
+    # The loops hand over within five ticks of 4 ms, but where the host was busy.
+    assert np.median(stamps["motor_us"] - stamps["accepted_us"]) <= 20_000
 
 
 @pytest.mark.parametrize("index", range(EPISODES))
