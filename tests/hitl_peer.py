@@ -21,7 +21,9 @@ import threading
 import time
 import tty
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ from pymavlink.generator import mavcrc
 from airl_mav.constants import TICK_US
 from airl_mav.frames import Geodetic
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from firmware_sim.mavlink.codec import Decoder, Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -58,14 +61,14 @@ DISARMED_OUTPUT = 0.05
 class Board:
     """One power-up."""
 
-    def __init__(self, write: Any, hil: bool) -> None:
+    def __init__(self, write: Any, hil: bool, parameters: Parameters) -> None:
         self.write = write
         self.hil = hil
         self.time_us = 100_000
         """Its own clock, from its own start."""
         self.lane = MemoryEndpoint()
         self.server = MavlinkServer([onboard_link(self.lane)], boot_unix_us=0)
-        self.autopilot = BuiltinAutopilot(Px4Parameters(quad(), outputs="HIL_ACT_FUNC{}"))
+        self.autopilot = BuiltinAutopilot(parameters)
         self.encoder = Encoder()
         self.decoder = Decoder(datagrams=False)
         self.attached = False
@@ -188,6 +191,10 @@ class HitlPeer:
         """Of HIL_ACTUATOR_CONTROLS."""
         self.refuses = False
         """Does not take commands to reboot."""
+        self.parameters: Callable[[], Parameters] = partial(
+            Px4Parameters, quad(), outputs="HIL_ACT_FUNC{}"
+        )
+        """What it is set to, from its next start on."""
         self.vanishes = True
         """Its USB goes with it when it reboots; else it is behind a UART, and only silent."""
         self.down_s = down_s
@@ -249,7 +256,7 @@ class HitlPeer:
     def _power_up(self) -> None:
         self.boots += 1
         self._up_s = self._goes_s = math.inf
-        self.board = Board(self._write, self._hil)
+        self.board = Board(self._write, self._hil, self.parameters())
 
     def _write(self, data: bytes) -> None:
         if self._master < 0 or self.mute or self._up_s < math.inf:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ports import LOOPBACK, free_ports
 
 from airl_mav.clock import SimClock, WallClock
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.autopilot.state import Mode
 from firmware_sim.bridges.avionics import BridgedAvionics, RealFirmware
 from firmware_sim.bridges.launch_hitl import HitlLauncher, clients_of
@@ -147,7 +149,7 @@ def test_one_episode_after_the_other(flight: Flight, peer: HitlPeer) -> None:
 def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
     flight: Flight, peer: HitlPeer
 ) -> None:
-    """Our built-in autopilot has no CA_ROTOR parameters: the question for them stays open."""
+    peer.parameters = partial(Parameters, quad().parameters)  # no CA_ROTOR among them
     avionics = BridgedAvionics(flight.launcher, flight.observer, 2.0)
     flight.simulation.close()
     firmware = avionics.boot(SETUP)

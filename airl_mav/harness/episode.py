@@ -73,6 +73,8 @@ class Episode:
     state: State | None = None
     verdict_state: State | None = None
     ended: Ended | None = None
+    navigating_us: int | None = None
+    """When navigation began, by the companion's clock, which has given up no time [µs]."""
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -114,18 +116,22 @@ def save_episode(
         latency |= join_stamps(
             _read(decisions_path), _part(arrays, "setpoints"), arrays["tick/slips_us"]
         )
-    record = _record(episode, plan, trajectory)
+    record = _record(episode, plan, trajectory, arrays["tick/slips_us"])
     folder.save_episode(record, trajectory, latency)
     record_path.unlink()
     decisions_path.unlink(missing_ok=True)
     return record
 
 
-def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeRecord:
-    state, loaded = episode.verdict_state, episode.loaded
+def _record(
+    episode: Episode, plan: Plan, trajectory: Trajectory, slips: NDArray[np.int64]
+) -> EpisodeRecord:
+    state, loaded, began_us = episode.verdict_state, episode.loaded, episode.navigating_us
     return judged_record(
         episode.referee,
         trajectory,
+        # What the referee knew in flight was the time given up by its newest state, an older one.
+        None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
         index=episode.index,
         seed=episode.seed,
         arena=plan.arena,
@@ -143,6 +149,7 @@ def _record(episode: Episode, plan: Plan, trajectory: Trajectory) -> EpisodeReco
 def judged_record(
     referee: Referee,
     trajectory: Trajectory,
+    navigation_us: int | None,
     *,
     index: int,
     seed: int,
@@ -157,9 +164,11 @@ def judged_record(
     notes: tuple[str, ...],
     sha256: dict[str, str] | None = None,
 ) -> EpisodeRecord:
-    """Return the record of a flight that a referee has watched; see `EpisodeRecord`."""
+    """Return the record of a flight that a referee has watched; see `EpisodeRecord`.
+
+    `navigation_us` is when navigation began, by the clock of the trajectory [µs].
+    """
     verdict = referee.verdict or referee.abort(started_us, "no verdict")
-    navigation_us = referee.navigation_us
     quality = None
     if navigation_us is not None and verdict.time_us >= navigation_us:
         quality = measure_quality(trajectory, navigation_us, verdict.time_us, computer_watts)

@@ -206,7 +206,7 @@ class Rehearsal:
         elif isinstance(event, Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
-                # By the companion's clock, which has not given up what the simulator's has.
+                episode.navigating_us = event.time_us
                 referee.start_navigation(event.time_us - episode.slipped_us)
         elif isinstance(event, Text):
             self._observer.text(event)

@@ -203,6 +203,7 @@ class _Flight:
         record = judged_record(
             referee,
             trajectory,
+            referee.navigation_us,
             index=index,
             seed=self._seed,
             arena=self._plan.arena_name,
