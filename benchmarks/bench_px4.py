@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from airl_mav.constants import US_PER_S
 from airl_mav.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.bridges.child import FirmwareChild
+from firmware_sim.bridges.child import FirmwareChild, Start
 from firmware_sim.bridges.px4 import Px4Bridge
 from firmware_sim.bridges.px4_program import (
     API_LOCAL_PORT,
@@ -45,6 +46,7 @@ from firmware_sim.simulation import EpisodeSetup, Simulation
 
 ROOT = Path(__file__).resolve().parent.parent
 HOVER_S = {"unpaced": 30.0, "paced": 10.0}
+AIRFRAME = 10016
 LIMIT_S = 60.0
 """Longest simulated time to be in the air."""
 
@@ -158,12 +160,13 @@ def flight(
         folder = Path(name)
         bridge, operator = Px4Bridge(SIMULATOR_PORT + instance), Operator(instance)
         if options.px4_dir is not None:
-            command = find_px4(options.px4_dir).command(instance, folder)
+            start = find_px4(options.px4_dir).start(instance, AIRFRAME, folder)
         else:
-            command = [sys.executable, str(ROOT / "tests/px4_peer.py"), "-i", str(instance)]
-        speed = {"PX4_SIM_SPEED_FACTOR": "10"} if mode == "unpaced" else {}
-        places = {**environment(10016), **speed}
-        child = FirmwareChild("PX4", command, places, folder, folder / "px4.txt")
+            peer = [sys.executable, str(ROOT / "tests/px4_peer.py"), "-i", str(instance)]
+            start = Start(peer, environment(AIRFRAME))
+        if mode == "unpaced":
+            start = replace(start, environment={**start.environment, "PX4_SIM_SPEED_FACTOR": "10"})
+        child = FirmwareChild("PX4", start, folder, folder / "px4.txt")
         try:
             bridge.wait_connected(60.0, child.check)
             setup = EpisodeSetup(vehicle, None, 1, WindSettings())

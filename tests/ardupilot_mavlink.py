@@ -163,7 +163,7 @@ class Manners:
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
             p = tuple(params)
-            return commands.ACTIONS[number](commands.Command(number, p), context)  # type: ignore[arg-type]
+            return commands.ACTIONS[number](commands.Command(number, p), context)
         return Result.UNSUPPORTED
 
     def _setpoint(self, message: WireMessage) -> None:

@@ -62,7 +62,7 @@ class ArdupilotPeer:
         self.fault = Fault(fault)
         self.error: BaseException | None = None
         self.link = JsonLink(port, rate_hz)
-        self.link.stop = lambda: self._stop.is_set()  # type: ignore[method-assign]
+        self.link.stop = lambda: self._stop.is_set()
         self.copter = Copter({"FRAME_TYPE": 1, **(parameters or {})}, position_s)
         self.manners = Manners(self.copter, [_client(p) for p in api_ports or []])
         self._stop = threading.Event()
@@ -114,7 +114,7 @@ class ArdupilotPeer:
         if fault.due("restart", now_us):
             fault.kind = ""
             again = JsonLink(link.address[1], link.rate_hz)
-            again.stop = link.stop  # type: ignore[method-assign]
+            again.stop = link.stop
             link.close()
             self.link = again
         if fault.due("garbage", now_us):

@@ -116,7 +116,7 @@ def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
     router: Router, peer: HitlPeer
 ) -> None:
     peer.board.armed = True
-    peer.board.idle = lambda *_: peer.say(  # type: ignore[method-assign]
+    peer.board.idle = lambda *_: peer.say(
         Encoder().pack(dialect.MAVLink_heartbeat_message(2, 12, 29 | 32 | 128, 0, 4, 3))
     )
     bridge = HitlBridge(router, peer.device, reboot_s=2.0)

@@ -22,6 +22,7 @@ from airl_mav.clock import SimClock, WallClock
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.autopilot.state import Mode
+from firmware_sim.bridges.airframe import HITL_OUTPUT, px4_airframe
 from firmware_sim.bridges.avionics import BridgedAvionics, RealFirmware
 from firmware_sim.bridges.launch_hitl import HitlLauncher, clients_of
 from firmware_sim.bridges.observer import Observer
@@ -54,11 +55,10 @@ class Flight:
             gcs_local_port=gcs_local,
             insecure=False,
         )
-        vehicle = quad()
-        assert vehicle.px4 is not None
         self.router = Router(clients_of(ends), WallClock())
         self.launcher = HitlLauncher(
-            vehicle.px4.motors, self.router, peer.device, 921_600, PATIENCE_S, silence_s=PATIENCE_S
+            *(px4_airframe(quad(), HITL_OUTPUT), self.router, peer.device, 921_600, PATIENCE_S),
+            silence_s=PATIENCE_S,
         )
         self.observer = Observer(RouterEnd(self.router), "observer")
         self.texts: list[str] = []
@@ -66,7 +66,7 @@ class Flight:
 
     def boot(self) -> Simulation:
         self.observer.restart()
-        bridge = self.launcher.launch(SETUP)
+        bridge = self.launcher.launch()
         firmware = RealFirmware(bridge, self.observer, self.launcher)
         firmware.on_message = lambda m: self.texts.append(m.text)
         self.firmware = firmware

@@ -20,7 +20,7 @@ from airl_mav.errors import UsageError
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.bridges.child import FirmwareChild
 from firmware_sim.bridges.px4 import EPOCH_US, Px4Bridge
-from firmware_sim.bridges.px4_program import environment, find_px4
+from firmware_sim.bridges.px4_program import find_px4
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.plant.wind import WindSettings
@@ -454,9 +454,8 @@ def test_a_program_started_like_px4_is_flown(tmp_path):
         ]
         build = write_build(tmp_path / "build", *options, "--port", str(bridge.port))
         program = find_px4(build)
-        child = FirmwareChild(
-            "PX4", program.command(3, tmp_path), environment(10016), tmp_path, tmp_path / "log"
-        )
+        start = program.start(3, 10016, tmp_path)
+        child = FirmwareChild("PX4", start, tmp_path, tmp_path / "log")
         try:
             bridge.wait_connected(PATIENCE_S, child.check)
             flight = Scene(bridge, None, TICK_US)

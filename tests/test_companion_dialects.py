@@ -144,7 +144,7 @@ def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting() -
         asked.append(getattr(dialect, f"MAVLINK_MSG_ID_{name}"))
         set_interval(name, interval_us, now_us)
 
-    scheduler.set_interval = note  # type: ignore[method-assign]
+    scheduler.set_interval = note
     kinematics = [dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED]
     kinematics.append(dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
     pacer = Pacer(bench)

@@ -302,9 +302,9 @@ def test_checks_and_what_they_find() -> None:
     assert not checklist.passed
     outcomes = [(check.name, check.outcome, check.finding) for check in checklist.checks]
     assert outcomes == [
-        ("first", Outcome.PASS, "quick"),
+        ("first", Outcome.PASSED, "quick"),
         ("second", Outcome.NOT_APPLICABLE, "no rangefinder"),
-        ("third", Outcome.FAIL, "too slow"),
+        ("third", Outcome.FAILED, "too slow"),
     ]
     assert [line.text for line in shown][-1] == "third: fail: too slow"
 
@@ -319,7 +319,7 @@ def test_what_ends_a_flight_is_noted_and_goes_on(error: BaseException) -> None:
     with pytest.raises(type(error)):
         checklist.perform("flight", breaks)
     (check,) = checklist.checks
-    assert check.outcome is Outcome.FAIL
+    assert check.outcome is Outcome.FAILED
     assert check.finding == (str(error) or "interrupted")
 
 
@@ -507,7 +507,7 @@ def test_another_clock_is_not_taken_for_telemetrys(monkeypatch: pytest.MonkeyPat
 def test_of_exchanges_the_first_short_one_is_taken_and_the_time_since_added() -> None:
     inbox, _ = an_inbox()
     now_us = [0]
-    inbox.stopwatch.time_us = lambda: now_us[0]  # type: ignore[method-assign]
+    inbox.stopwatch.time_us = lambda: now_us[0]
     round_trips_us = [50_000, 9_000, 1_500, 1_000]
 
     def send(name: str, fields: dict[str, object]) -> None:

@@ -17,7 +17,9 @@ from flight_rig import quad
 from processes import ROOT, is_running, wait_until
 from pymavlink.dialects.v20 import common as dialect
 
+from airl_mav.cli.firmware import FirmwareCommand
 from airl_mav.cli.firmware_options import (
+    FirmwareName,
     RealFirmwareOptions,
     arguments,
     check_firmware,
@@ -30,9 +32,16 @@ from airl_mav.ports import Ports
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.state import Mode
-from firmware_sim.bridges.airframe import ArduPilotAirframe, Px4Airframe, differences
-from firmware_sim.bridges.ardupilot_program import Links, find_arducopter, parameter_file
-from firmware_sim.bridges.child import FirmwareChild
+from firmware_sim.bridges.airframe import (
+    ArduPilotAirframe,
+    Px4Airframe,
+    ardupilot_airframe,
+    differences,
+    px4_airframe,
+)
+from firmware_sim.bridges.ardupilot_program import PARAMETERS, Links, find_arducopter
+from firmware_sim.bridges.ardupilot_program import start as start_arducopter
+from firmware_sim.bridges.child import FirmwareChild, Start
 from firmware_sim.bridges.modes import flight_of
 from firmware_sim.bridges.observer import Observer
 from firmware_sim.bridges.parameter_client import ParameterClient, same
@@ -48,16 +57,16 @@ PX4_ID, ARDUPILOT_ID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILO
 HOLDER = """
 import sys, time
 from pathlib import Path
-from firmware_sim.bridges.child import FirmwareChild
+from firmware_sim.bridges.child import FirmwareChild, Start
 folder = Path(sys.argv[1])
-child = FirmwareChild("X", [sys.argv[2], *sys.argv[3:]], {}, folder, folder / "x.log")
+child = FirmwareChild("X", Start(sys.argv[2:], {}), folder, folder / "x.log")
 print("up", flush=True)
 time.sleep(600)
 """
 
 
 def started(folder: Path, *program: str) -> FirmwareChild:
-    return FirmwareChild("PX4", program, {"GREETING": "hello"}, folder, folder / "x.log")
+    return FirmwareChild("PX4", Start(program, {"GREETING": "hello"}), folder, folder / "x.log")
 
 
 def test_a_program_runs_logs_and_is_ended_with_what_it_started(tmp_path: Path) -> None:
@@ -131,6 +140,14 @@ def px4_set_right(vehicle: VehicleProfile) -> dict[str, int | float]:
 def px4(vehicle: VehicleProfile) -> Px4Airframe:
     assert vehicle.px4 is not None
     return Px4Airframe(vehicle, vehicle.px4, "PWM_MAIN_FUNC{}")
+
+
+def test_a_vehicle_that_says_nothing_of_a_firmware_is_told() -> None:
+    vehicle = quad().model_copy(update={"px4": None, "ardupilot": None})
+    with pytest.raises(FirmwareMissingError, match=r"no table \[px4\]"):
+        px4_airframe(vehicle, "PWM_MAIN_FUNC{}")
+    with pytest.raises(FirmwareMissingError, match=r"no table \[ardupilot\]"):
+        ardupilot_airframe(vehicle)
 
 
 def test_px4_with_its_stock_airframe_is_right() -> None:
@@ -372,7 +389,7 @@ def test_px4_is_found_in_a_build_a_tree_and_a_package(tmp_path: Path) -> None:
         (where / "etc" / "init.d-posix" / "rcS").touch()
         program = find_px4(root)
         assert program.binary == where / "bin" / "px4"
-        words = program.command(3, tmp_path / "w")
+        words = program.start(3, 10016, tmp_path / "w").argv
         assert words[:4] == [str(where / "bin" / "px4"), "-d", "-i", "3"]
         assert words[-1] == str(where / "etc")
     with pytest.raises(FirmwareMissingError, match=r"--px4-dir .*: no bin/px4"):
@@ -398,11 +415,15 @@ def test_folders_of_flights_are_new_each_time(tmp_path: Path) -> None:
     assert not temporary.log.parent.exists()
 
 
-def test_ardupilots_defaults_are_its_file_format() -> None:
-    assert parameter_file({"FRAME_TYPE": 1, "MOT_THST_HOVER": 0.52}) == (
-        "FRAME_TYPE 1\nMOT_THST_HOVER 0.52\n"
-    )
-    assert Links(1, 2, 3).api == 1
+def test_ardupilot_is_started_with_its_parameters_in_a_file(tmp_path: Path) -> None:
+    settings = {"FRAME_TYPE": 1, "MOT_THST_HOVER": 0.52}
+    start = start_arducopter(Path("/x/arducopter"), 2, Links(1, 2, 3), settings, tmp_path)
+    assert (tmp_path / PARAMETERS).read_text() == "FRAME_TYPE 1\nMOT_THST_HOVER 0.52\n"
+    words = list(start.argv)
+    assert words[0] == "/x/arducopter"
+    assert words[words.index("--defaults") + 1] == PARAMETERS
+    assert words[words.index("--sim-port-out") + 1] == "9022"
+    assert [word.rpartition(":")[2] for word in words[-5::2]] == ["1", "2", "3"]
 
 
 def test_options_reach_the_other_command_unchanged(tmp_path: Path) -> None:
@@ -434,10 +455,13 @@ GOOD = RealFirmwareOptions(px4_connect=True)
     ],
 )
 def test_what_cannot_be_flown_is_told(
-    firmware: str, options: RealFirmwareOptions, ports: Ports, lockstep: bool, words: str
+    firmware: FirmwareName, options: RealFirmwareOptions, ports: Ports, lockstep: bool, words: str
 ) -> None:
+    command = FirmwareCommand(
+        firmware=firmware, real=options, ports=ports, lockstep=lockstep, speed=2.0
+    )
     with pytest.raises(UsageError) as raised:
-        check_firmware(firmware, options, ports, lockstep=lockstep, speed=2.0)  # type: ignore[arg-type]
+        check_firmware(command)
     assert words in str(raised.value)
 
 

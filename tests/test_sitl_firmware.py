@@ -86,7 +86,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
     run, flown = tmp_path / "run", episode(tmp_path)
     assert "begins again: the firmware gave up: PX4" in process.text()
     assert flown["outcome"] == "success"
-    (note,) = flown["notes"]  # type: ignore[misc]
+    (note,) = flown["notes"]
     assert "flown again: the firmware gave up: PX4" in note
     setup = json.loads((run / "run.json").read_text(encoding="utf-8"))["setup"]
     assert (setup["level"], setup["firmware"]) == ("firmware", "PX4 SITL")

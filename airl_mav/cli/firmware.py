@@ -142,13 +142,7 @@ def check(command: FirmwareCommand) -> None:
     if command.duration is not None:
         check_range("--duration", command.duration, 0.0, 1e6)
     check_wind(command.wind)
-    check_firmware(
-        command.firmware,
-        command.real,
-        command.ports,
-        lockstep=command.lockstep,
-        speed=command.speed,
-    )
+    check_firmware(command)
     if command.tlog is not None and not command.tlog.parent.is_dir():
         raise UsageError(f"--tlog {command.tlog}: no folder {command.tlog.parent}")
 

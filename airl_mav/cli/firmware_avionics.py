@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from airl_mav.cli.firmware_options import FirmwareName, RealFirmwareOptions
 from airl_mav.clock import WallClock
 from airl_mav.errors import UsageError
 from airl_mav.ports import LOOPBACK, Ports
-from airl_mav.profiles.vehicle import RealFirmware, VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.bridges import ardupilot_program, px4_program
+from firmware_sim.bridges.airframe import HITL_OUTPUT, SITL_OUTPUT, ardupilot_airframe, px4_airframe
+from firmware_sim.bridges.ardupilot import ArdupilotBridge
 from firmware_sim.bridges.ardupilot_program import Links, find_arducopter
 from firmware_sim.bridges.avionics import BridgedAvionics, Launcher
-from firmware_sim.bridges.launch_ardupilot import ArdupilotLauncher
 from firmware_sim.bridges.launch_hitl import HitlLauncher, clients_of
-from firmware_sim.bridges.launch_px4 import Px4Launcher
+from firmware_sim.bridges.launch_sitl import SitlLauncher
 from firmware_sim.bridges.observer import Observer
+from firmware_sim.bridges.px4 import Px4Bridge
 from firmware_sim.bridges.px4_program import find_px4
 from firmware_sim.bridges.router import Router, RouterEnd
 from firmware_sim.bridges.workplace import Workplace
@@ -54,57 +57,61 @@ def real_avionics(firmware: FirmwareName, wanted: Wanted) -> BridgedAvionics:
 
 
 def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options = wanted.options
+    options, instance = wanted.options, wanted.options.instance
+    airframe = px4_airframe(wanted.vehicle, SITL_OUTPUT)
     program = None if options.px4_dir is None else find_px4(options.px4_dir)
-    table = _table(wanted.vehicle.px4, "px4")
     endpoint = UdpEndpoint(
-        (LOOPBACK, px4_program.PAYLOAD_PORT + options.instance),
-        (LOOPBACK, px4_program.PAYLOAD_LOCAL_PORT + options.instance),
+        (LOOPBACK, px4_program.PAYLOAD_PORT + instance),
+        (LOOPBACK, px4_program.PAYLOAD_LOCAL_PORT + instance),
         local_option="--instance",
         remote_option="--instance",
     )
-    workplace = Workplace("px4", options.firmware_dir, wanted.log)
-    timeout_s = options.firmware_timeout
-    return Px4Launcher(table.motors, program, options.instance, timeout_s, workplace), endpoint
+    launcher = SitlLauncher(
+        airframe,
+        partial(Px4Bridge, px4_program.SIMULATOR_PORT + instance),
+        None if program is None else partial(program.start, instance, airframe.number),
+        Workplace("px4", options.firmware_dir, wanted.log),
+        timeout_s=options.firmware_timeout,
+        reboots=False,
+    )
+    return launcher, endpoint
 
 
 def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options, ports = wanted.options, wanted.ports
+    options, ports, instance = wanted.options, wanted.ports, wanted.options.instance
+    airframe = ardupilot_airframe(wanted.vehicle)
     where = options.ardupilot_dir
     program = None if where is None else find_arducopter(where)
-    table = _table(wanted.vehicle.ardupilot, "ardupilot")
     # Who is started by us can be told any port.
-    port = ardupilot_program.OBSERVER_PORT + options.instance if program is None else 0
+    port = ardupilot_program.OBSERVER_PORT + instance if program is None else 0
     endpoint = UdpEndpoint(
         (LOOPBACK, port), None, local_option="--instance", remote_option="--instance"
     )
     links = Links(ports.api_port, ports.gcs_port, endpoint.local[1])
-    workplace = Workplace("ardupilot", options.firmware_dir, wanted.log)
-    timeout_s = options.firmware_timeout
-    launcher = ArdupilotLauncher(
-        table.motors, program, options.instance, links, timeout_s, workplace
+    start = ardupilot_program.start
+    launcher = SitlLauncher(
+        airframe,
+        partial(ArdupilotBridge, ardupilot_program.simulator_port(instance)),
+        None if program is None else partial(start, program, instance, links, airframe.settings),
+        Workplace("ardupilot", options.firmware_dir, wanted.log),
+        timeout_s=options.firmware_timeout,
+        reboots=True,
     )
     return launcher, endpoint
 
 
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options = wanted.options
-    table = _table(wanted.vehicle.px4, "px4")
+    airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
     router = Router(clients_of(wanted.bind_ends()), WallClock())
     try:
         launcher = HitlLauncher(
-            table.motors, router, options.serial or "", options.baud, options.firmware_timeout
+            airframe, router, options.serial or "", options.baud, options.firmware_timeout
         )
     except UsageError:
         router.close()
         raise
     return launcher, RouterEnd(router)
-
-
-def _table(table: RealFirmware | None, name: str) -> RealFirmware:
-    if table is None:
-        raise UsageError(f"--firmware {name}: the vehicle's profile has no table [{name}]")
-    return table
 
 
 _PARTS: dict[FirmwareName, Callable[[Wanted], tuple[Launcher, Endpoint]]] = {

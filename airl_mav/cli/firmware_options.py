@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 from airl_mav.cli.common import check_range
 from airl_mav.errors import UsageError
@@ -75,15 +75,38 @@ def option_of(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def check_firmware(
-    firmware: FirmwareName,
-    options: RealFirmwareOptions,
-    ports: Ports,
-    *,
-    lockstep: bool,
-    speed: float | str | None,
-) -> None:
+class FirmwareWords(Protocol):
+    """What a command line says of the flight controller."""
+
+    @property
+    def firmware(self) -> FirmwareName:
+        """Which one."""
+        ...
+
+    @property
+    def real(self) -> RealFirmwareOptions:
+        """How a real one is reached."""
+        ...
+
+    @property
+    def ports(self) -> Ports:
+        """Of all links."""
+        ...
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether simulated time waits for the companion."""
+        ...
+
+    @property
+    def speed(self) -> float | str | None:
+        """Multiple of real time; None = as usual."""
+        ...
+
+
+def check_firmware(command: FirmwareWords) -> None:
     """Check what is asked of a flight controller. Raises UsageError."""
+    firmware, options = command.firmware, command.real
     given = {name for name, value in asdict(options).items() if value not in (None, False)}
     for kind, names in NEEDS.items():
         mine = [name for name in names if name in given]
@@ -97,18 +120,18 @@ def check_firmware(
     check_range("--firmware-timeout", options.firmware_timeout, 1.0, 3600.0)
     if firmware == "builtin":
         return
-    if lockstep:
+    if command.lockstep:
         raise UsageError(
             f"--firmware {firmware} with --lockstep: accepted: without; only the built-in autopilot"
             " and its companion share one simulated clock"
         )
-    if firmware == "px4-hitl" and speed not in (None, 1.0):
+    if firmware == "px4-hitl" and command.speed not in (None, 1.0):
         raise UsageError(
-            f"--speed {speed} with --firmware px4-hitl: accepted: 1, a board's own pace"
+            f"--speed {command.speed} with --firmware px4-hitl: accepted: 1, a board's own pace"
         )
-    if firmware == "px4" and _moved(ports):
+    if firmware == "px4" and (moved := _moved(command.ports)):
         raise UsageError(
-            f"{_moved(ports)}: PX4 SITL has ports of its own: accepted: --instance moves them all"
+            f"{moved}: PX4 SITL has ports of its own: accepted: --instance moves them all"
         )
 
 

@@ -180,13 +180,7 @@ def check(command: SitlCommand) -> tuple[Setup, PilotSettings]:
     check_range("--altitude", pilot.altitude_m, 0.5, 100.0)
     check_holding("--hold", pilot.hold_s, command.watchdog)
     check_wind(command.wind)
-    check_firmware(
-        command.firmware,
-        command.real,
-        command.ports,
-        lockstep=command.lockstep,
-        speed=command.speed,
-    )
+    check_firmware(command)
     check_program(command.real)
     if not command.lockstep:
         # The companion connects to the camera by its number: it cannot be "any free one" here.

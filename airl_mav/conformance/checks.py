@@ -13,8 +13,8 @@ from companion.interfaces import LinkError
 class Outcome(Enum):
     """What came of a check."""
 
-    PASS = "pass"  # noqa: S105
-    FAIL = "fail"
+    PASSED = "pass"
+    FAILED = "fail"
     NOT_APPLICABLE = "not applicable"
 
 
@@ -66,28 +66,28 @@ class Checklist:
         """
         start_s = self._transcript.time_s
         try:
-            self._note(name, Outcome.PASS, check(), start_s)
+            self._note(name, Outcome.PASSED, check(), start_s)
         except NotApplicableError as reason:
             self._note(name, Outcome.NOT_APPLICABLE, str(reason), start_s)
         except FailedError as finding:
-            self._note(name, Outcome.FAIL, str(finding), start_s)
+            self._note(name, Outcome.FAILED, str(finding), start_s)
             return False
         except LinkError as error:
-            self._note(name, Outcome.FAIL, str(error), start_s)
+            self._note(name, Outcome.FAILED, str(error), start_s)
             raise
         except KeyboardInterrupt:
-            self._note(name, Outcome.FAIL, "interrupted", start_s)
+            self._note(name, Outcome.FAILED, "interrupted", start_s)
             raise
         return True
 
     def skip(self, name: str, reason: str) -> None:
         """Note a check that could not be made as failed."""
-        self._note(name, Outcome.FAIL, reason, self._transcript.time_s)
+        self._note(name, Outcome.FAILED, reason, self._transcript.time_s)
 
     @property
     def passed(self) -> bool:
         """Whether there are checks and none failed."""
-        return bool(self.checks) and all(c.outcome is not Outcome.FAIL for c in self.checks)
+        return bool(self.checks) and all(c.outcome is not Outcome.FAILED for c in self.checks)
 
     def _note(self, name: str, outcome: Outcome, finding: str, start_s: float) -> None:
         check = Check(name, outcome, finding, self._transcript.time_s - start_s)

@@ -33,7 +33,7 @@ FIGURES: dict[str, tuple[str, float, int]] = {
 """Column heading, scale and digits of each figure of a StepResponse."""
 
 KINDS = {"sent": "->", "heard": "<-", "check": "==", "note": "--"}
-COLOURS = {Outcome.PASS: "green", Outcome.FAIL: "red", Outcome.NOT_APPLICABLE: "yellow"}
+COLOURS = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.NOT_APPLICABLE: "yellow"}
 
 
 def line_text(line: Line) -> str:
@@ -84,8 +84,8 @@ def check_table(checks: list[Check]) -> Table:
 def verdict(findings: Findings) -> str:
     """Return the outcome in one line."""
     checks = findings.checklist.checks
-    failed = [check.name for check in checks if check.outcome is Outcome.FAIL]
-    passed = sum(check.outcome is Outcome.PASS for check in checks)
+    failed = [check.name for check in checks if check.outcome is Outcome.FAILED]
+    passed = sum(check.outcome is Outcome.PASSED for check in checks)
     rest = len(checks) - passed - len(failed)
     counted = f"{passed} passed, {len(failed)} failed, {rest} not applicable"
     if findings.interrupted:

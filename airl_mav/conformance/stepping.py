@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 from airl_mav.conformance.air import start_offboard
@@ -81,7 +82,7 @@ def judge_steps(
     """Compare every step with the stored column: one check each."""
     for name in STEP_NAMES:
         if name in names:
-            checklist.perform(f"step {name}", lambda name=name: _judge(flown.get(name), reference))  # type: ignore[misc]
+            checklist.perform(f"step {name}", partial(_judge, flown.get(name), reference))
 
 
 def stored_step(reference: Reference, name: StepName) -> StoredStep:

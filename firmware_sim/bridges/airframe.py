@@ -6,7 +6,7 @@ a controller that fights.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from airl_mav.profiles.vehicle import (
@@ -22,8 +22,8 @@ from firmware_sim.flight_controller import FirmwareMissingError
 
 MOTORS = range(4)
 
-Outputs = str
-"""Name of the parameter that says what hangs on output {}: PWM_MAIN_FUNC{}, HIL_ACT_FUNC{}."""
+SITL_OUTPUT, HITL_OUTPUT = "PWM_MAIN_FUNC{}", "HIL_ACT_FUNC{}"
+"""PX4's parameter that says what hangs on output {}."""
 
 GROUND_LOSS = "NAV_DLL_ACT"
 """PX4's parameter of what the loss of the ground station does; 0 = nothing."""
@@ -40,6 +40,14 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 
 class Airframe(Protocol):
     """What one kind of firmware must be set to."""
+
+    firmware: str
+    """What the firmware is called in messages: PX4."""
+
+    @property
+    def motors(self) -> Sequence[Corner]:
+        """Corner of the motor on each of its outputs."""
+        ...
 
     @property
     def settings(self) -> Mapping[str, Value]:
@@ -58,16 +66,20 @@ class Airframe(Protocol):
 class Px4Airframe:
     """A quad by PX4's control allocation: rotor positions and turns, output functions."""
 
-    def __init__(self, vehicle: VehicleProfile, px4: Px4, outputs: Outputs) -> None:
+    firmware = "PX4"
+
+    def __init__(self, vehicle: VehicleProfile, px4: Px4, output: str) -> None:
         """Take the vehicle.
 
         Args:
             vehicle: Its rotors.
             px4: What is said of PX4.
-            outputs: Parameter of an output's function, with {} for its number.
+            output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
         """
-        self._motors = px4.motors
-        self._outputs = outputs
+        self.motors = px4.motors
+        self.number = px4.airframe
+        """SYS_AUTOSTART."""
+        self._output = output
         self.settings: dict[str, Value] = {
             "THR_MDL_FAC": vehicle.rotor.thrust_curve,
             **vehicle.rotor.px4_geometry(),
@@ -77,7 +89,7 @@ class Px4Airframe:
     def names(self) -> list[str]:
         """Return all parameters that must be known."""
         rotors = [f"CA_ROTOR{i}_{key}" for i in MOTORS for key in ("PX", "PY", "KM")]
-        outputs = [self._outputs.format(i + 1) for i in MOTORS]
+        outputs = [self._output.format(i + 1) for i in MOTORS]
         frame = ["CA_AIRFRAME", "CA_ROTOR_COUNT", GROUND_LOSS]
         return list(dict.fromkeys([*frame, *outputs, *rotors, *self.settings]))
 
@@ -88,8 +100,8 @@ class Px4Airframe:
                 f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
                 f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
             )
-        for output, expected in enumerate(self._motors, start=1):
-            name = self._outputs.format(output)
+        for output, expected in enumerate(self.motors, start=1):
+            name = self._output.format(output)
             motor = int(held[name]) - _PX4_MOTOR_1
             if motor not in MOTORS:
                 return f"PX4's {name} is {held[name]}: expected a motor, 101 to 104"
@@ -112,8 +124,10 @@ class Px4Airframe:
 class ArduPilotAirframe:
     """A quad by ArduCopter's frame class and type, and its output functions."""
 
+    firmware = "ArduPilot"
+
     def __init__(self, ardupilot: ArduPilot) -> None:
-        self._ardupilot = ardupilot
+        self.motors = ardupilot.motors
         self._frame: dict[str, int] = {
             "FRAME_CLASS": ardupilot.frame_class,
             "FRAME_TYPE": ardupilot.frame_type,
@@ -129,7 +143,7 @@ class ArduPilotAirframe:
         for name, expected in self._frame.items():
             if held[name] != expected:
                 return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
-        for output, corner in enumerate(self._ardupilot.motors, start=1):
+        for output, corner in enumerate(self.motors, start=1):
             function = int(held[f"SERVO{output}_FUNCTION"])
             found = _ARDUPILOT_QUAD_X.get(function - _ARDUPILOT_MOTOR_1 + 1)
             if found != corner:
@@ -141,18 +155,20 @@ class ArduPilotAirframe:
         return None
 
 
-def px4_airframe(name: str, vehicle: VehicleProfile, outputs: Outputs) -> Px4Airframe:
+def px4_airframe(vehicle: VehicleProfile, output: str) -> Px4Airframe:
     """Return what PX4 must be set to. Raises UsageError when the profile does not say it."""
     if vehicle.px4 is None:
-        raise FirmwareMissingError(f"--firmware {name}: the vehicle's profile has no table [px4]")
-    return Px4Airframe(vehicle, vehicle.px4, outputs)
+        raise FirmwareMissingError(
+            "--vehicle: its profile has no table [px4]: accepted: one as quad's"
+        )
+    return Px4Airframe(vehicle, vehicle.px4, output)
 
 
-def ardupilot_airframe(name: str, vehicle: VehicleProfile) -> ArduPilotAirframe:
+def ardupilot_airframe(vehicle: VehicleProfile) -> ArduPilotAirframe:
     """Return what ArduPilot must be set to. Raises UsageError when the profile does not say it."""
     if vehicle.ardupilot is None:
         raise FirmwareMissingError(
-            f"--firmware {name}: the vehicle's profile has no table [ardupilot]"
+            "--vehicle: its profile has no table [ardupilot]: accepted: one as quad's"
         )
     return ArduPilotAirframe(vehicle.ardupilot)
 

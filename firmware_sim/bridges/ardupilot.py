@@ -19,6 +19,7 @@ from airl_mav.constants import US_PER_S
 from airl_mav.errors import UsageError
 from airl_mav.ports import LOOPBACK
 from firmware_sim.bridges.ardupilot_program import PORTS_PER_INSTANCE, SIMULATOR_PORT
+from firmware_sim.bridges.bridge import nobody_to_look_after
 from firmware_sim.bridges.json_lines import (
     ServoPacket,
     ServoPacketError,
@@ -86,7 +87,7 @@ class ArdupilotBridge:
         """How many of them came in a row."""
         self._pwm_min_us, self._span_us = pwm_min_us, pwm_max_us - pwm_min_us
         self._silence_us = int(silence_s * US_PER_S)
-        self._alive: Callable[[], None] = _assume_alive
+        self._alive: Callable[[], None] = nobody_to_look_after
         self._truth: Callable[[], Truth] | None = None
         self._address: Address | None = None
         self._packet: ServoPacket | None = None
@@ -258,7 +259,3 @@ def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
     if after.frame_count < before.frame_count:
         raise FirmwareLostError(_RESTARTED)
     return after
-
-
-def _assume_alive() -> None:
-    """Say nothing: nobody looks after the process."""

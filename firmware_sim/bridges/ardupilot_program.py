@@ -9,6 +9,7 @@ from pathlib import Path
 
 from airl_mav.location import HOME
 from airl_mav.ports import LOOPBACK
+from firmware_sim.bridges.child import Start
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -79,9 +80,21 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
     ]
 
 
-def parameter_file(settings: Mapping[str, float]) -> str:
-    """Return the text of a file of default parameters."""
-    return "".join(f"{name} {value:g}\n" for name, value in settings.items())
+def start(
+    program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
+) -> Start:
+    """Return how it is started, its parameters in a file.
+
+    Args:
+        program: The program itself.
+        instance: Its instance number, which moves the simulator's port.
+        links: Where it talks to.
+        settings: Parameters, by name.
+        folder: Where it runs, and where the file is put.
+    """
+    text = "".join(f"{name} {value:g}\n" for name, value in settings.items())
+    (folder / PARAMETERS).write_text(text, encoding="ascii")
+    return Start(command(str(program), instance, links, PARAMETERS), {})
 
 
 def how_to_start(instance: int, links: Links) -> str:

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from airl_mav.clock import WallClock
 from airl_mav.constants import US_PER_S
-from airl_mav.profiles.vehicle import CORNERS, Corner
+from airl_mav.profiles.vehicle import CORNERS
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.autopilot.state import Message, Severity
 from firmware_sim.bridges.airframe import GROUND_LOSS, Airframe, differences
@@ -36,20 +36,14 @@ READY_LIMIT_S = 120.0
 class Launcher(Protocol):
     """How one kind of firmware gets going."""
 
-    name: str
-    """What it is called in messages: PX4."""
-    motors: Sequence[Corner]
-    """Corner of the motor on each of its outputs."""
+    airframe: Airframe
+    """What it must be set to."""
     may_set: bool
     """Whether its parameters are ours to set: it was started by us, for this flight alone."""
     reboots: bool
     """Whether it starts anew by itself when told to; else it can only be told to shut down."""
 
-    def airframe(self, setup: EpisodeSetup) -> Airframe:
-        """Return what it must be set to. Raises UsageError when the vehicle does not say."""
-        ...
-
-    def launch(self, setup: EpisodeSetup) -> Bridge:
+    def launch(self) -> Bridge:
         """Start it, or wait for it, and return the bridge, connected.
 
         Raises:
@@ -77,7 +71,7 @@ class RealFirmware:
         self._bridge = bridge
         self._observer = observer
         self._launcher = launcher
-        self._output = tuple(launcher.motors.index(corner) for corner in CORNERS)
+        self._output = tuple(launcher.airframe.motors.index(corner) for corner in CORNERS)
         self._sample: SensorSample | None = None
         self.rate_hz = bridge.rate_hz
         self.see = bridge.see
@@ -138,7 +132,6 @@ class BridgedAvionics:
         self._launcher = launcher
         self._observer = observer
         self._timeout_s = timeout_s
-        self._airframe: Airframe | None = None
         self._missing: list[str] = []
         """Parameters that are being waited for."""
         self.filenos = observer.filenos
@@ -149,10 +142,9 @@ class BridgedAvionics:
 
     def boot(self, setup: EpisodeSetup) -> RealFirmware:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
-        launcher = self._launcher
-        self._airframe = launcher.airframe(setup)
+        del setup  # Each start is a power-up: it knows nothing of the last flight.
         self._observer.restart()
-        return RealFirmware(launcher.launch(setup), self._observer, launcher)
+        return RealFirmware(self._launcher.launch(), self._observer, self._launcher)
 
     def connect(self, tick: Callable[[], int]) -> None:
         """Fly ticks on the ground until its frame is known to be right and it may be armed.
@@ -164,10 +156,8 @@ class BridgedAvionics:
             FirmwareMissingError: It is silent, its frame is another one, or it never gets ready.
             FirmwareLostError: It died.
         """
-        airframe, observer = self._airframe, self._observer
-        if airframe is None:
-            return
-        parameters, name = observer.parameters, self._launcher.name
+        airframe, observer = self._launcher.airframe, self._observer
+        parameters = observer.parameters
         self._until(tick, lambda: observer.heard, "a MAVLink heartbeat")
         names = airframe.names()
         self._until(tick, self._asking(lambda: parameters.ask(names)), "the parameters")
@@ -180,7 +170,7 @@ class BridgedAvionics:
             wanted = airframe.settings
             self._until(tick, self._asking(lambda: parameters.set(wanted)), "set parameters")
         elif different := differences(parameters.values, airframe.settings):
-            self._say(f"{name} is set otherwise than the vehicle: {_some(different)}")
+            self._say(f"{airframe.firmware} is set otherwise than the vehicle: {_some(different)}")
         self._until(tick, lambda: observer.ready, "its word that it may be armed")
 
     def close(self) -> None:
@@ -216,7 +206,7 @@ class BridgedAvionics:
                 left = f" ({_some(self._missing)})" if self._missing else ""
                 spent_s = (now_us - start_us) / US_PER_S
                 raise FirmwareMissingError(
-                    f"{self._launcher.name} runs, but {what}{left} did not come in "
+                    f"{self._launcher.airframe.firmware} runs, but {what}{left} did not come in "
                     f"{clock.time_us() / US_PER_S:.0f} s ({spent_s:.0f} s simulated); it said: "
                     f"{observer.last_text or 'nothing'}"
                 )

@@ -8,6 +8,10 @@ from typing import Protocol
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 
+def nobody_to_look_after() -> None:
+    """Do nothing: for firmware whose process is not ours, nobody can tell whether it lives."""
+
+
 class Bridge(Protocol):
     """One simulator interface, for one flight of one firmware.
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -18,18 +19,25 @@ TAIL_LINES = 8
 """Lines of a dead process's log that are shown."""
 
 
+@dataclass(frozen=True)
+class Start:
+    """How a program is started in a folder of its own."""
+
+    argv: Sequence[str]
+    """Program and arguments."""
+    environment: Mapping[str, str]
+    """Added to our own environment."""
+
+
 class FirmwareChild:
     """One process of real firmware, on a leash: it ends with us, also when we are killed."""
 
-    def __init__(
-        self, name: str, argv: Sequence[str], environment: Mapping[str, str], cwd: Path, log: Path
-    ) -> None:
+    def __init__(self, name: str, start: Start, cwd: Path, log: Path) -> None:
         """Start it.
 
         Args:
             name: What it is called in messages: PX4.
-            argv: Program and arguments.
-            environment: Added to our own environment.
+            start: How.
             cwd: Its working directory.
             log: What it prints is appended here.
 
@@ -38,19 +46,19 @@ class FirmwareChild:
         """
         self.name = name
         self._log = log
-        program = Path(argv[0])
+        program = Path(start.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():
             raise FirmwareMissingError(f"{name}: {program}: no program that can be run")
         with log.open("ab") as file:
             self._start = file.tell()
             # A session of its own: Ctrl-C at the terminal is for us, who then end it in order.
-            self._process = subprocess.Popen(  # noqa: S603
-                [sys.executable, "-m", "firmware_sim.bridges.leash", *argv],
+            self._process = subprocess.Popen(  # noqa: S603 - a list of words, no shell
+                [sys.executable, "-m", "firmware_sim.bridges.leash", *start.argv],
                 stdin=subprocess.PIPE,
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 cwd=cwd,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **start.environment},
                 start_new_session=True,
             )
 

@@ -21,7 +21,7 @@ GRACE_S = 2.0
 def main() -> None:
     """Run the command line's program until it ends, or the leash does; exit with its status."""
     # A group of its own: signals meant for the holder pass it by, and it can be ended whole.
-    program = subprocess.Popen(  # noqa: S603
+    program = subprocess.Popen(  # noqa: S603 - a list of words, no shell
         sys.argv[1:], stdin=subprocess.DEVNULL, start_new_session=True
     )
     threading.Thread(target=_end_with_leash, args=(program,), daemon=True).start()

@@ -13,6 +13,7 @@ from airl_mav.clock import WallClock
 from airl_mav.constants import TICK_HZ, TICK_US, US_PER_S
 from airl_mav.ports import LOOPBACK
 from firmware_sim.bridges import hil
+from firmware_sim.bridges.bridge import nobody_to_look_after
 from firmware_sim.bridges.px4_program import MODEL, SIMULATOR_PORT
 from firmware_sim.bridges.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -95,7 +96,7 @@ class Px4Bridge:
         """The port it listens on."""
         self._answer_s, self._start_s = answer_s, start_s
         self._clock = WallClock()
-        self._alive: Callable[[], None] = lambda: None
+        self._alive: Callable[[], None] = nobody_to_look_after
         self._decoder = Decoder(datagrams=False)
         self._encoder = Encoder()
         self._truth: Callable[[], Truth] | None = None

@@ -6,6 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_sim.bridges.child import Start
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT = 4560
@@ -33,13 +34,20 @@ class Px4Program:
     etc: Path
     """Folder of its start-up scripts."""
 
-    def command(self, instance: int, folder: Path) -> list[str]:
-        """Return program and arguments: in the background, without a shell."""
-        return [
+    def start(self, instance: int, airframe: int, folder: Path) -> Start:
+        """Return how it is started: in the background, without a shell.
+
+        Args:
+            instance: PX4's instance number, which moves all its ports.
+            airframe: SYS_AUTOSTART.
+            folder: Where it runs.
+        """
+        argv = [
             str(self.binary),
             *("-d", "-i", str(instance)),
             *("-w", str(folder), "-s", SCRIPT, str(self.etc)),
         ]
+        return Start(argv, environment(airframe))
 
 
 def find_px4(folder: Path) -> Px4Program:
