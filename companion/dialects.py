@@ -30,8 +30,8 @@ class Dialect:
     name: str
     streams: tuple[tuple[str, float], ...]
     """What must be asked for: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
-    ready: Callable[[Any], bool]
-    """Whether it may be armed and then flown by position, by MAVSDK's telemetry."""
+    health: tuple[str, ...]
+    """Flags of MAVSDK's health that say that it may be armed, and then flown by position."""
     arm_timeout_s: float
     """Longest time from the beginning of a mission, with the flight controller just powered up, to
     its arming [s]."""
@@ -40,27 +40,28 @@ class Dialect:
         """Return what asks MAVSDK's telemetry for the streams, one after the other."""
         return [partial(getattr(telemetry, f"set_rate_{name}"), hz) for name, hz in self.streams]
 
-
-def _px4_ready(telemetry: Any) -> bool:
-    return bool(telemetry.health_all_ok() and telemetry.health().is_armable)
-
-
-def _ardupilot_ready(telemetry: Any) -> bool:
-    """In STABILIZE it may be armed without a position; GUIDED, and so take-off, needs one.
-
-    MAVSDK's calibration flags are left out: they mean "enabled and healthy now" here, and the
-    pre-arm checks have looked at the calibration.
-    """
-    health = telemetry.health()
-    return bool(
-        health.is_armable
-        and health.is_local_position_ok
-        and health.is_global_position_ok
-        and health.is_home_position_ok
-    )
+    def ready(self, telemetry: Any) -> bool:
+        """Return whether it may be armed and then flown by position, by MAVSDK's telemetry."""
+        health = telemetry.health()
+        return all(getattr(health, flag) for flag in self.health)
 
 
-PX4 = Dialect("PX4", _KINEMATICS, _px4_ready, arm_timeout_s=20.0)
+_POSITION = ("is_local_position_ok", "is_global_position_ok")
+
+PX4 = Dialect(
+    "PX4",
+    _KINEMATICS,
+    # health_all_ok without the home position: PX4 sets home when it arms, and MAVSDK forgets it
+    # whenever this process has stood still for 3 s.
+    (
+        "is_gyrometer_calibration_ok",
+        "is_accelerometer_calibration_ok",
+        "is_magnetometer_calibration_ok",
+        *_POSITION,
+        "is_armable",
+    ),
+    arm_timeout_s=20.0,
+)
 
 ARDUPILOT = Dialect(
     "ArduPilot",
@@ -72,7 +73,10 @@ ARDUPILOT = Dialect(
         ("landed_state", _STATUS_HZ),
         ("home", 1.0),
     ),
-    _ardupilot_ready,
+    # In STABILIZE it may be armed without a position; GUIDED, and so take-off, needs one. MAVSDK's
+    # calibration flags are left out: they mean "enabled and healthy now" here, and the pre-arm
+    # checks have looked at the calibration.
+    (*_POSITION, "is_home_position_ok", "is_armable"),
     # Its EKF learns the gyros' bias for 40 s before it uses GPS.
     arm_timeout_s=90.0,
 )

@@ -156,7 +156,7 @@ class Campaign:
             assert path.time_us[-1] >= episode.ended_us
             assert np.hypot(*(path.position[-1, :2] - episode.goal)) < episode.goal_radius_m + 1.0
             decided = stamps["sent_us"]
-            assert len(decided) >= 3
+            assert len(decided) >= 1
             # Equal: what happens while the simulator stands still happens at one of its ticks.
             assert episode.navigation_us <= decided.min() <= decided.max() <= path.time_us[-1]
             check_log(self.out / f"flight-{episode.index:03d}.tlog", path.time_us)

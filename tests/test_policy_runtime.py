@@ -556,5 +556,6 @@ def test_a_learned_policy_flies_a_rehearsal(folder: Path, tmp_path: Path) -> Non
     for times in sent:
         assert len(times) >= 5
         periods_s = np.diff(times) / 1e6
-        # Its own hold, not the default of 0.5 s; a busy host may make any period longer.
-        assert 0.3 <= periods_s.min() < 0.5
+        # Its own hold, not the default of 0.5 s; a busy host may make any period longer, and
+        # shorter where simulated time was given up in it.
+        assert 0.3 <= np.median(periods_s) < 0.5

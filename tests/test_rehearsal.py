@@ -86,6 +86,8 @@ class Stage:
         self.all: list[FakeChild] = []
         self.on_abort: Callable[[Abort], list[Item]] = lambda _: [ended("stopped")]
         self.saves = True
+        self.slips: list[tuple[int, int]] = []
+        """When the firmware has given up time, and how much [µs]."""
         self.starts: list[list[Item]] = []
         """What is said at each start; both are ready when nothing is left of it."""
 
@@ -145,7 +147,7 @@ class FakeChild:
         elif isinstance(request, Abort):
             stage.put(*stage.on_abort(request))
         elif isinstance(request, FinishEpisode) and stage.saves:
-            write_record(self.record)
+            write_record(self.record, stage.slips)
             stage.put((FIRMWARE, Saved(path=str(self.record))))
 
     def stop(self) -> None:
@@ -159,7 +161,7 @@ class FakeChild:
         return "last words"
 
 
-def write_record(path: Path) -> None:
+def write_record(path: Path, slips: Sequence[tuple[int, int]]) -> None:
     """What the firmware leaves of an episode: 100 s at 10 m/s to the north."""
     n = 5001
     time_us = START_US + np.arange(n, dtype=np.int64) * 20_000
@@ -176,7 +178,7 @@ def write_record(path: Path) -> None:
         "setpoints/setpoint": np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
         "estimate/time_us": np.zeros(0, np.int64),
         "tick/lateness_us": np.zeros(3, np.int64),
-        "tick/slips_us": np.zeros((0, 2), np.int64),
+        "tick/slips_us": np.array(slips, np.int64).reshape(-1, 2),
     }
     np.savez(path, **arrays)
 
@@ -335,17 +337,21 @@ def test_success_then_crash_is_called_off_without_landing(play: Callable[..., Ru
 
 
 def test_time_given_up_is_taken_off_the_companions_clock(play: Callable[..., Run]) -> None:
-    (record,) = play(
+    run = play(
         [
             at(0.5),
             at(1.0, slipped_us=3_000_000),
-            # 5 s by the companion's clock is 2 s by the simulator's.
-            phase("navigating", 5.0),
-            at(2.5, 1.0, slipped_us=3_000_000),
+            # 5.1 s by the companion's clock is 2 s by the simulator's, which has given up another
+            # 0.1 s that no state has told yet.
+            phase("navigating", 5.1),
+            at(2.5, 1.0, slipped_us=3_100_000),
             at(9.0, 8.0, slipped_us=3_500_000),
             ended(),
         ],
-    ).fly()
+    )
+    when = [(1.0, 3.0), (1.5, 0.1), (9.0, 0.4)]
+    run.stage.slips = [(START_US + int(at_s * 1e6), int(lost_s * 1e6)) for at_s, lost_s in when]
+    (record,) = run.fly()
     assert record.navigation_us == START_US + 2_000_000
     assert record.slipped_us == 3_500_000
 
