@@ -6,6 +6,9 @@ BIN   := $(VENV)/bin
 FLY   := $(VENV)/.installed-sim
 ALL   := $(VENV)/.installed-all
 
+# One more than there are cores: tests that fly mostly wait.
+WORKERS := $(shell expr $$(nproc) + 1)
+
 comma := ,
 
 # pybullet has wheels for CPython 3.10 and 3.11 only.
@@ -48,7 +51,7 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 
 .PHONY: test
 test: lint  ## Everything CI checks
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: bench
 bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")

@@ -23,6 +23,15 @@ ROOT = Path(__file__).resolve().parent.parent
 OFFBOARD, HOLD, POSITION, LAND = 6 << 16, 3 << 24 | 4 << 16, 3 << 16, 6 << 24 | 4 << 16
 """PX4 custom modes."""
 
+NO_REPORT = """
+from airl_mav.cli import sitl
+sitl.conclude = lambda *_: None
+"""
+"""Before airl-sitl's main(): pictures take longer than flights."""
+
+SITL = ("-m", "airl_mav.cli.sitl")
+SITL_WITHOUT_REPORT = ("-c", f"{NO_REPORT}\nsitl.main()")
+
 PATIENCE_S = 150.0
 """Longest wait for anything [wall s]: after a change of the sources, a first start compiles."""
 

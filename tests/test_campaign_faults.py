@@ -21,20 +21,23 @@ from typing import Any
 import numpy as np
 import pytest
 from ports import TestPorts, choose_ports
-from processes import Running, children_of, is_running, running, wait_until, write_arena
+from processes import (
+    NO_REPORT,
+    Running,
+    children_of,
+    is_running,
+    running,
+    wait_until,
+    write_arena,
+)
 from pymavlink import mavutil
 
 from airl_mav.harness.run_folder import load
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mark.timeout(300)]
 
 SEED = 30
 SPEED = 8.0
-
-NO_REPORT = """
-from airl_mav.cli import sitl
-sitl.conclude = lambda *_: None  # figures take longer than flights
-"""
 
 KILLER = """
 import os, signal
@@ -102,7 +105,7 @@ class Campaign:
     @contextmanager
     def flying(self, script: str = "") -> Iterator[Running]:
         """Run the command; other ports every time, as they decide nothing."""
-        code = f"{NO_REPORT}\n{script}\nfrom airl_mav.cli.sitl import main\nmain()"
+        code = f"{NO_REPORT}\n{script}\nsitl.main()"
         with running(["-c", code, *self.options(choose_ports())], self.folder) as process:
             yield process
             self.look(process)
@@ -291,6 +294,7 @@ def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:
         return [int(status) for status in re.findall(r"^status (-?\d+)$", process.text(), re.M)]
 
 
+@pytest.mark.xdist_group("evaluation")
 def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     """At level gym flights are the same every time: so are runs, killed or not."""
     out, straight = tmp_path / "killed", tmp_path / "straight"

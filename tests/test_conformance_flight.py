@@ -80,7 +80,7 @@ def patient_reference(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("flight")
+@pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(400)
 def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
     out = tmp_path / "result.json"
@@ -112,7 +112,7 @@ def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("flight")
+@pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)
 def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
     out = tmp_path / "result.json"
@@ -132,7 +132,7 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("flight")
+@pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)
 def test_ctrl_c_lands(tmp_path: Path) -> None:
     out = tmp_path / "result.json"

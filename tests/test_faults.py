@@ -21,6 +21,8 @@ from ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from processes import (
     HOLD,
     OFFBOARD,
+    SITL,
+    SITL_WITHOUT_REPORT,
     Ground,
     Running,
     ground_station,
@@ -60,11 +62,17 @@ def ground() -> Iterator[Ground]:
 
 @contextmanager
 def sitl(
-    folder: Path, ports: TestPorts, *options: str, goal_m: float = FAR_M, speed: float = SPEED
+    folder: Path,
+    ports: TestPorts,
+    *options: str,
+    goal_m: float = FAR_M,
+    speed: float = SPEED,
+    report: bool = False,
 ) -> Iterator[Running]:
     """airl-sitl in an empty corridor."""
     words = [
-        *("-m", "airl_mav.cli.sitl", "--arena", str(write_arena(folder, goal_m))),
+        *(SITL if report else SITL_WITHOUT_REPORT),
+        *("--arena", str(write_arena(folder, goal_m))),
         *("--speed", str(speed), "--altitude", "1.5", "--out", str(folder / "run")),
         *ports.options(),
         *options,
@@ -212,7 +220,7 @@ def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> 
 
 def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0) as run:
+    with sitl(tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0, report=True) as run:
         run.find_children("firmware", "companion")
         run.wait_for_text("flight 000")
         ground.wait_flying(0.5, run)
@@ -232,7 +240,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
 
 def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
     """SIGTERM, from a batch system or a service manager, is Ctrl-C."""
-    with sitl(tmp_path, choose_ports(ground.port)) as run:
+    with sitl(tmp_path, choose_ports(ground.port), report=True) as run:
         run.find_children("firmware", "companion")
         ground.wait_flying(1.0, run)
         run.process.terminate()
@@ -245,7 +253,7 @@ def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
 
 
 def test_interrupted_start(tmp_path: Path) -> None:
-    with sitl(tmp_path, choose_ports()) as run:
+    with sitl(tmp_path, choose_ports(), report=True) as run:
         run.find_children("firmware", "companion")
         run.interrupt()
         assert run.wait(40.0) == 130

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from ports import choose_ports
-from processes import ROOT
+from processes import ROOT, SITL_WITHOUT_REPORT
 from rich.console import Console
 
 from airl_mav.cli.evaluate_command import EvaluateCommand
@@ -107,7 +107,7 @@ def test_two_processes_are_as_late_in_simulated_time(trace: Path, tmp_path: Path
     """airl-sitl at four times the speed: a decision takes its trace's time, or a little more."""
     out = tmp_path / "run"
     words = [
-        *(sys.executable, "-m", "airl_mav.cli.sitl", *choose_ports().options()),
+        *(sys.executable, *SITL_WITHOUT_REPORT, *choose_ports().options()),
         *("--policy", POLICY, "--arena", ARENA, "--episodes", "1", "--seed", f"{SEED}"),
         *("--latency", str(trace), "--speed", "4", "--out", str(out)),
     ]

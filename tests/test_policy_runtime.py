@@ -20,7 +20,7 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 
 from policy_kit import SPEC, export_tiny, noise
 from ports import choose_ports
-from processes import ROOT, running
+from processes import ROOT, SITL_WITHOUT_REPORT, running
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
@@ -540,7 +540,7 @@ def test_onnx_flies_without_torch_and_without_a_word(exported: Path, tmp_path: P
 def test_a_learned_policy_flies_a_rehearsal(folder: Path, tmp_path: Path) -> None:
     write_card(folder, read_card(folder).model_copy(update={"hold_s": 0.3, "epsilon": 0.2}))
     run = tmp_path / "run"
-    words = ["-m", "airl_mav.cli.sitl", *choose_ports().options(), "--policy", str(folder)]
+    words = [*SITL_WITHOUT_REPORT, *choose_ports().options(), "--policy", str(folder)]
     words += ["--out", str(run), "--episodes", "2", "--speed", "3", "--time-limit", "4"]
     with running(words, tmp_path) as process:
         process.find_children("firmware", "companion")

@@ -10,11 +10,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tyro
 from flight_rig import quad
 from processes import ROOT, is_running, wait_until
+from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.cli.firmware import FirmwareCommand
@@ -26,6 +28,9 @@ from airl_mav.cli.firmware_options import (
     how_to_start,
     load_timeout_s,
 )
+from airl_mav.cli.parameters import KINDS
+from airl_mav.cli.parameters import run as write_parameters
+from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.errors import UsageError
 from airl_mav.ports import Ports
@@ -376,6 +381,52 @@ def test_modes_of_both_families(kind: int, custom: int, landed: int, mode: Mode)
     assert (flight.mode, flight.phase) == (mode, Phase.AIR)
 
 
+# --- parameters as files
+
+
+def parameters_of(firmware: str, out: Path) -> list[str]:
+    assert write_parameters(ParametersCommand(firmware, out=out)) == 0
+    return out.read_text(encoding="utf-8").splitlines()
+
+
+@pytest.mark.parametrize("firmware", ["px4", "px4-hitl", "ardupilot"])
+def test_firmware_that_is_set_from_the_file_flies_the_vehicle(
+    firmware: str, tmp_path: Path
+) -> None:
+    """Read back as their own tools do, the values are those that are checked on the ground."""
+    lines = parameters_of(firmware, tmp_path / "file")
+    airframe = KINDS[firmware][0](quad())
+    if firmware == "ardupilot":
+        loader = mavparm.MAVParmDict()
+        assert loader.load(str(tmp_path / "file"))
+        held = dict(loader)
+    else:
+        rows = [line.split("\t") for line in lines if not line.startswith("#")]
+        assert {(vehicle, component) for vehicle, component, *_ in rows} == {("1", "1")}
+        held = {name: (int if kind == "6" else float)(v) for _, _, name, v, kind in rows}
+        assert held["CA_ROTOR_COUNT"] == 4
+        assert isinstance(held["CA_ROTOR_COUNT"], int)
+        assert isinstance(held["THR_MDL_FAC"], float)
+    assert set(airframe.names()) - set(held) <= {"NAV_DLL_ACT"}
+    assert airframe.problem(held) is None
+    assert differences(held, airframe.settings) == []
+
+
+def test_another_order_of_motors_is_in_the_file(tmp_path: Path) -> None:
+    profile = tmp_path / "other.toml"
+    order = '["rear left", "front right", "front left", "rear right"]'
+    profile.write_text(f'base = "quad"\n[px4]\nmotors = {order}\n', encoding="utf-8")
+    command = ParametersCommand("px4", vehicle=str(profile), out=tmp_path / "file")
+    assert write_parameters(command) == 0
+    text = (tmp_path / "file").read_text(encoding="utf-8")
+    assert "PWM_MAIN_FUNC1\t102\t6\n1\t1\tPWM_MAIN_FUNC2\t101\t6\n" in text
+
+
+def test_parameters_into_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no folder"):
+        write_parameters(ParametersCommand("px4", out=tmp_path / "x" / "y"))
+
+
 # --- programs and options
 
 
@@ -466,13 +517,18 @@ def test_what_cannot_be_flown_is_told(
 
 
 def test_the_user_is_told_what_to_start() -> None:
-    assert how_to_start(RealFirmwareOptions(px4_connect=True, instance=2), quad(), Ports()) == (
+    def told(**options: Any) -> str | None:
+        return how_to_start(FirmwareCommand(real=RealFirmwareOptions(**options)), quad())
+
+    assert told(px4_connect=True, instance=2) == (
         "PX4_SIM_MODEL=none_iris PX4_SYS_AUTOSTART=10016 build/px4_sitl_default/bin/px4 -i 2"
     )
-    hint = how_to_start(RealFirmwareOptions(ardupilot_connect=True), quad(), Ports())
+    hint = told(ardupilot_connect=True)
     assert hint is not None
+    assert hint.startswith("airl parameters ardupilot --vehicle quad --out vehicle.parm && ")
+    assert "--defaults vehicle.parm" in hint
     assert "--model JSON:127.0.0.1 --sim-port-out 9002" in hint
     assert "--serial2 udpclient:127.0.0.1:14030" in hint
-    assert how_to_start(RealFirmwareOptions(px4_dir=Path("x")), quad(), Ports()) is None
+    assert told(px4_dir=Path("x")) is None
     assert load_timeout_s("builtin", GOOD) is None
     assert load_timeout_s("px4", replace(GOOD, firmware_timeout=10.0)) == 80.0

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from ports import choose_ports
-from processes import ROOT, running, write_arena
+from processes import ROOT, SITL, SITL_WITHOUT_REPORT, running, write_arena
 from pymavlink import mavutil
 
 from airl_mav.latency.samplers import build_sampler
 from airl_mav.profiles.computer import load_computer
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mark.timeout(300)]
 
 EPISODES = 2
 SIX_STAGES = (
@@ -48,9 +48,9 @@ class Done:
             return {key: archive[key] for key in archive.files}
 
 
-def sitl(folder: Path, *options: str) -> Done:
+def sitl(folder: Path, *options: str, report: bool = True) -> Done:
     """Run airl-sitl to its end."""
-    words = ["-m", "airl_mav.cli.sitl", *choose_ports().options()]
+    words = [*(SITL if report else SITL_WITHOUT_REPORT), *choose_ports().options()]
     words += ["--out", str(folder / "run"), *options]
     with running(words, folder) as process:
         process.find_children("firmware", "companion")
@@ -260,7 +260,7 @@ def test_injected_latency(tmp_path: Path) -> None:
 def test_a_crash_is_judged_and_the_run_goes_on(tmp_path: Path) -> None:
     """A storm into the wall: the companion is called off, the next episode starts."""
     storm = ("--wind.east-m-s", "48", "--arena", str(write_arena(tmp_path, 30.0)))
-    run = sitl(tmp_path, *storm, "--episodes", "2", "--speed", "3")
+    run = sitl(tmp_path, *storm, "--episodes", "2", "--speed", "3", report=False)
     assert [episode["outcome"] for episode in run.episodes] == ["collision", "collision"]
     for episode in run.episodes:
         assert "hit " in episode["reason"]

@@ -14,11 +14,21 @@ import numpy as np
 import pytest
 from hitl_peer import HitlPeer
 from ports import LOOPBACK, choose_ports, free_ports
-from processes import ROOT, Running, children_of, is_running, running, wait_until, write_arena
+from processes import (
+    ROOT,
+    SITL,
+    SITL_WITHOUT_REPORT,
+    Running,
+    children_of,
+    is_running,
+    running,
+    wait_until,
+    write_arena,
+)
 from px4_peer import write_build
 from pymavlink import mavutil
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mark.timeout(300)]
 
 SPEED = "6"
 
@@ -42,16 +52,18 @@ def free_instance() -> int:
     raise AssertionError("no instance is free")
 
 
-def sitl(firmware: str, *options: str) -> list[str]:
+def sitl(firmware: str, *options: str, report: bool = False) -> list[str]:
     _, (camera,) = free_ports(0, 1)
     return [
-        *("-m", "airl_mav.cli.sitl", "--firmware", firmware, "--camera-port", str(camera)),
+        *(SITL if report else SITL_WITHOUT_REPORT),
+        *("--firmware", firmware, "--camera-port", str(camera)),
         *("--speed", SPEED, "--episodes", "1", "--out", "run", *options),
     ]
 
 
-def px4(build: Path, *options: str) -> list[str]:
-    return sitl("px4", "--px4-dir", str(build), "--instance", str(free_instance()), *options)
+def px4(build: Path, *options: str, report: bool = False) -> list[str]:
+    instance = ("--instance", str(free_instance()))
+    return sitl("px4", "--px4-dir", str(build), *instance, *options, report=report)
 
 
 def leashed(process: Running) -> list[int]:
@@ -66,6 +78,11 @@ def episode(folder: Path) -> dict[str, object]:
     return flown
 
 
+def setup(folder: Path) -> dict[str, object]:
+    info: dict[str, dict[str, object]] = json.loads((folder / "run" / "run.json").read_text())
+    return info["setup"]
+
+
 def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
     """It dies in its first flight only; the rehearsal takes a new one, and says so."""
     healthy = write_build(tmp_path / "healthy")
@@ -78,7 +95,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
         f"touch {mark}\n{faulty}"
     )
     arena = write_arena(tmp_path, 10.0)
-    with running(px4(build, "--arena", str(arena)), tmp_path) as process:
+    with running(px4(build, "--arena", str(arena), report=True), tmp_path) as process:
         programs = wait_until(lambda: leashed(process), "PX4")
         assert process.wait(250.0) == 0, process.text()
         for pid in programs:
@@ -88,8 +105,8 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
     assert flown["outcome"] == "success"
     (note,) = flown["notes"]
     assert "flown again: the firmware gave up: PX4" in note
-    setup = json.loads((run / "run.json").read_text(encoding="utf-8"))["setup"]
-    assert (setup["level"], setup["firmware"]) == ("firmware", "PX4 SITL")
+    told = setup(tmp_path)
+    assert (told["level"], told["firmware"]) == ("firmware", "PX4 SITL")
     assert "PX4 SITL" in process.text()
     assert "PX4 SITL" in (run / "report.html").read_text(encoding="utf-8")
     assert "peer: simulator on TCP port" in (run / "autopilot.log").read_text(encoding="utf-8")
@@ -149,7 +166,7 @@ def test_a_rehearsal_with_ardupilot(tmp_path: Path) -> None:
     with running(words, tmp_path) as process:
         assert process.wait(250.0) == 0, process.text()
     assert episode(tmp_path)["outcome"] == "success"
-    assert "ArduPilot SITL" in process.text()
+    assert setup(tmp_path)["firmware"] == "ArduPilot SITL"
     assert "Starting sketch" in (tmp_path / "run" / "autopilot.log").read_text(encoding="utf-8")
 
 
@@ -168,7 +185,7 @@ def test_a_rehearsal_with_a_board(tmp_path: Path) -> None:
     finally:
         peer.close()
     assert episode(tmp_path)["outcome"] == "success"
-    assert "PX4 on a board" in process.text()
+    assert setup(tmp_path)["firmware"] == "PX4 on a board"
     assert "CA_ROTOR0_PX = 0.1515 (vehicle: 0.13)" in process.text()
     assert peer.boots > 1  # rebooted before it flew
     assert peer.received["HIL_SENSOR"] > 1000

@@ -14,7 +14,7 @@ import pytest
 from ports import choose_ports
 from processes import ROOT, running
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mark.timeout(400)]
 
 
 @pytest.fixture(scope="module")

@@ -234,7 +234,7 @@ def stand_alone(command: FirmwareCommand) -> int:
     try:
         episode = setup(command, vehicle, command.arena, command.seed, command.seed)
         warm_up(vehicle)
-        hint = how_to_start(command.real, vehicle, command.ports)
+        hint = how_to_start(command, vehicle)
         if hint is not None:
             console.print(f"waiting for {hint}", soft_wrap=True, markup=False, highlight=False)
         firmware.load(episode, command.tlog, unix_us())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -77,6 +78,11 @@ def option_of(name: str) -> str:
 
 class FirmwareWords(Protocol):
     """What a command line says of the flight controller."""
+
+    @property
+    def vehicle(self) -> str:
+        """Its profile."""
+        ...
 
     @property
     def firmware(self) -> FirmwareName:
@@ -177,12 +183,15 @@ def check_program(options: RealFirmwareOptions) -> None:
         ardupilot_program.find_arducopter(options.ardupilot_dir)
 
 
-def how_to_start(options: RealFirmwareOptions, vehicle: VehicleProfile, ports: Ports) -> str | None:
+def how_to_start(command: FirmwareWords, vehicle: VehicleProfile) -> str | None:
     """Return the command with which the user starts what is waited for; None: nothing is."""
+    options, ports = command.real, command.ports
     if options.px4_connect and vehicle.px4 is not None:
         return px4_program.how_to_start(options.instance, vehicle.px4.airframe)
     if options.ardupilot_connect:
         observer = ardupilot_program.OBSERVER_PORT + options.instance
         links = ardupilot_program.Links(ports.api_port, ports.gcs_port, observer)
-        return ardupilot_program.how_to_start(options.instance, links)
+        start = ardupilot_program.how_to_start(options.instance, links)
+        file = shlex.join(["--vehicle", command.vehicle, "--out", ardupilot_program.PARAMETERS])
+        return f"airl parameters ardupilot {file} && {start}"
     return None

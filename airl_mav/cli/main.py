@@ -14,6 +14,7 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.export_command import ExportCommand
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.ladder_command import LadderCommand
+from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.cli.sweep_command import SweepCommand
@@ -40,6 +41,7 @@ SUBCOMMANDS: dict[str, Subcommand] = {
     "export": Subcommand(ExportCommand, "airl_mav.cli.export"),
     "gap": Subcommand(GapCommand, "airl_mav.cli.gap"),
     "ladder": Subcommand(LadderCommand, "airl_mav.cli.ladder"),
+    "parameters": Subcommand(ParametersCommand, "airl_mav.cli.parameters"),
     "profile": Subcommand(ProfileCommand, "airl_mav.cli.profile", needs=()),
     "report": Subcommand(ReportCommand, "airl_mav.cli.report"),
     "sweep": Subcommand(SweepCommand, "airl_mav.cli.sweep"),

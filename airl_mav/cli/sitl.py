@@ -206,7 +206,7 @@ def _say_what_flies(command: SitlCommand, setup: Setup, console: Console) -> Non
     console.print(f"QGC        UDP port {command.ports.gcs_port} (connects by itself)")
     if setup.level == "firmware":
         console.print(f"firmware   {setup.firmware}")
-        hint = how_to_start(command.real, load_vehicle(command.vehicle), command.ports)
+        hint = how_to_start(command, load_vehicle(command.vehicle))
         if hint is not None:
             _say(console, f"           start one for every flight: {hint}")
 

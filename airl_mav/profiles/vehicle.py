@@ -195,13 +195,17 @@ class Estimation(ProfileModel):
 ParameterTable = dict[str, Annotated[float, Strict()]]
 
 
+# Whole numbers stay whole: real firmware has parameters of both types.
+TypedParameterTable = dict[str, Annotated[int, Strict()] | Annotated[float, Strict()]]
+
+
 class RealFirmware(ProfileModel):
     """What real firmware must be set to, to fly this vehicle."""
 
     motors: tuple[Corner, Corner, Corner, Corner] = Field(
         description="which motor hangs on each of the firmware's outputs 1 to 4"
     )
-    parameters: ParameterTable = Field(
+    parameters: TypedParameterTable = Field(
         default_factory=dict, description="set where we start the firmware, checked where not"
     )
 

@@ -31,6 +31,9 @@ GROUND_LOSS = "NAV_DLL_ACT"
 _PX4_MOTOR_1 = 101
 """PX4's output function of motor 1 (docs: Actuator Configuration)."""
 
+_PX4_MULTIROTOR = 0
+"""PX4's CA_AIRFRAME."""
+
 _ARDUPILOT_MOTOR_1 = 33
 """ArduPilot's SERVOn_FUNCTION of motor 1."""
 
@@ -47,6 +50,11 @@ class Airframe(Protocol):
     @property
     def motors(self) -> Sequence[Corner]:
         """Corner of the motor on each of its outputs."""
+        ...
+
+    @property
+    def frame(self) -> Mapping[str, Value]:
+        """What makes the firmware fly such a frame, motors on their outputs: never set by us."""
         ...
 
     @property
@@ -80,6 +88,11 @@ class Px4Airframe:
         self.number = px4.airframe
         """SYS_AUTOSTART."""
         self._output = output
+        self.frame: dict[str, Value] = {
+            "CA_AIRFRAME": _PX4_MULTIROTOR,
+            "CA_ROTOR_COUNT": len(MOTORS),
+            **{output.format(i + 1): _PX4_MOTOR_1 + CORNERS.index(self.motors[i]) for i in MOTORS},
+        }
         self.settings: dict[str, Value] = {
             "THR_MDL_FAC": vehicle.rotor.thrust_curve,
             **vehicle.rotor.px4_geometry(),
@@ -88,14 +101,11 @@ class Px4Airframe:
 
     def names(self) -> list[str]:
         """Return all parameters that must be known."""
-        rotors = [f"CA_ROTOR{i}_{key}" for i in MOTORS for key in ("PX", "PY", "KM")]
-        outputs = [self._output.format(i + 1) for i in MOTORS]
-        frame = ["CA_AIRFRAME", "CA_ROTOR_COUNT", GROUND_LOSS]
-        return list(dict.fromkeys([*frame, *outputs, *rotors, *self.settings]))
+        return [GROUND_LOSS, *self.frame, *self.settings]
 
     def problem(self, held: Mapping[str, Value]) -> str | None:
         """Return what is wrong with the frame that PX4 flies, in words."""
-        if held["CA_AIRFRAME"] != 0 or held["CA_ROTOR_COUNT"] != len(MOTORS):
+        if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
             return (
                 f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
                 f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
@@ -128,19 +138,23 @@ class ArduPilotAirframe:
 
     def __init__(self, ardupilot: ArduPilot) -> None:
         self.motors = ardupilot.motors
-        self._frame: dict[str, int] = {
+        self._kind: dict[str, int] = {
             "FRAME_CLASS": ardupilot.frame_class,
             "FRAME_TYPE": ardupilot.frame_type,
         }
-        self.settings: dict[str, Value] = {**self._frame, **ardupilot.parameters}
+        self.frame: dict[str, Value] = {
+            f"SERVO{i + 1}_FUNCTION": _ARDUPILOT_MOTOR_1 + CORNERS.index(self.motors[i])
+            for i in MOTORS
+        }
+        self.settings: dict[str, Value] = {**self._kind, **ardupilot.parameters}
 
     def names(self) -> list[str]:
         """Return all parameters that must be known."""
-        return [*(f"SERVO{i + 1}_FUNCTION" for i in MOTORS), *self.settings]
+        return [*self.frame, *self.settings]
 
     def problem(self, held: Mapping[str, Value]) -> str | None:
         """Return what is wrong with the frame that ArduCopter flies, in words."""
-        for name, expected in self._frame.items():
+        for name, expected in self._kind.items():
             if held[name] != expected:
                 return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
         for output, corner in enumerate(self.motors, start=1):

@@ -10,6 +10,7 @@ from pathlib import Path
 from airl_mav.location import HOME
 from airl_mav.ports import LOOPBACK
 from firmware_sim.bridges.child import Start
+from firmware_sim.bridges.parameter_file import ardupilot_file
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -92,8 +93,7 @@ def start(
         settings: Parameters, by name.
         folder: Where it runs, and where the file is put.
     """
-    text = "".join(f"{name} {value:g}\n" for name, value in settings.items())
-    (folder / PARAMETERS).write_text(text, encoding="ascii")
+    (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
     return Start(command(str(program), instance, links, PARAMETERS), {})
 
 
