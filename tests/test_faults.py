@@ -561,7 +561,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     ports = choose_ports(ground.port)
     # The watchdog counts simulated time: a busy host would let it be first now and then.
     patient = ("--decision-timeout-s", "6", "--leave-after-s", "6")
-    with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0) as run:
+    with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0, report=True) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
         before = ground.track[-1][0]
