@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord, run_sha256
-from airl_mav.flight.setup import BUILT_IN, Part
+from airl_mav.flight.setup import Part
 from airl_mav.flight.statistics import Estimate
 from airl_mav.harness.run_folder import EPISODES_FILE, LoadedRun
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
@@ -84,7 +84,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
         ("source of t2", injection.source),
         ("assumed of t2", injection.assumed),
         ("level", setup.level),
-        ("firmware", "" if setup.firmware == BUILT_IN else setup.firmware),
+        ("firmware", setup.firmware),
         ("speed", pace),
         ("between commands", setup.between_commands),
         ("sha256 of the flights", run_sha256(run.episodes) or ""),
