@@ -33,6 +33,14 @@ POLL_S = 0.1
 HEALTH_SETTLE_S = 0.5
 """Good health must last so long before arming: more than two of PX4's 5 Hz reports [s]."""
 
+TAKEOFF_REACHED_M = 0.2
+"""Closer than this to the take-off altitude, the climb is over: PX4's last decimetres take seconds,
+its approach halves the rest in 1.4 s."""
+
+OFFBOARD_SETTLE_S = 0.1
+"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know: a
+setpoint that comes within some 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
+
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
@@ -273,15 +281,16 @@ class MavsdkLink:
         while True:
             state = self.kinematics()
             height = start_down - float(state.position[2])
-            if height > 0.85 * altitude_m and abs(float(state.velocity[2])) < 0.3:
+            if height > altitude_m - TAKEOFF_REACHED_M and abs(float(state.velocity[2])) < 0.3:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
             self._pause()
 
     def enter_offboard(self) -> None:
-        """Send a standing setpoint and switch to offboard."""
+        """Send a standing setpoint and switch to offboard; return when setpoints count."""
         self.set_velocity_body(STOP)
         self._call("offboard", self._offboard.start)
+        self._pause(OFFBOARD_SETTLE_S)
 
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""

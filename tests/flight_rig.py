@@ -127,6 +127,8 @@ class Rig:
         self.arm()
         assert self.ap.takeoff(altitude_m) is Result.ACCEPTED
         self.until(lambda: self.mode is Mode.HOLD, 60.0)
+        # Hold climbs the rest: PX4's take-off is over within NAV_MC_ALT_RAD of its altitude.
+        self.until(lambda: self.height > altitude_m - 0.35, 20.0)
         self.run(settle_s)
 
     def go_offboard(self, setpoint: Setpoint) -> None:

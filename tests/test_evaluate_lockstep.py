@@ -252,7 +252,8 @@ def test_killed_at_any_moment_it_goes_on_and_nothing_is_lost_or_doubled(
     out = tmp_path / "run"
     chance = random.Random(5)
     saved = 0
-    for attempt in range(3):
+    # Before anything is saved, and in the middle.
+    for attempt in range(2):
         with evaluating(tmp_path, out) as killed:
             killed.wait_for_workers()
             if attempt:

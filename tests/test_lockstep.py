@@ -45,6 +45,7 @@ from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup
 
 LONG_MS = 200.0
+RERUNS, STOPPED = 6, 2
 
 
 @pytest.fixture(scope="module")
@@ -87,12 +88,13 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
     assert np.all(reference.latency["accepted_us"] > 0), "every decision reached the autopilot"
 
 
-def test_twenty_reruns_under_load_are_the_same(
+def test_reruns_under_load_are_the_same(
     plan: LockstepPlan, policy: Policy, reference: FlownEpisode
 ) -> None:
+    """Some of them; `scripts/lockstep_reruns.py` does a hundred."""
     with busy(3):
-        reruns = [fly(plan, policy, 0, SEED) for _ in range(20)]
-    assert [rerun.record for rerun in reruns] == [reference.record] * 20
+        reruns = [fly(plan, policy, 0, SEED) for _ in range(RERUNS)]
+    assert [rerun.record for rerun in reruns] == [reference.record] * RERUNS
     for rerun in reruns:
         for name, values in reference.trajectory.arrays().items():
             np.testing.assert_array_equal(rerun.trajectory.arrays()[name], values)
@@ -111,12 +113,14 @@ def test_without_the_barrier_reruns_differ(
             del handle
 
     monkeypatch.setattr(stage_module, "ThreadPartner", Hasty)
-    flights = set()
+    flights: set[str] = set()
     with busy(2):
         for _ in range(10):
             record = fly(plan, policy, 0, SEED).record
             assert record.sha256 is not None
             flights.add(record.sha256["flight"])
+            if len(flights) > 1:
+                break
     assert len(flights) > 1
 
 
@@ -143,7 +147,7 @@ def test_earlier_flights_leave_no_trace(
 def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> None:
     """SIGSTOP: MAVSDK's timers run out meanwhile, by the wall clock."""
     moments = np.random.default_rng(5)
-    command = [sys.executable, lockstep_kit.__file__, "4"]
+    command = [sys.executable, lockstep_kit.__file__, f"{STOPPED}"]
     environment = {**os.environ, "PYTHONPATH": str(Path.cwd())}
     fingerprints = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as child:
@@ -161,7 +165,7 @@ def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> No
         finally:
             child.kill()
     assert reference.record.sha256 is not None
-    assert fingerprints == [reference.record.sha256["flight"]] * 4
+    assert fingerprints == [reference.record.sha256["flight"]] * STOPPED
 
 
 def test_pace_changes_nothing(plan: LockstepPlan, policy: Policy, reference: FlownEpisode) -> None:
@@ -281,10 +285,10 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
             stage.run(setup, lambda: program(stage), linger_us=12 * US_PER_S)
         return found
 
-    by_speed = {speed: events(speed) for speed in (None, 40.0, 12.0)}
+    by_speed = {speed: events(speed) for speed in (None, 60.0, 20.0)}
     assert any(word.lower() in text.lower() for _, text in by_speed[None]), by_speed[None]
-    assert by_speed[40.0] == by_speed[None]
-    assert by_speed[12.0] == by_speed[None]
+    assert by_speed[60.0] == by_speed[None]
+    assert by_speed[20.0] == by_speed[None]
 
 
 def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:

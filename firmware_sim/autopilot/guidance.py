@@ -10,6 +10,7 @@ from airl_mav.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.control.cascade import Demand
 from airl_mav.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.climb import Climb, ClimbLimits
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.state import Mode, Setpoint
@@ -21,11 +22,15 @@ FALLBACK_DESCENT_M_S = 0.75
 """Descent in Position mode without a pilot's sticks (measured on PX4 1.16). It stays level: drag
 alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
 
-TAKEOFF_REACHED_M = 0.2
-"""Closer than this to the take-off altitude, take-off is done."""
+RETURN_HEIGHT_REACHED_M = 0.2
+"""Closer than this to the height of return, its climb is done."""
+
+SETTLED_M = 0.01
+"""Closer than this to the take-off altitude, it is held like any other."""
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _TAKEOFF, _OFFBOARD, _LAND = Mode.TAKEOFF, Mode.OFFBOARD, Mode.LAND
+_HOLD = Mode.HOLD
 _RETURN, _POSITION = Mode.RETURN, Mode.POSITION
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 
@@ -61,7 +66,11 @@ class Guidance:
         self._anchor = Anchor((0.0, 0.0, 0.0), 0.0)
         self._braking = False
         self._return_leg = 0
+        self._climb = Climb()
+        self._settling = False
+        """Take-off is done, its altitude not yet reached."""
         self._spool_since_us: int | None = None
+        self._now_us = 0
         self._home: Vec = (0.0, 0.0, 0.0)
         self._offboard: Demand | None = None
         self.takeoff_altitude_m = 0.0
@@ -69,7 +78,14 @@ class Guidance:
 
     def enter(self, mode: Mode, state: Vector) -> None:
         """A new mode begins here and now."""
-        self._mode = mode
+        if mode is _HOLD and self.takeoff_done(state):
+            # Hold goes on to the altitude, above the place where take-off began.
+            north, east, _ = self._anchor.position
+            self._mode, self._settling, self._braking = mode, True, False
+            self._anchor.position = north, east, self._home[2] - self.takeoff_altitude_m
+            return
+        self._mode, self._settling = mode, False
+        self._climb.restart(max(0.0, -state.item(V + 2)))
         self._anchor = Anchor(_triple(state, P), quat_yaw(state[Q:RATES]))
         self._braking = mode is Mode.HOLD
         self._return_leg = 0
@@ -88,13 +104,19 @@ class Guidance:
         )
 
     def takeoff_done(self, state: Vector) -> bool:
-        """Return whether a take-off has reached its altitude."""
+        """Return whether a take-off has come near its altitude, by PX4's acceptance radius.
+
+        Source: PX4 1.16, MissionBlock; half of an altitude that is smaller than the radius.
+        """
         if self._mode is not _TAKEOFF:
             return False
-        return self._height(state) > self.takeoff_altitude_m - TAKEOFF_REACHED_M
+        altitude, radius = self.takeoff_altitude_m, self._value("NAV_MC_ALT_RAD")
+        near = altitude / 2.0 if altitude < radius else radius
+        return self._height(state) > altitude - near
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> Demand | None:
         """Return what to fly now; None = the motors stand still."""
+        self._now_us = time_us
         if phase is _AIR:
             self._spool_since_us = None
             return self._flown(state)
@@ -127,6 +149,7 @@ class Guidance:
         if ramp_s > 0.0:
             share = min(1.0, ramp_s / max(value("MPC_TKO_RAMP_T"), 1e-3))
             limit += share * (value("MPC_TKO_SPEED") - limit)
+        self._climb.restart(max(0.0, limit))
         position, velocity, yaw, yaw_rate = demand
         down = -limit if math.isnan(velocity[2]) else max(velocity[2], -limit)
         return Demand(
@@ -155,6 +178,8 @@ class Guidance:
     def _hold(self, state: Vector) -> Demand:
         """Brake first, then hold the place where the vehicle came to rest."""
         anchor = self._anchor
+        if self._settling:
+            return self._settle()
         if self._braking:
             anchor.position = _triple(state, P)
             if math.hypot(*_triple(state, V)) > 0.3:
@@ -173,10 +198,41 @@ class Guidance:
         return Demand((north, east, NAN), (NAN, NAN, vertical), self._anchor.yaw, NAN)
 
     def _takeoff(self, state: Vector) -> Demand:
-        target = self._home[2] - self.takeoff_altitude_m
-        # Aim a little above: the P law alone would take for ever over the last centimetres.
-        speed = self._vertical(state, target - 0.5, self._value("MPC_TKO_SPEED"))
-        return self._above_anchor(speed)
+        # The trajectory stays where the vehicle is: it must not wait below the ground while the
+        # thrust ramps up, nor be chased after it.
+        self._climb.height_m = self._height(state)
+        self._climb_on()
+        return self._above_anchor(-self._climb.speed_m_s)
+
+    def _settle(self) -> Demand:
+        """Hold's way from the end of a take-off to its altitude."""
+        climb = self._climb
+        self._climb_on()
+        north, east, _ = self._anchor.position
+        self._settling = abs(self.takeoff_altitude_m - climb.height_m) > SETTLED_M
+        return Demand(
+            (north, east, self._home[2] - climb.height_m),
+            (NAN, NAN, -climb.speed_m_s),
+            self._anchor.yaw,
+            NAN,
+        )
+
+    def _climb_on(self) -> None:
+        """Move the trajectory on towards the take-off altitude."""
+        climb, target = self._climb, self.takeoff_altitude_m
+        limits = self._limits(climb.height_m, up=target > climb.height_m)
+        climb.towards(target, limits, self._now_us)
+
+    def _limits(self, height: float, *, up: bool) -> ClimbLimits:
+        """Return what bounds a climb: PX4's FlightTaskAuto, gentle where a take-off begins."""
+        value, jerk = self._value, self._value("MPC_JERK_AUTO")
+        if not up:
+            return ClimbLimits(value("MPC_Z_V_AUTO_DN"), value("MPC_ACC_DOWN_MAX"), jerk)
+        speed, acceleration = value("MPC_Z_V_AUTO_UP"), value("MPC_ACC_UP_MAX")
+        if self._mode is _TAKEOFF and height < value("MPC_LAND_ALT1"):
+            speed = value("MPC_TKO_SPEED")
+            acceleration = min(acceleration, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
+        return ClimbLimits(speed, acceleration, jerk)
 
     def _land(self, state: Vector) -> Demand:
         speed = self._landing_speed(self._height(state))
@@ -210,7 +266,7 @@ class Guidance:
         if self._return_leg == 0:
             height = self._height(state)
             target = max(value("RTL_RETURN_ALT"), height)
-            if height > target - TAKEOFF_REACHED_M or away < value("NAV_ACC_RAD"):
+            if height > target - RETURN_HEIGHT_REACHED_M or away < value("NAV_ACC_RAD"):
                 self._return_leg = 1
                 anchor.position = position
             climb = self._vertical(state, home[2] - target - 0.5, value("MPC_Z_VEL_MAX_UP"))

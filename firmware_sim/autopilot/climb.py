@@ -1,0 +1,59 @@
+"""How fast the automatic modes climb and sink towards a height.
+
+Source: PX4 1.16, `PositionSmoothing` on the vertical axis and `computeMaxSpeedFromDistance`
+(lib/motion_planning, TrajMath.hpp). The jerk limit of the speed itself is left out: it delays a
+change of speed by a tenth of a second.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from airl_mav.constants import US_PER_S
+
+
+class ClimbLimits(NamedTuple):
+    """What bounds a vertical movement."""
+
+    speed_m_s: float
+    acceleration_m_s2: float
+    jerk_m_s3: float
+
+
+def approach_speed(distance_m: float, limits: ClimbLimits) -> float:
+    """Return the greatest speed [m/s] that can still be braked within a distance [m] >= 0."""
+    _, a, jerk = limits
+    b = 4.0 * a * a / jerk
+    return min(limits.speed_m_s, 0.5 * (math.sqrt(b * b + 8.0 * a * distance_m) - b))
+
+
+class Climb:
+    """A vertical trajectory towards a height; its speed changes no faster than its limits."""
+
+    def __init__(self) -> None:
+        self.height_m = 0.0
+        """Where it is."""
+        self.speed_m_s = 0.0
+        """Upwards."""
+        self._time_us: int | None = None
+
+    def restart(self, speed_m_s: float) -> None:
+        """Go on from a speed."""
+        self.speed_m_s, self._time_us = speed_m_s, None
+
+    def towards(self, height_m: float, limits: ClimbLimits, time_us: int) -> None:
+        """Move on to a time.
+
+        Args:
+            height_m: Where to.
+            limits: Of this movement.
+            time_us: Simulated time, rising from call to call [µs].
+        """
+        elapsed_s = 0.0 if self._time_us is None else (time_us - self._time_us) / US_PER_S
+        self._time_us = time_us
+        self.height_m += self.speed_m_s * elapsed_s
+        left_m = height_m - self.height_m
+        wanted = math.copysign(approach_speed(abs(left_m), limits), left_m)
+        most = limits.acceleration_m_s2 * elapsed_s
+        self.speed_m_s += min(most, max(-most, wanted - self.speed_m_s))
