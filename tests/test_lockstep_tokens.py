@@ -42,7 +42,7 @@ from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
 
-pytestmark = [pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.xdist_group("tokens"), pytest.mark.timeout(300)]
 
 SEED, ARENA = 1, "static-obstacles"
 LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
