@@ -369,7 +369,7 @@ def test_it_hovers_and_lands() -> None:
         stage.run(0.1)
         assert stage.bridge.armed
         assert copter.takeoff(2.0) is Result.ACCEPTED
-        stage.run(7.0)
+        stage.run(12.0)
         assert -sim.truth.position[2] == pytest.approx(2.0, abs=0.3)
         assert np.linalg.norm(sim.truth.velocity) < 0.2
         copter.set_mode(LAND)
