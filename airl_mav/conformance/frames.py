@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.conformance.air import FACING_EAST_DEG, FLY_S, MODE_S, STANDING_M_S, velocity
+from airl_mav.conformance.air import FACING_EAST_DEG, FLY_S, MODE_S, STANDING_M_S
 from airl_mav.conformance.checks import Checklist, require
 from airl_mav.conformance.family import Reaction
 from airl_mav.conformance.raw import (
@@ -127,11 +127,17 @@ def _trial(session: Session, stream: RawStream, probe: Probe) -> Callable[[], st
 
 
 def _nan(session: Session, stream: RawStream) -> str:
-    """A velocity of NaN: neither flown nor taken for a lost signal."""
+    """A velocity of NaN: neither flown nor taken for a lost signal.
+
+    Judged by the way of the last second: ArduCopter starts its mode anew with each such setpoint,
+    and swings about its place with up to 0.6 m/s.
+    """
     stream.fly(RawSetpoint(LOCAL_NED, VELOCITY, vx=None))
     session.transcript.say("sent", "SET_POSITION_TARGET_LOCAL_NED vx NaN for 2 s")
     session.let(BACK_S)
-    mode, (north, east, down) = session.mode, velocity(session)
+    mode, motion = session.mode, session.inbox.recent(BACK_S / 2).motion
+    require(len(motion) > 1, "no LOCAL_POSITION_NED")
+    north, east, down = (motion[-1, 1:4] - motion[0, 1:4]) / (motion[-1, 0] - motion[0, 0])
     stream.fly(STILL_EAST)
     session.let(BACK_S / 2)
     finding = f"{session.inbox.mode_name(mode)}, ({north:.2f}, {east:.2f}, {down:.2f}) m/s"
