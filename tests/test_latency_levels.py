@@ -113,11 +113,13 @@ def test_two_processes_are_as_late_in_simulated_time(trace: Path, tmp_path: Path
     ]
     done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    taken = t2_us(load(out), 0)
+    run = load(out)
+    taken = t2_us(run, 0)
     assert len(taken) > 5
     told = expected_us(1e3 * TRACE_MS[draw_of(SEED)], len(taken))
-    # Sleeping ends late on a busy machine, never early.
-    assert (taken >= told - 1).all()
+    # Sleeping ends late on a busy machine, never early; where the host gave up time, the
+    # simulator's clock has seen less of it.
+    assert (taken >= told - 1 - run.episodes[0].slipped_us).all()
 
 
 def draw_of(seed: int) -> int:
