@@ -149,6 +149,7 @@ class Guidance:
         if ramp_s > 0.0:
             share = min(1.0, ramp_s / max(value("MPC_TKO_RAMP_T"), 1e-3))
             limit += share * (value("MPC_TKO_SPEED") - limit)
+        # Off the floor, the climb goes on from the ramp.
         self._climb.restart(max(0.0, limit))
         position, velocity, yaw, yaw_rate = demand
         down = -limit if math.isnan(velocity[2]) else max(velocity[2], -limit)
