@@ -21,14 +21,14 @@ from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import render
-from airl_mav.frames import (
+from airl_mav.core.frames import (
     ned_to_enu,
     quat_from_euler,
     quat_ned_frd_to_enu_flu,
     quat_to_matrix,
     quat_wxyz_to_xyzw,
 )
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 
 SIZES = ((32, 24), (64, 48), (128, 96))
 OBSTACLES = (0, 10, 50)

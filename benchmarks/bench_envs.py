@@ -62,7 +62,7 @@ def measure_ours() -> list[Result]:
     from airl_mav.arena.generate import generate
     from airl_mav.camera.intrinsics import Intrinsics
     from airl_mav.camera.render import Mount
-    from airl_mav.constants import TICK_S, TICK_US
+    from airl_mav.core.constants import TICK_S, TICK_US
     from airl_mav.envs.arenas import batch_of
     from airl_mav.envs.camera import lens_of, look
     from airl_mav.envs.fleet import Rules, Verdict, hover, new_fleet, vehicle_of

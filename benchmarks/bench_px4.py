@@ -22,21 +22,21 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from airl_mav.clock import SimClock
-from airl_mav.constants import US_PER_S
-from airl_mav.ports import LOOPBACK
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.bridges.child import FirmwareChild, Start
-from firmware_sim.bridges.px4 import Px4Bridge
-from firmware_sim.bridges.px4_program import (
+from firmware_sim.external.process.child import FirmwareChild, Start
+from firmware_sim.external.px4.program import (
     API_LOCAL_PORT,
     API_PORT,
     SIMULATOR_PORT,
     environment,
     find_px4,
 )
-from firmware_sim.bridges.tcp_port import TcpPort
+from firmware_sim.external.px4.simulator import Px4Bridge
+from firmware_sim.external.transport.tcp_port import TcpPort
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
@@ -162,8 +162,8 @@ def flight(
         if options.px4_dir is not None:
             start = find_px4(options.px4_dir).start(instance, AIRFRAME, folder)
         else:
-            peer = [sys.executable, str(ROOT / "tests/px4_peer.py"), "-i", str(instance)]
-            start = Start(peer, environment(AIRFRAME))
+            peer = [sys.executable, str(ROOT / "tests/support/px4_peer.py"), "-i", str(instance)]
+            start = Start(peer, {**environment(AIRFRAME), "PYTHONPATH": str(ROOT)})
         if mode == "unpaced":
             start = replace(start, environment={**start.environment, "PX4_SIM_SPEED_FACTOR": "10"})
         child = FirmwareChild("PX4", start, folder, folder / "px4.txt")

@@ -23,12 +23,12 @@ from rich.table import Table
 
 from airl_mav.cli.lockstep import lockstep_plan, policies
 from airl_mav.cli.sitl_command import SitlCommand, check
-from airl_mav.clock import SimClock
-from airl_mav.constants import TICK_S, TICK_US, US_PER_S
-from airl_mav.harness.lockstep.digest import FlightDigest
-from airl_mav.harness.lockstep.flight import LockstepPlan, fly
-from airl_mav.harness.lockstep.link import lockstep_link
-from airl_mav.harness.lockstep.threaded import ThreadPartner
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
+from airl_mav.lockstep.digest import FlightDigest
+from airl_mav.lockstep.flight import LockstepPlan, fly
+from airl_mav.lockstep.link import lockstep_link
+from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle

@@ -30,7 +30,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.cli import profile_bare, profile_hil
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.profile_plan import ProfilePlan, planned
-from airl_mav.clock import WallClock
+from airl_mav.core.clock import WallClock
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation

@@ -9,7 +9,7 @@ from typing import Protocol
 import zmq
 
 from airl_mav.camera.frame import Frame, FrameError
-from airl_mav.clock import Clock, WallClock
+from airl_mav.core.clock import Clock, WallClock
 
 
 @dataclass(frozen=True)

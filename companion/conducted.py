@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from typing import TypeAlias
 
-from airl_mav.clock import Clock
+from airl_mav.core.clock import Clock
 from companion.watchdog import Watchdog
 
 Sleep: TypeAlias = "Callable[[int, threading.Event | None], None]"

@@ -8,9 +8,9 @@ from typing import Any
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
 from mavsdk.logging import log_subscribe
 
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from companion.interfaces import LinkError
 
 SLICE_S = 0.5

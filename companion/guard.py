@@ -6,7 +6,7 @@ import faulthandler
 import threading
 from typing import Protocol
 
-from airl_mav.clock import Clock
+from airl_mav.core.clock import Clock
 from companion.watchdog import Watchdog
 
 POLL_US = 10_000

@@ -19,8 +19,8 @@ from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspee
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import LandedState, Telemetry, TelemetryError
 
-from airl_mav.clock import Clock, WallClock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion import raw_bytes
 from companion.connection import first_autopilot, open_connection

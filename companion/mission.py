@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.clock import Clock
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import Clock
+from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from airl_mav.camera.frame import Frame
-from airl_mav.clock import Clock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action, Policy, limited, vertical_speed

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 
-from airl_mav.clock import NS_PER_US
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import NS_PER_US
+from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.clock_offset import Exchanges
 from companion.link import MavsdkLink
 

@@ -6,8 +6,8 @@ its turn, which names the newest one that has reached it.
 
 from __future__ import annotations
 
-from airl_mav.clock import Clock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 from companion.camera import FrameSource, ReceivedFrame
 from companion.conducted import Abandoned
 from companion.token_clock import TokenTurns

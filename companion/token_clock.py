@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from airl_mav.clock import Clock, SimClock
+from airl_mav.core.clock import Clock, SimClock
 from companion.conducted import Abandoned
 from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
 

@@ -16,8 +16,8 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-from airl_mav.clock import Clock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 from companion.interfaces import STOP, BodyVelocity, Link, LinkError
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from airl_mav.camera.frame import Frame
-from airl_mav.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.state import Message
 from firmware_sim.flight_controller import FlightController

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from firmware_sim.interfaces import Autopilot, Truth
 
 if TYPE_CHECKING:  # Who only looks for a program need not load an estimator.

@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.frames import Geodetic
+from airl_mav.core.frames import Geodetic
 
 Vector = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.clock import Clock, SimClock, WallClock
+from airl_mav.core.clock import Clock, SimClock, WallClock
 
 MAX_LAG_US = 200_000
 """Further behind than this, simulated time gives up the difference instead of racing through it:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.atomic import save_arrays
 from airl_mav.camera.frame import Frame
-from airl_mav.clock import Clock
+from airl_mav.core.clock import Clock
+from airl_mav.core.files import save_arrays
 from airl_mav.flight.trajectory import TrajectoryRecorder
 from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot

@@ -7,7 +7,7 @@ disk. Either way it must not happen in flight: a tick has 4 ms.
 from __future__ import annotations
 
 from airl_mav.arena.generate import generate
-from airl_mav.clock import SimClock
+from airl_mav.core.clock import SimClock
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile

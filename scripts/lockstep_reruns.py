@@ -118,8 +118,8 @@ def fly(command: Reruns, flights: int) -> None:
     """Fly, and print when each flight begins and what its fingerprint is."""
     from airl_mav.cli.lockstep import lockstep_plan, policies
     from airl_mav.cli.sitl_command import SitlCommand, check
-    from airl_mav.harness.lockstep.flight import Watching
-    from airl_mav.harness.lockstep.flight import fly as fly_episode
+    from airl_mav.lockstep.flight import Watching
+    from airl_mav.lockstep.flight import fly as fly_episode
 
     flown = SitlCommand(
         policy=command.policy, arena=command.arena, seed=command.seed, lockstep=True

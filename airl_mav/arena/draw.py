@@ -20,7 +20,7 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape, Tour
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 FLOOR_COLOUR = "#f8f7f4"
 GRID_COLOUR = "#e4e1da"

@@ -21,7 +21,7 @@ from airl_mav.arena.passage import passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, draw_place, place_all
 from airl_mav.arena.tours import draw_tour
 from airl_mav.arena.zones import draw_goal, zone_radius_m
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 
 LAYOUTS = 20

@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 
 class Shape(IntEnum):

@@ -9,7 +9,7 @@ import numpy as np
 from airl_mav.arena.footprints import Boxes, Floats, inner, outside_all
 from airl_mav.arena.geometry import Bounds
 from airl_mav.arena.placement import BATCH, BATCHES
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 
 

@@ -30,7 +30,7 @@ from airl_mav.camera.projection import (
     bounding_rectangle,
     dot,
 )
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 _BOX: Final = int(Shape.BOX)

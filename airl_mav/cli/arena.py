@@ -13,8 +13,8 @@ from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.zones import zone_of
 from airl_mav.cli.arena_command import ArenaCommand
-from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 

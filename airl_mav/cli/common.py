@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from airl_mav.errors import UsageError
-from airl_mav.ports import Ports
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import Ports
 
 if TYPE_CHECKING:  # The companion shares this module, and not the simulator.
     from firmware_sim.plant.wind import WindSettings

@@ -8,7 +8,6 @@ import threading
 import tyro
 from rich.console import Console
 
-from airl_mav.atomic import save_arrays
 from airl_mav.cli import companion_lockstep
 from airl_mav.cli.common import (
     EXIT_BROKEN,
@@ -26,8 +25,9 @@ from airl_mav.cli.companion_command import (
     watchdog_settings,
 )
 from airl_mav.cli.companion_service import serve
-from airl_mav.clock import WallClock
-from airl_mav.cpu_quota import held_to
+from airl_mav.core.clock import WallClock
+from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.files import save_arrays
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
 from companion.interfaces import LinkError

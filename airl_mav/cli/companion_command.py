@@ -18,9 +18,9 @@ from airl_mav.cli.common import (
     GREATEST_SEED,
     check_range,
 )
-from airl_mav.clock import Clock
-from airl_mav.cpu_quota import check_permitted
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import Clock
+from airl_mav.core.cpu_quota import check_permitted
+from airl_mav.core.errors import UsageError
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.latency.source import select_injection

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 
-from airl_mav.constants import US_PER_MS
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.envs.spec import Delay
-from airl_mav.harness.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.latency.samplers import FixedSampler, LatencySampler
+from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.policy.actions import Policy
 from companion.camera import ZmqFrameSource
 from companion.conducted import ConductedClock

@@ -11,17 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from airl_mav.atomic import save_arrays
-from airl_mav.channel import (
-    Abort,
-    ChildChannel,
-    Ended,
-    Failed,
-    Fly,
-    Progress,
-    Ready,
-    Shutdown,
-)
 from airl_mav.cli import companion_lockstep
 from airl_mav.cli.common import (
     EXIT_BROKEN,
@@ -38,12 +27,23 @@ from airl_mav.cli.companion_command import (
     opened,
     watchdog_settings,
 )
-from airl_mav.clock import WallClock
-from airl_mav.cpu_quota import held_to
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import WallClock
+from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import save_arrays
 from airl_mav.latency.samplers import latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.rehearsal.channel import (
+    Abort,
+    ChildChannel,
+    Ended,
+    Failed,
+    Fly,
+    Progress,
+    Ready,
+    Shutdown,
+)
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
 from companion.interfaces import LinkError

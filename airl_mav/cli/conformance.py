@@ -12,7 +12,6 @@ from rich.console import Console
 
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, check_range
 from airl_mav.cli.conformance_command import ConformanceCommand
-from airl_mav.clock import WallClock
 from airl_mav.conformance.checks import Checklist
 from airl_mav.conformance.reference import AUTO, load_reference
 from airl_mav.conformance.report import as_data, check_table, line_text, step_table, verdict
@@ -20,8 +19,9 @@ from airl_mav.conformance.sequence import Examination, Findings, examine
 from airl_mav.conformance.session import Session
 from airl_mav.conformance.steps import STEP_NAMES, StepName
 from airl_mav.conformance.transcript import Line, Transcript
-from airl_mav.errors import UsageError
-from airl_mav.versioned import write_json
+from airl_mav.core.clock import WallClock
+from airl_mav.core.errors import UsageError
+from airl_mav.core.versioned import write_json
 
 STYLES = {"sent": "cyan", "heard": "", "check": "bold", "note": "dim"}
 

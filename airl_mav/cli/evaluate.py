@@ -12,15 +12,15 @@ from airl_mav.cli import report
 from airl_mav.cli.common import GREATEST_SEED, check_draws, check_range
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.report_command import ReportCommand
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import run_sha256
 from airl_mav.flight.statistics import aggregate
-from airl_mav.harness.run_folder import RUN_FILE
-from airl_mav.harness.workers import GREATEST_WORKERS
 from airl_mav.policy.card import Result as CardResult
 from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.rehearsal.run_folder import RUN_FILE
+from airl_mav.rehearsal.workers import GREATEST_WORKERS
 from airl_mav.report.matrix import (
     MATRIX_FILE,
     MATRIX_TABLE_FILE,

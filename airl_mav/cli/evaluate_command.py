@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from airl_mav.ports import Ports
+from airl_mav.core.ports import Ports
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,12 @@ from airl_mav.cli.common import check_range
 from airl_mav.cli.companion_command import PilotOptions, chance, pilot_settings
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_settings import policy_part, seeds, settings
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import LearnedPilots, Pilots, SinglePilots
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
-from airl_mav.harness.evaluation import Evaluation
-from airl_mav.harness.evaluation_gym import GymPlan
 from airl_mav.latency.injection import without_timing
 from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
@@ -23,6 +21,8 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo, find_policy, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import Camera, load_vehicle
+from airl_mav.rehearsal.evaluation import Evaluation
+from airl_mav.rehearsal.evaluation_gym import GymPlan
 
 GREATEST_SLOTS = 4096
 """Flights at a time: more would fill gigabytes with paths."""

@@ -9,14 +9,14 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_settings import policy_part, seeds, settings
 from airl_mav.cli.lockstep import lockstep_plan, policies
 from airl_mav.cli.sitl_command import SitlCommand, check
-from airl_mav.harness.evaluation import Evaluation, Job
-from airl_mav.harness.evaluation_lockstep import Fly, LockstepRun
-from airl_mav.harness.lockstep.flight import LockstepPlan, fly
-from airl_mav.harness.run_folder import FlownEpisode, RunFolder
-from airl_mav.harness.workers import GREATEST_WORKERS
+from airl_mav.core.provenance import usable_cores
+from airl_mav.lockstep.flight import LockstepPlan, fly
 from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.provenance import usable_cores
+from airl_mav.rehearsal.evaluation import Evaluation, Job
+from airl_mav.rehearsal.evaluation_lockstep import Fly, LockstepRun
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.rehearsal.workers import GREATEST_WORKERS
 from companion.pilot import PilotSettings
 from firmware_sim.warm_up import warm_up
 

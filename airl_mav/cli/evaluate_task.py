@@ -19,13 +19,13 @@ from airl_mav.cli.evaluate_lockstep import plan_lockstep
 from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.evaluation import Evaluation, Watch, open_folder
-from airl_mav.harness.evaluation_gym import fly_gym
-from airl_mav.harness.evaluation_lockstep import fly_lockstep
-from airl_mav.harness.lock import locked
-from airl_mav.harness.run_folder import RunFolder, load
-from airl_mav.harness.workers import WorkerError
 from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.rehearsal.evaluation import Evaluation, Watch, open_folder
+from airl_mav.rehearsal.evaluation_gym import fly_gym
+from airl_mav.rehearsal.evaluation_lockstep import fly_lockstep
+from airl_mav.rehearsal.lock import locked
+from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.rehearsal.workers import WorkerError
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
 from companion.watchdog import WatchdogSettings

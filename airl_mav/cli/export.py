@@ -11,13 +11,13 @@ from rich.console import Console
 
 from airl_mav.cli.common import check_train_installed
 from airl_mav.cli.export_command import ExportCommand
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import package_versions
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyFacts, Training
 from airl_mav.policy.layouts import ObservationSpec
 from airl_mav.profiles.loading import explain
-from airl_mav.provenance import package_versions
 
 
 def run(command: ExportCommand, console: Console | None = None) -> int:

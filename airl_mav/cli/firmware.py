@@ -15,7 +15,6 @@ import tyro
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
-from airl_mav.channel import ChildChannel, Failed, LoadEpisode, Ready, Shutdown
 from airl_mav.cli import firmware_lockstep
 from airl_mav.cli.common import (
     EXIT_BROKEN,
@@ -37,14 +36,15 @@ from airl_mav.cli.firmware_options import (
     how_to_start,
 )
 from airl_mav.cli.firmware_service import Bench, Service, WallBench, unix_us
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
-from airl_mav.harness.lockstep.errors import LockstepError
-from airl_mav.ports import LOOPBACK, Ports
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK, Ports
+from airl_mav.lockstep.errors import LockstepError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.rehearsal.channel import ChildChannel, Failed, LoadEpisode, Ready, Shutdown
 from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware

@@ -8,22 +8,28 @@ from functools import partial
 from pathlib import Path
 
 from airl_mav.cli.firmware_options import FirmwareName, RealFirmwareOptions
-from airl_mav.clock import WallClock
-from airl_mav.errors import UsageError
-from airl_mav.ports import LOOPBACK, Ports
+from airl_mav.core.clock import WallClock
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK, Ports
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.bridges import ardupilot_program, px4_program
-from firmware_sim.bridges.airframe import HITL_OUTPUT, SITL_OUTPUT, ardupilot_airframe, px4_airframe
-from firmware_sim.bridges.ardupilot import ArdupilotBridge
-from firmware_sim.bridges.ardupilot_program import Links, find_arducopter
-from firmware_sim.bridges.avionics import BridgedAvionics, Launcher
-from firmware_sim.bridges.launch_hitl import HitlLauncher, clients_of
-from firmware_sim.bridges.launch_sitl import SitlLauncher
-from firmware_sim.bridges.observer import Observer
-from firmware_sim.bridges.px4 import Px4Bridge
-from firmware_sim.bridges.px4_program import find_px4
-from firmware_sim.bridges.router import Router, RouterEnd
-from firmware_sim.bridges.workplace import Workplace
+from firmware_sim.external.airframe import (
+    HITL_OUTPUT,
+    SITL_OUTPUT,
+    ardupilot_airframe,
+    px4_airframe,
+)
+from firmware_sim.external.ardupilot import program as ardupilot_program
+from firmware_sim.external.ardupilot.program import Links, find_arducopter
+from firmware_sim.external.ardupilot.simulator import ArdupilotBridge
+from firmware_sim.external.avionics import BridgedAvionics, Launcher
+from firmware_sim.external.observer import Observer
+from firmware_sim.external.process.sitl_launcher import SitlLauncher
+from firmware_sim.external.process.working_folder import Workplace
+from firmware_sim.external.px4 import program as px4_program
+from firmware_sim.external.px4.hitl_launcher import HitlLauncher, clients_of
+from firmware_sim.external.px4.program import find_px4
+from firmware_sim.external.px4.simulator import Px4Bridge
+from firmware_sim.external.transport.router import Router, RouterEnd
 from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
 from firmware_sim.mavlink.px4_links import Px4Ends
 

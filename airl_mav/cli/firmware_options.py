@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from airl_mav.cli.common import check_range
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import Ports
 from airl_mav.flight.setup import BUILT_IN
-from airl_mav.ports import Ports
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.bridges import ardupilot_program, px4_program
+from firmware_sim.external.ardupilot import program as ardupilot_program
+from firmware_sim.external.px4 import program as px4_program
 
 FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
 

@@ -10,7 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from airl_mav.channel import (
+from airl_mav.core.clock import utc_now
+from airl_mav.core.constants import US_PER_S
+from airl_mav.rehearsal.channel import (
     ChildChannel,
     FinishEpisode,
     Loaded,
@@ -19,9 +21,7 @@ from airl_mav.channel import (
     Shutdown,
     Text,
 )
-from airl_mav.clock import utc_now
-from airl_mav.constants import US_PER_S
-from airl_mav.harness.state import state_of
+from airl_mav.rehearsal.state import state_of
 from firmware_sim import firmware
 from firmware_sim.autopilot.state import Message
 from firmware_sim.crash import CrashWatch

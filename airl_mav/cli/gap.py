@@ -10,9 +10,9 @@ from rich.console import Console
 
 from airl_mav.cli.common import GREATEST_SEED, check_range
 from airl_mav.cli.gap_command import GapCommand
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
-from airl_mav.harness.workers import GREATEST_WORKERS
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.rehearsal.workers import GREATEST_WORKERS
 
 if TYPE_CHECKING:
     from airl_mav.cli.cells import FlownCell

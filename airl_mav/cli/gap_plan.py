@@ -17,8 +17,8 @@ from airl_mav.cli.gap_command import (
     NOT_MITIGATED,
     GapCommand,
 )
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.spec import Delay
-from airl_mav.errors import UsageError
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer

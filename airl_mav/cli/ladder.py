@@ -10,11 +10,11 @@ from rich.console import Console
 from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_draws, check_range
 from airl_mav.cli.evaluate import DEFAULT_ARENA
 from airl_mav.cli.ladder_command import LadderCommand
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
-from airl_mav.harness.run_folder import RUN_FILE
-from airl_mav.harness.workers import GREATEST_WORKERS
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
 from airl_mav.policy.registry import find_policy
+from airl_mav.rehearsal.run_folder import RUN_FILE
+from airl_mav.rehearsal.workers import GREATEST_WORKERS
 from airl_mav.report.matrix import MATRIX_FILE
 
 FACTS = ("vehicle", "computer", "workload", "latency", "seed")

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 from airl_mav.cli.companion_command import chance, hover_after_s
 from airl_mav.cli.sitl_command import ARRIVAL_SHARE, SitlCommand
-from airl_mav.constants import US_PER_MS
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.envs.spec import Delay
 from airl_mav.flight.setup import Setup
-from airl_mav.harness.lockstep.flight import LockstepPlan
+from airl_mav.lockstep.flight import LockstepPlan
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import find_policy, load_policy

@@ -5,19 +5,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 
-from airl_mav.atomic import replace_file
 from airl_mav.cli.parameters_command import ParametersCommand
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from firmware_sim.bridges.airframe import (
+from firmware_sim.external.airframe import (
     HITL_OUTPUT,
     SITL_OUTPUT,
     Airframe,
     ardupilot_airframe,
     px4_airframe,
 )
-from firmware_sim.bridges.parameter_client import Value
-from firmware_sim.bridges.parameter_file import ardupilot_file, qgroundcontrol_file
+from firmware_sim.external.parameter_client import Value
+from firmware_sim.external.parameter_file import ardupilot_file, qgroundcontrol_file
 
 Kind = tuple[Callable[[VehicleProfile], Airframe], Callable[[Mapping[str, Value]], str]]
 

@@ -13,19 +13,19 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from airl_mav.atomic import replace_file, save_arrays
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.profile_plan import Measured, ProfilePlan, planned
 from airl_mav.cli.profile_report import print_measured, say, stages_of
-from airl_mav.clock import utc_now
-from airl_mav.constants import US_PER_MS
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import utc_now
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file, save_arrays
+from airl_mav.core.machine import MachineState, machine_state
+from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import summarize
-from airl_mav.machine_state import MachineState, machine_state
 from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
 from airl_mav.profiles.computer_file import with_workload, write_profile, write_samples
-from airl_mav.provenance import describe_machine, package_versions
 from companion.interfaces import LinkError
 
 SCHEMA = 1
@@ -118,7 +118,7 @@ def _level(command: ProfileCommand) -> Callable[[ProfilePlan, Callable[[int], No
 
         return profile_hil.measure
     from airl_mav.cli import profile_sitl
-    from airl_mav.harness.rehearsal import RehearsalError
+    from airl_mav.rehearsal.rehearsal import RehearsalError
 
     def measure(plan: ProfilePlan, progress: Callable[[int], None]) -> Measured:
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.profile_plan import Measured, ProfilePlan
-from airl_mav.clock import Clock, WallClock, processor_time_us
+from airl_mav.core.clock import Clock, WallClock, processor_time_us
 from airl_mav.policy.actions import Policy, limited
 from airl_mav.policy.layouts import camera_mismatch
 from airl_mav.policy.learned import LearnedPolicy, open_network

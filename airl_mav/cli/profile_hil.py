@@ -22,8 +22,8 @@ from airl_mav.cli.companion_command import (
 )
 from airl_mav.cli.profile_bare import typical_us
 from airl_mav.cli.profile_plan import Measured, ProfilePlan
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_MS
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.clock_offset import ClockError, ClockRelation, Exchanges, relate
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.policy.actions import Action, CameraBound, Policy

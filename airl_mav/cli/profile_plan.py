@@ -18,7 +18,8 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.common import GREATEST_SEED, check_installed, check_ports, check_range
 from airl_mav.cli.companion_command import GREATEST_THREADS
 from airl_mav.cli.profile_command import ProfileCommand
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
 from airl_mav.policy.layouts import LayoutName, ObservationSpec, camera_mismatch
@@ -28,7 +29,6 @@ from airl_mav.profiles.computer import ComputerProfile, Network
 from airl_mav.profiles.computer_file import existing_profile
 from airl_mav.profiles.loading import explain, list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.provenance import describe_machine
 from companion.pilot import PilotSettings
 
 FLOWN_HOLD_S = 0.05

@@ -11,18 +11,18 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.channel import State, Text
 from airl_mav.cli.profile_bare import typical_us
 from airl_mav.cli.profile_plan import Measured, ProfilePlan
 from airl_mav.cli.sitl import plan as rehearsal_plan
 from airl_mav.cli.sitl import terminated_as_interrupted
 from airl_mav.cli.sitl_command import SitlCommand, check
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
-from airl_mav.harness.run_folder import RunFolder, load
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.channel import State, Text
+from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
+from airl_mav.rehearsal.run_folder import RunFolder, load
 
 PACE_M_S = 0.1
 """Speed limit in flight: far below what a goal or a wall could be reached with."""

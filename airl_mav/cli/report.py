@@ -7,9 +7,9 @@ from pathlib import Path
 from rich.console import Console
 
 from airl_mav.cli.report_command import ReportCommand
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
-from airl_mav.harness.run_folder import RUN_FILE
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.report.compare.build import COMPARE_FILE, load_compared, run_folders
 from airl_mav.report.compare.page import build_comparison
 from airl_mav.report.compare.terminal import print_comparison

@@ -22,22 +22,22 @@ from airl_mav.cli.common import (
 from airl_mav.cli.evaluate_settings import fingerprint
 from airl_mav.cli.firmware_options import api_port, arguments, how_to_start, load_timeout_s
 from airl_mav.cli.sitl_command import ARRIVAL_SHARE, SitlCommand, check, wall_speed
-from airl_mav.cpu_quota import remove_left
-from airl_mav.errors import UsageError
+from airl_mav.core.cpu_quota import remove_left
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.flight.setup import Setup
-from airl_mav.harness.episode import Plan, ProcessPlan
-from airl_mav.harness.evaluation import Evaluation, Job, open_folder
-from airl_mav.harness.lock import locked
-from airl_mav.harness.lockstep.errors import LockstepError
-from airl_mav.harness.progress import RichObserver
-from airl_mav.harness.rehearsal import Rehearsal, RehearsalError
-from airl_mav.harness.run_folder import FIRMWARE_PRINTS, RUN_FILE, RunFolder
+from airl_mav.lockstep.errors import LockstepError
 from airl_mav.policy.registry import find_policy
-from airl_mav.ports import LOOPBACK
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.episode import Plan, ProcessPlan
+from airl_mav.rehearsal.evaluation import Evaluation, Job, open_folder
+from airl_mav.rehearsal.lock import locked
+from airl_mav.rehearsal.progress import RichObserver
+from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
+from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RUN_FILE, RunFolder
 from companion.pilot import PilotSettings
 
 LEAVES_RESULTS_ALONE = ("ports",)
@@ -273,7 +273,7 @@ def _rehearse_in_lockstep(
 ) -> None:
     # Imported late: two processes of their own load the simulator otherwise.
     from airl_mav.cli.lockstep import lockstep_plan, policies
-    from airl_mav.harness.lockstep.rehearsal import rehearse
+    from airl_mav.lockstep.rehearsal import rehearse
     from firmware_sim.warm_up import warm_up
 
     observer.waiting("loading")

@@ -30,8 +30,9 @@ from airl_mav.cli.firmware_options import (
     check_firmware,
     check_program,
 )
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import Ports
 from airl_mav.envs.spec import Delay
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Level, Part, Setup
 from airl_mav.latency.injection import without_timing
@@ -39,7 +40,6 @@ from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
-from airl_mav.ports import Ports
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile

@@ -21,12 +21,12 @@ from airl_mav.cli.common import (
 from airl_mav.cli.episode_bar import stop_on_signals
 from airl_mav.cli.sweep_command import SweepCommand
 from airl_mav.cli.sweep_progress import SweepProgress
-from airl_mav.errors import UsageError
-from airl_mav.harness.workers import GREATEST_WORKERS, WorkerError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import usable_cores
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import explain, load_profile
-from airl_mav.provenance import usable_cores
+from airl_mav.rehearsal.workers import GREATEST_WORKERS, WorkerError
 from airl_mav.sweep.config import Examination, Grid, SweepConfig, load_sweep
 from airl_mav.sweep.executors import Executor, LocalExecutor, Work
 from airl_mav.sweep.store import SweepFolder

@@ -15,8 +15,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import Trial, size_of

@@ -7,8 +7,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from airl_mav.cli.train_command import TrainCommand
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.errors import UsageError
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import explain
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from airl_mav.clock import WallClock
 from airl_mav.conformance.checks import FailedError, NotApplicableError, require
 from airl_mav.conformance.family import Answer
 from airl_mav.conformance.inbox import Fields
@@ -23,7 +22,8 @@ from airl_mav.conformance.words import (
     result_name,
     version_name,
 )
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 
 FIRST_WORDS_S = 5.0
 """How long a message that surely comes is waited for [wall s]."""

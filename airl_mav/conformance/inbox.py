@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from airl_mav.clock import NS_PER_US, WallClock
 from airl_mav.conformance.track import Track
 from airl_mav.conformance.transcript import Transcript
 from airl_mav.conformance.words import (
@@ -19,7 +18,8 @@ from airl_mav.conformance.words import (
     landed_name,
     result_name,
 )
-from airl_mav.constants import MS_PER_S, US_PER_S
+from airl_mav.core.clock import NS_PER_US, WallClock
+from airl_mav.core.constants import MS_PER_S, US_PER_S
 
 NAMES = (
     "ATTITUDE",

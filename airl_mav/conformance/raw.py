@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from airl_mav.conformance.session import Session
 from airl_mav.conformance.words import LOCAL_NED
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
 
 PERIOD_S = 0.05

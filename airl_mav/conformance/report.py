@@ -8,7 +8,6 @@ from typing import Any
 from rich.table import Table
 from rich.text import Text
 
-from airl_mav.clock import utc_now
 from airl_mav.conformance.checks import Check, Outcome
 from airl_mav.conformance.reference import JUDGED, Reference, misses
 from airl_mav.conformance.sequence import Examination, Findings
@@ -17,6 +16,7 @@ from airl_mav.conformance.step_response import StepResponse
 from airl_mav.conformance.stepping import stored_step
 from airl_mav.conformance.steps import STEP_NAMES
 from airl_mav.conformance.transcript import Line
+from airl_mav.core.clock import utc_now
 
 SCHEMA = 1
 """Version of the file."""

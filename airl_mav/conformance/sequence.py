@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from airl_mav.clock import WallClock
 from airl_mav.conformance import air, ground
 from airl_mav.conformance.checks import Checklist
 from airl_mav.conformance.frames import check_frames
@@ -14,7 +13,8 @@ from airl_mav.conformance.reference import Reference, load_reference
 from airl_mav.conformance.session import Session
 from airl_mav.conformance.stepping import FlownStep, fly_steps, judge_steps
 from airl_mav.conformance.steps import STEP_NAMES, StepName
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
 
 RESCUE_S = 300.0

@@ -18,7 +18,6 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from mavsdk.plugins.offboard import Offboard, VelocityBodyYawspeed, VelocityNedYaw
 
-from airl_mav.clock import WallClock
 from airl_mav.conformance.family import FAMILIES, PX4, Family
 from airl_mav.conformance.inbox import NAMES, Inbox
 from airl_mav.conformance.steps import Ned, Setpoint
@@ -30,8 +29,9 @@ from airl_mav.conformance.words import (
     DO_SET_MODE,
     command_name,
 )
-from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from companion.connection import first_autopilot, open_connection
 from companion.interfaces import LinkError
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from airl_mav.conformance.step_response import StepResponse, step_response
 from airl_mav.conformance.track import Track
-from airl_mav.frames import wrap_pi
+from airl_mav.core.frames import wrap_pi
 
 StepName = Literal[
     "north-2",

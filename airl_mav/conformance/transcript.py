@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from airl_mav.clock import Clock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 
 Kind = Literal["sent", "heard", "check", "note"]
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from airl_mav.conformance.inbox import Inbox
 from airl_mav.conformance.words import REQUEST_MESSAGE
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 ANSWER_S = 2.0
 """Longest wait for an answer [wall s]."""

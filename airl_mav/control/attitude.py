@@ -10,7 +10,7 @@ import math
 
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize, rotate
 
 

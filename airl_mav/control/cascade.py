@@ -17,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.control.attitude import attitude_towards, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
 from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
 from airl_mav.control.mixer import Motors, mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import velocity_control, velocity_setpoint
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 Memory = NDArray[np.float64]

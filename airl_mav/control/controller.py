@@ -21,7 +21,7 @@ from airl_mav.control.cascade import (
 )
 from airl_mav.control.gains import Gains, pack, unpack
 from airl_mav.control.mixer import Motors
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 Row = NDArray[np.float64]

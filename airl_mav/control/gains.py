@@ -10,8 +10,8 @@ import numpy as np
 from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
-from airl_mav.constants import DEG
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import DEG
+from airl_mav.core.kernels import kernel
 
 
 class Gains(NamedTuple):

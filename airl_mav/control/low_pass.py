@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 
 
 class Biquad(NamedTuple):

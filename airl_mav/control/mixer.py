@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 Motors = tuple[float, float, float, float]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from airl_mav.constants import DEG
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import DEG
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 # Integration fades out towards this rate error: no wind-up in fast flips (PX4's RateControl).

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.constants import GRAVITY_M_S2
 from airl_mav.control.gains import Gains
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 

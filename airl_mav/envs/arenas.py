@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import US_PER_S
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.kernels import kernel
 
 
 class ArenaBatch(NamedTuple):

@@ -11,9 +11,9 @@ from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.fleet import Fleet
-from airl_mav.kernels import kernel
 
 
 class Lens(NamedTuple):

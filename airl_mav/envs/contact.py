@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
 NOTHING = -1

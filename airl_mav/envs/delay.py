@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.constants import MS_PER_S
+from airl_mav.core.constants import MS_PER_S
 from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.latency.injection import Injection, choose_injection
 from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.actions import Policy, limited

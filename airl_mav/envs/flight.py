@@ -12,13 +12,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.constants import TICK_S, TICK_US
 from airl_mav.control.attitude import heading_of
 from airl_mav.control.cascade import Demand, Filters, cascade_tick, filters
+from airl_mav.core.constants import TICK_S, TICK_US
+from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.contact import NOTHING, clearance, touches
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
-from airl_mav.kernels import kernel
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import power_w

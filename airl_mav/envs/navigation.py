@@ -20,7 +20,8 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.constants import TICK_US, US_PER_MS, US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of, put_arena
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws, Stream, stream
@@ -32,7 +33,6 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.state import State, join, part_of, restore, take
 from airl_mav.envs.telemetry import Telemetry
 from airl_mav.envs.trace import Trace
-from airl_mav.errors import UsageError
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import (

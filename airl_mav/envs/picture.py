@@ -24,8 +24,8 @@ from airl_mav.arena.draw import (
     draw_arena,
 )
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
-from airl_mav.constants import US_PER_S
-from airl_mav.errors import UsageError
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
@@ -27,8 +29,6 @@ from airl_mav.envs.vector import (
     quality,
     zone_option,
 )
-from airl_mav.errors import UsageError
-from airl_mav.frames import quat_yaw
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.layouts import DEPTH, Encoded
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 
 State = dict[str, NDArray[Any]]
 """Arrays by name; "fleet/position" is `position` of the part `fleet`."""

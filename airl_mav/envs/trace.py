@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.curriculum import CurriculumState
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
@@ -28,7 +29,6 @@ from airl_mav.envs.state import (
     unpack,
     unpack_generators,
 )
-from airl_mav.errors import UsageError
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.layouts import Encoded
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m]: that of the paper's code, seen from above."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.trajectory import Trajectory
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.footprints import bounding_boxes, segments_clear
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.evidence import (
     HALF_WIDTH_M,
     NO_CAUSE,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.constants import US_PER_MS
+from airl_mav.core.constants import US_PER_MS
 
 RESOLUTION_US = 1.0
 """Both clocks tell whole microseconds, cut off [µs]."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler, build_sampler
 from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
 

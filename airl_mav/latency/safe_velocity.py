@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.constants import DEG, GRAVITY_M_S2
+from airl_mav.core.constants import DEG, GRAVITY_M_S2
 
 
 def safe_velocity(

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.constants import US_PER_MS
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.profiles.computer import Latency
 
 LATENCY_STREAM = 2

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.latency.injection import Injection, choose_injection, moments
 from airl_mav.profiles.computer import LONGEST_MS, Latency, load_computer, read_samples
 from airl_mav.profiles.loading import explain, list_profiles

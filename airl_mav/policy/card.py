@@ -14,7 +14,8 @@ from typing import Annotated, Any
 from pydantic import Field, Strict, ValidationError, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.versioned import write_json
 from airl_mav.flight.setup import Level
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
@@ -22,7 +23,6 @@ from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import explain
 from airl_mav.profiles.vehicle import Camera
-from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of the card's fields."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
 from airl_mav.policy.actions import Action
 from airl_mav.policy.card import (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M, Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.frames import Vector, ned_to_heading, quats_to_euler
+from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
 
 
 @dataclass(frozen=True)

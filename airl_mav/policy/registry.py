@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile, profiles_dir
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tomli_w
 
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.profiles.computer import ComputerProfile, Workload
 from airl_mav.profiles.loading import load_profile
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.fields import range_of
 
 if sys.version_info >= (3, 11):

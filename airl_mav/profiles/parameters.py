@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from matplotlib.ticker import MaxNLocator
 from airl_mav.flight.energy import EnergySplit, add_up, split_energy
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.run_folder import LoadedRun
 from airl_mav.profiles.vehicle import Power
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.figures import quiet
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, Column, TableView, failures_first
 from airl_mav.report.theme import INK, MARK, MUTED, SERIES, SERIES_SOFT, Picture, new_figure, render

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory

@@ -12,12 +12,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.flight.evidence import Cause
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
-from airl_mav.harness.run_folder import LoadedRun, RunInfo
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 from airl_mav.report.ages import ages_table, run_ages
 from airl_mav.report.energy import (
     energy_figure,

@@ -9,10 +9,10 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
+from airl_mav.core.versioned import write_json
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.report.tables import NONE, Column, TableView
-from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `matrix.json`; docs/run-folder.md describes it."""

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, START_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Bounds
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.figures import OUTCOME_COLOURS, OUTCOME_MARKERS, quiet
 from airl_mav.report.tables import OUTCOME_WORDS
 from airl_mav.report.theme import INK, MUTED, RULE, Picture, new_figure, render

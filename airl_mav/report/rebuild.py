@@ -8,10 +8,10 @@ from pathlib import Path
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.harness.run_folder import LoadedRun, RunInfo, load
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.report.html import build_report, pictured
 from airl_mav.report.worst import EXAMINED, ranked
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.tables import OUTCOME_WORDS
 from airl_mav.report.theme import DARK

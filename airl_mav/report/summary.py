@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Aggregate, Estimate, aggregate, median_of
-from airl_mav.harness.run_folder import TICK_LATENESS, LoadedRun
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,
@@ -24,6 +23,7 @@ from airl_mav.latency.stages import (
     stage_samples,
 )
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.rehearsal.run_folder import TICK_LATENESS, LoadedRun
 
 MODELLED_STAGES = tuple(
     SETPOINT_TO_MOTOR if stage.key == "link" else stage

@@ -9,8 +9,8 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.setup import Part
 from airl_mav.flight.statistics import Estimate
-from airl_mav.harness.run_folder import EPISODES_FILE, LoadedRun
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
+from airl_mav.rehearsal.run_folder import EPISODES_FILE, LoadedRun
 from airl_mav.report.summary import RealTime, RunSummary
 
 US_PER_MS = 1_000.0

@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.summary import summarize_run
 from airl_mav.report.tables import (
     NONE,

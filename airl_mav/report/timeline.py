@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from airl_mav.constants import US_PER_S
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
 from airl_mav.latency.stages import STAGES, Samples, Stage
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.figures import long_tail, quiet
 from airl_mav.report.tables import US_PER_MS, Column, TableView, ms
 from airl_mav.report.theme import (

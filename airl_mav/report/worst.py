@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.causes import cause_of
 from airl_mav.flight.evidence import (
     Cause,
@@ -22,10 +22,10 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.sight import Sight
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import LoadedRun
 from airl_mav.latency.safe_velocity import max_acceleration
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, Column, TableView
 from airl_mav.vehicle.rotor import N_ROTORS
 

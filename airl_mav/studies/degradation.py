@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from airl_mav.cli.cells import Cell
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.gap import hardware_gap, relative_gap
 from airl_mav.flight.paper import DEGRADATION, PaperFigures
 from airl_mav.flight.statistics import Estimate

@@ -13,7 +13,7 @@ from airl_mav.cli import gap
 from airl_mav.cli.cells import Cell
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.gap_plan import GapPlan, plan_gap
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.report.gap.build import GapStudy
 from airl_mav.report.gap.file import read_gap
 from airl_mav.report.gap.tables import all_tables

@@ -10,13 +10,13 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
+from airl_mav.core.versioned import write_json
 from airl_mav.report.html import environment
 from airl_mav.report.matrix import markdown_table
 from airl_mav.report.tables import TableView
 from airl_mav.report.terminal import print_table
 from airl_mav.report.theme import Picture
-from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `study.json`; docs/studies.md describes it."""

@@ -18,13 +18,13 @@ from rich.console import Console
 from airl_mav.cli.cells import Cell, FlownCell, check_root, fly_cells
 from airl_mav.cli.common import run_command
 from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.statistics import Aggregate, aggregate
-from airl_mav.harness.run_folder import LoadedRun, load
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import pool, stage_samples
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import explain, load_profile
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.studies.sheet import DATA_FILE, Sheet, print_sheet, write_sheet
 
 

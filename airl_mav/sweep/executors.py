@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from airl_mav.harness.workers import Workers
+from airl_mav.rehearsal.workers import Workers
 from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.trial import Trial
 

@@ -16,8 +16,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from airl_mav.errors import UsageError
-from airl_mav.harness.workers import LOOK_S, TRIES, WorkerError
+from airl_mav.core.errors import UsageError
+from airl_mav.rehearsal.workers import LOOK_S, TRIES, WorkerError
 from airl_mav.sweep.executors import Work
 from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.trial import Trial

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from airl_mav.core.errors import UsageError
+from airl_mav.core.versioned import write_json
 from airl_mav.envs.evaluation import OUTCOMES, Flown
-from airl_mav.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.sweep.trial import Trial
-from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `result.json`; docs/sweep.md describes it."""

@@ -23,13 +23,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
-from airl_mav.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.versioned import read_json
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.result import TrialResult, read_result, write_result
 from airl_mav.sweep.trial import Trial
-from airl_mav.versioned import read_json
 
 SCHEMA = 1
 """Version of `sweep.json`; docs/sweep.md describes it."""

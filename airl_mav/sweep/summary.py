@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.versioned import write_json
 from airl_mav.flight.paper import BEST_OF_SWEEP
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
@@ -19,7 +20,6 @@ from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.trial import Trial, size_of, trials
-from airl_mav.versioned import write_json
 
 
 @dataclass(frozen=True)

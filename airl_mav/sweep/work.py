@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import SLOTS, Flown, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
-from airl_mav.errors import UsageError
 from airl_mav.policy.learned import load_learned
 from airl_mav.sweep.result import Trained, TrialResult, judged
 from airl_mav.sweep.store import Progress, SweepFolder

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.training.learner_state import Arrays, collect, restore
 
 SCHEMA = 1

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.policy.card import (
     ONNX_FILE,
     TORCH_FILE,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from airl_mav.clock import utc_now
+from airl_mav.core.clock import utc_now
+from airl_mav.core.provenance import package_versions
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.vector import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
-from airl_mav.provenance import package_versions
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import load_best
 from airl_mav.training.sb3_export import export_sb3

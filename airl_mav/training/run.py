@@ -16,8 +16,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from airl_mav.clock import WallClock
-from airl_mav.constants import US_PER_S
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.evaluation import Flown, fly_episodes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.sb3 import NavigationVecEnv

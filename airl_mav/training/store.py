@@ -19,10 +19,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from airl_mav.atomic import replace_file
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
-from airl_mav.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.training.config import TrainingConfig
 
 SCHEMA = 1

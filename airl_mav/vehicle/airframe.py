@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import VehicleProfile
 
 

@@ -1,10 +1,10 @@
-"""Quaternion kernels for compiled loops; the same conventions as `airl_mav.frames`."""
+"""Quaternion kernels for compiled loops; the same conventions as `airl_mav.core.frames`."""
 
 from __future__ import annotations
 
 import math
 
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 
 Quat = tuple[float, float, float, float]
 Vec = tuple[float, float, float]

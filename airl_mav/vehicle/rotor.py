@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Vec
 

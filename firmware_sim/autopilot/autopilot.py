@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from airl_mav.constants import TICK_HZ, TICK_S
 from airl_mav.control.cascade import Demand
 from airl_mav.control.controller import Controller
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
-from airl_mav.frames import Geodetic, local_to_geodetic
+from airl_mav.core.constants import TICK_HZ, TICK_S
+from airl_mav.core.frames import Geodetic, local_to_geodetic
 from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator, NewFilter

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 
 class ClimbLimits(NamedTuple):

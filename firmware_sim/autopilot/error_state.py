@@ -14,9 +14,9 @@ import math
 
 import numpy as np
 
-from airl_mav.constants import GRAVITY_M_S2
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import (
     Quat,
     Vec,

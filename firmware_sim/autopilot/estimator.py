@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from airl_mav.atmosphere import altitude_m
-from airl_mav.constants import TICK_S, US_PER_S
-from airl_mav.frames import Geodetic, Vector, geodetic_to_local, quat_from_euler
-from airl_mav.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
+from airl_mav.core.constants import TICK_S, US_PER_S
+from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, quat_from_euler
+from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
+from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.state import Estimate

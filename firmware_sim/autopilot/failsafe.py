@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.commander import Event, Flight, Phase
 from firmware_sim.autopilot.state import Message, Mode, Severity
 

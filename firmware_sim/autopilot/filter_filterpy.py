@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
-from airl_mav.constants import TICK_S
-from airl_mav.frames import Vector
+from airl_mav.core.constants import TICK_S
+from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import N_STATES, gate_ratio, inject, propagate
 
 

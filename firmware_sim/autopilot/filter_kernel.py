@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from airl_mav.constants import TICK_S
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import TICK_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import (
     ACC,
     ATT,

@@ -6,9 +6,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from airl_mav.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.control.cascade import Demand
-from airl_mav.frames import Vector, quat_yaw
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import Climb, ClimbLimits
 from firmware_sim.autopilot.commander import Phase

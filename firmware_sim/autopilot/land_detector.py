@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from airl_mav.constants import US_PER_S
-from airl_mav.frames import Vector
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import V
 
 # Share of the way from least to hover thrust below which the floor must be carrying

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.frames import Geodetic
+from airl_mav.core.frames import Geodetic
 from firmware_sim.interfaces import BatterySample, GpsFix
 
 Vector = NDArray[np.float64]

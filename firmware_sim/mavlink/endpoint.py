@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
 
 Address = tuple[str, int]
 """IPv4 host (name or number) and UDP port."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
     {

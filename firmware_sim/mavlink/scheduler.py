@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from heapq import heapify, heapreplace
 
-from airl_mav.constants import TICK_US
+from airl_mav.core.constants import TICK_US
 
 OFF = 0
 """Interval of a stream that is not sent."""

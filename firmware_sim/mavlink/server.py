@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from airl_mav.frames import Geodetic
+from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.autopilot.state import AutopilotState, Message
 from firmware_sim.mavlink import identity

@@ -9,7 +9,7 @@ import struct
 from pathlib import Path
 from types import TracebackType
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 
 PARTIAL_SUFFIX = ".part"
 """Added to the file's name until the log is complete."""

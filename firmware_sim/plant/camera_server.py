@@ -12,8 +12,8 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
-from airl_mav.constants import DEG, US_PER_S
-from airl_mav.errors import UsageError
+from airl_mav.core.constants import DEG, US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.vehicle import Camera
 from airl_mav.vehicle.rotation import Quat, Vec
 

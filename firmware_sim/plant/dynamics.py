@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from airl_mav.constants import GRAVITY_M_S2
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Battery, Power
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage

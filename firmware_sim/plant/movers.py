@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.constants import US_PER_S
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from firmware_sim.plant.bullet import pybullet
 
 MARGIN_M = 0.5

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.constants import TICK_HZ, US_PER_S
-from airl_mav.frames import Vector
+from airl_mav.core.constants import TICK_HZ, US_PER_S
+from airl_mav.core.frames import Vector
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotor import lag

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from airl_mav.constants import TICK_S
-from airl_mav.frames import Vector
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import TICK_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 
 BLOCK = 256
 """Gusts are drawn for so many ticks at once; how many changes no value."""

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.constants import GRAVITY_M_S2, TICK_S
-from airl_mav.frames import (
+from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.core.frames import (
     Vector,
     ned_to_enu,
     quat_from_euler,

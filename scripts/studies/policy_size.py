@@ -26,10 +26,11 @@ from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
-from airl_mav.atomic import replace_file
 from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
-from airl_mav.clock import utc_now
-from airl_mav.errors import UsageError
+from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import MIN_SAMPLES, percentile
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import ObservationSpec, boxes
@@ -38,7 +39,6 @@ from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
-from airl_mav.provenance import describe_machine, package_versions
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.matrix import markdown_table

@@ -10,17 +10,17 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.errors import UsageError
+from airl_mav.core.errors import UsageError
+from airl_mav.core.versioned import write_json
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate
-from airl_mav.harness.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.ladder.build import LADDER_FILE
 from airl_mav.report.matrix import MATRIX_FILE
 from airl_mav.report.summary import RunSummary, summarize_run
 from airl_mav.report.tables import setup_rows
-from airl_mav.versioned import write_json
 
 SCHEMA = 1
 """Version of `compare.json`; docs/run-folder.md describes it."""

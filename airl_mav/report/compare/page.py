@@ -8,12 +8,12 @@ from pathlib import Path
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.atomic import replace_file
-from airl_mav.errors import UsageError
-from airl_mav.harness.run_folder import LoadedRun
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.compare.build import (
     COMPARE_FILE,
     Compared,

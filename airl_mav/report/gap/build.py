@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from airl_mav.constants import US_PER_MS
-from airl_mav.errors import UsageError
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.gap import HardwareGap, hardware_gap, relative_gap, total_energy_j
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import pair_by_seed
@@ -17,9 +17,9 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.statistics import Aggregate, Estimate, aggregate, bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.harness.run_folder import LoadedRun, RunInfo, load
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import pool, stage_samples
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 
 Role = Literal["reference", "target", "mitigated", "training", "mitigated-reference"]
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from airl_mav.core.versioned import read_versioned, write_json
 from airl_mav.flight.gap import HardwareGap
 from airl_mav.flight.paper import PaperFigures, PrintedGaps
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.report.gap.build import Flown, Gap, GapStudy, HeldArena, build_gap
-from airl_mav.versioned import read_versioned, write_json
 
 SCHEMA = 1
 """Version of `gap.json`; docs/run-folder.md describes it."""

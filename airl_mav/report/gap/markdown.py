@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.report.gap.build import GapStudy
 from airl_mav.report.gap.tables import all_tables, energy_note, fact_rows, legend_rows
 from airl_mav.report.matrix import escape_markdown, markdown_table

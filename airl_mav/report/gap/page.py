@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.report.fan import fan_pictures, fan_sheet
 from airl_mav.report.gap.build import WITH, WITH_TRAINED, WITHOUT, ArenaGap, Gap, GapStudy
 from airl_mav.report.gap.figures import (

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
+from airl_mav.core.versioned import read_versioned, write_json
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate, aggregate
-from airl_mav.harness.run_folder import LoadedRun, RunInfo, load
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples
-from airl_mav.versioned import read_versioned, write_json
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 
 SCHEMA = 1
 """Version of `ladder.json`; docs/run-folder.md describes it."""

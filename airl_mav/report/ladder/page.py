@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.flight.paired import Change
 from airl_mav.report.differences import Against, draw_differences, draw_sheet
 from airl_mav.report.html import REPORT_FILE, Headline, environment, provenance

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from airl_mav.atomic import replace_file
+from airl_mav.core.files import replace_file
 from airl_mav.report.html import Headline, environment
 from airl_mav.report.matrix import markdown_table
 from airl_mav.report.sweep.figures import sheet, size_figure, success_figure, trade_figure

@@ -6,7 +6,7 @@ A real PX4 ignores it. Here a request may only speed streams up: MAVProxy asks f
 
 from __future__ import annotations
 
-from airl_mav.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services.context import Context, Handler, for_vehicle_or_all

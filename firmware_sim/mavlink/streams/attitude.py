@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import yaw_of
 from firmware_sim.autopilot.state import AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values

@@ -6,9 +6,9 @@ import math
 
 from numba.extending import register_jitable
 
-from airl_mav import atmosphere
-from airl_mav.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
-from airl_mav.kernels import kernel
+from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import conjugate, rotate, yaw_of
 from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect

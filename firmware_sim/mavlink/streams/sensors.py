@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from airl_mav import atmosphere
-from airl_mav.kernels import kernel
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect

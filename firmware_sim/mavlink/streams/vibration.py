@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from airl_mav.constants import GRAVITY_M_S2, US_PER_S
-from airl_mav.kernels import kernel
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.state import AutopilotState, Vector
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import Values

@@ -1,0 +1,106 @@
+"""Time. Everything else takes a Clock; nothing else reads the time.
+
+All times are integer microseconds of simulated time. `SimClock` is moved by whoever owns it;
+`WallClock` follows the host's monotonic clock, multiplied by a speed factor.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from datetime import datetime, timezone
+from typing import Protocol
+
+from airl_mav.core.constants import US_PER_S
+
+NS_PER_US = 1_000
+
+
+def processor_time_us() -> int:
+    """Return the processor time that this process has used, all its threads together [µs]."""
+    return time.process_time_ns() // NS_PER_US
+
+
+class Clock(Protocol):
+    """A source of simulated time."""
+
+    def time_us(self) -> int:
+        """Return the present simulated time [µs]."""
+        ...
+
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Return once `time_us()` has reached the given simulated time [µs].
+
+        Args:
+            time_us: Until when [µs].
+            interrupt: Ends the sleep early when it is set.
+        """
+        ...
+
+
+class SimClock:
+    """Simulated time that its owner advances: unpaced, deterministic."""
+
+    def __init__(self, start_us: int = 0) -> None:
+        self._now_us = start_us
+
+    def time_us(self) -> int:
+        """Return the present simulated time [µs]."""
+        return self._now_us
+
+    def advance(self, step_us: int) -> None:
+        """Move time forward by `step_us` [µs]. Raises ValueError when asked to go back."""
+        if step_us < 0:
+            raise ValueError(f"time cannot go back: step_us={step_us}")
+        self._now_us += step_us
+
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Jump to `time_us` [µs], or stay when it has passed or `interrupt` is set."""
+        if interrupt is None or not interrupt.is_set():
+            self._now_us = max(self._now_us, time_us)
+
+
+class WallClock:
+    """Simulated time = (host monotonic - epoch) x speed.
+
+    CLOCK_MONOTONIC is shared by all processes of a host, so two processes with the same epoch
+    and speed read the same simulated time.
+    """
+
+    def __init__(self, speed: float = 1.0, epoch_ns: int | None = None) -> None:
+        """Start at 0, or share another clock's epoch.
+
+        Args:
+            speed: Simulated seconds per wall second, > 0.
+            epoch_ns: Host monotonic time [ns] of simulated time 0; None means now.
+        """
+        if not speed > 0.0:
+            raise ValueError(f"speed={speed}: must be > 0")
+        self.speed = speed
+        self.epoch_ns = time.monotonic_ns() if epoch_ns is None else epoch_ns
+
+    def time_us(self) -> int:
+        """Return the present simulated time [µs]."""
+        return int((time.monotonic_ns() - self.epoch_ns) * self.speed) // NS_PER_US
+
+    def wall_seconds_until(self, time_us: int) -> float:
+        """Return wall seconds left until simulated `time_us`; negative when it has passed."""
+        target_ns = self.epoch_ns + time_us * NS_PER_US / self.speed
+        return (target_ns - time.monotonic_ns()) / (US_PER_S * NS_PER_US)
+
+    def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
+        """Sleep until simulated `time_us` [µs], or until `interrupt` is set."""
+        while (wait_s := self.wall_seconds_until(time_us)) > 0.0:
+            if interrupt is None:
+                time.sleep(wait_s)
+            elif interrupt.wait(wait_s):
+                return
+
+    def slip(self, step_us: int) -> None:
+        """Give up `step_us` [µs] of simulated time: the host could not keep up."""
+        self.epoch_ns += int(step_us * NS_PER_US / self.speed)
+
+
+def utc_now() -> datetime:
+    """Return the calendar time, for names and log headers; never for timing."""
+    return datetime.now(timezone.utc)

@@ -1,0 +1,194 @@
+"""Hold this process to a share of a core, for real, by a control group of its own (Linux).
+
+The kernel lets the group run for its quota in every period and stops all its threads for the rest
+(Documentation/scheduler/sched-bwc.rst). Version 2 has `cpu.max`, version 1 `cpu.cfs_quota_us`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from airl_mav.core.errors import UsageError
+
+LEAST_QUOTA_US = 1_000
+"""The kernel's least quota [µs]. It is what is given of less than a core, in a period that is as
+short as can be: a decision is slowed all along and not stopped once for long. One that takes less
+than this is not slowed at all."""
+
+PERIOD_US = 10_000
+"""Period of a core or more [µs]."""
+
+LEAST_PERCENT, MOST_PERCENT = 1.0, 6400.0
+
+PREFIX = "airl-quota-"
+OPTION = "--cpu-quota"
+
+
+@dataclass(frozen=True)
+class CpuGroup:
+    """A control group that holds its processes to a share of a core."""
+
+    path: Path
+    version: int
+    """1 or 2."""
+
+    def set_quota(self, percent: float) -> None:
+        """Set the quota [% of one core]. Raises OSError."""
+        if percent < 100.0:
+            quota_us, period_us = LEAST_QUOTA_US, round(LEAST_QUOTA_US * 100.0 / percent)
+        else:
+            quota_us, period_us = round(PERIOD_US * percent / 100.0), PERIOD_US
+        if self.version == 2:
+            (self.path / "cpu.max").write_text(f"{quota_us} {period_us}")
+        else:
+            (self.path / "cpu.cfs_period_us").write_text(f"{period_us}")
+            (self.path / "cpu.cfs_quota_us").write_text(f"{quota_us}")
+
+    def statistics(self) -> dict[str, int]:
+        """Return the kernel's `cpu.stat`: nr_periods, nr_throttled and more."""
+        lines = (self.path / "cpu.stat").read_text().splitlines()
+        return {key: int(value) for key, _, value in (line.partition(" ") for line in lines)}
+
+
+@dataclass(frozen=True)
+class _Home:
+    """Where this process is, and where its own groups can be made."""
+
+    version: int
+    own: Path
+    parents: tuple[Path, ...]
+
+
+@contextmanager
+def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup | None]:
+    """Hold this process, all threads and children to come, to a share of a core for a while.
+
+    Args:
+        percent: Of one core, 100 is all of it, 200 two; None: nothing is done.
+        root: Where /proc and /sys are found.
+
+    Raises:
+        UsageError: It is not permitted here; says why.
+    """
+    if percent is None:
+        yield None
+        return
+    home = _home(root)
+    group = _made(home, percent)
+    try:
+        _move(group.path)
+    except OSError as error:
+        group.path.rmdir()
+        raise _refused(f"this process cannot be moved to {group.path}: {error.strerror}") from None
+    try:
+        yield group
+    finally:
+        # A group with a process in it cannot be removed.
+        with suppress(OSError):
+            _move(home.own)
+            group.path.rmdir()
+
+
+def check_permitted(percent: float | None, root: Path = Path("/")) -> None:
+    """Raise UsageError, with the reason, unless a process can be held to a share of a core here."""
+    if percent is None:
+        return
+    if not LEAST_PERCENT <= percent <= MOST_PERCENT:
+        raise UsageError(
+            f"{OPTION} {percent:g}: accepted: {LEAST_PERCENT:g} <= value <= {MOST_PERCENT:g} %"
+        )
+    _made(_home(root), percent).path.rmdir()
+
+
+def remove_left(root: Path = Path("/")) -> None:
+    """Remove the groups of processes that ended without a chance to remove their own."""
+    with suppress(UsageError):
+        for parent in _home(root).parents:
+            _sweep(parent)
+
+
+def _made(home: _Home, percent: float) -> CpuGroup:
+    """Make a group with a quota. Raises UsageError."""
+    reason = ""
+    for parent in home.parents:
+        _sweep(parent)
+        path = parent / f"{PREFIX}{os.getpid()}"
+        try:
+            path.mkdir()
+        except OSError as error:
+            reason = f"no group can be made in {parent}: {error.strerror}"
+            continue
+        group = CpuGroup(path, home.version)
+        try:
+            if home.version == 2 and not (path / "cpu.max").exists():
+                (parent / "cgroup.subtree_control").write_text("+cpu")
+            group.set_quota(percent)
+        except OSError as error:
+            path.rmdir()
+            reason = f"the CPU controller cannot be used in {parent}: {error.strerror}"
+            continue
+        return group
+    raise _refused(reason)
+
+
+def _home(root: Path) -> _Home:
+    """Find the CPU controller. Raises UsageError."""
+    try:
+        memberships = (root / "proc/self/cgroup").read_text().splitlines()
+        mounts = [line.split() for line in (root / "proc/self/mounts").read_text().splitlines()]
+    except OSError:
+        raise _refused("no control groups: Linux has them") from None
+    groups = [line.split(":", 2) for line in memberships]
+    for _, controllers, own in groups:
+        if "cpu" in controllers.split(","):
+            for _, point, kind, options, *_ in mounts:
+                if kind == "cgroup" and "cpu" in options.split(","):
+                    place = _inside(root, point, own)
+                    return _Home(1, place, (place,))
+    for number, controllers, own in groups:
+        if number == "0" and not controllers:
+            for _, point, kind, *_ in mounts:
+                place = _inside(root, point, own)
+                if kind == "cgroup2" and "cpu" in _words(place / "cgroup.controllers"):
+                    # A group with processes cannot have groups with controllers below it (but for
+                    # the root): then one beside it.
+                    beside = (place.parent,) if own != "/" else ()
+                    return _Home(2, place, (*beside, place))
+    raise _refused("the CPU controller of control groups is not there")
+
+
+def _inside(root: Path, point: str, own: str) -> Path:
+    """Return a process's group in a mounted hierarchy."""
+    place = root / point.lstrip("/")
+    inner = place / own.lstrip("/")
+    # Inside a container the path may be that of the host.
+    return inner if inner.is_dir() else place
+
+
+def _sweep(parent: Path) -> None:
+    """Remove the groups of processes that are gone."""
+    for old in parent.glob(f"{PREFIX}*"):
+        # Its process may live and be about to move in; the kernel keeps a group with processes.
+        if not Path(f"/proc/{old.name.removeprefix(PREFIX)}").exists():
+            with suppress(OSError):
+                old.rmdir()
+
+
+def _move(group: Path) -> None:
+    """Move this process with all its threads. Raises OSError."""
+    (group / "cgroup.procs").write_text(f"{os.getpid()}")
+
+
+def _words(path: Path) -> list[str]:
+    try:
+        return path.read_text().split()
+    except OSError:
+        return []
+
+
+def _refused(reason: str) -> UsageError:
+    return UsageError(f"{OPTION}: not permitted here: {reason}")

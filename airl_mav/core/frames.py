@@ -1,0 +1,229 @@
+"""Coordinate frames: the only place that converts.
+
+The project speaks PX4's frames: world NED (north, east, down), body FRD (forward, right, down).
+pybullet speaks ENU / FLU. Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate
+body vectors into the world: v_ned = R(q) v_frd. Euler angles are the aerospace sequence yaw,
+pitch, roll (Z-Y-X, intrinsic).
+
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import EARTH_RADIUS_M
+
+Vector = NDArray[np.float64]
+
+SQRT_HALF = math.sqrt(0.5)
+
+
+def wrap_pi(angle: float) -> float:
+    """Wrap an angle [rad] into [-pi, pi)."""
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def ned_to_enu(v: Vector) -> Vector:
+    """Swap a world vector (..., 3) between NED and ENU. Its own inverse."""
+    return np.stack([v[..., 1], v[..., 0], -v[..., 2]], axis=-1)
+
+
+enu_to_ned = ned_to_enu
+
+
+def frd_to_flu(v: Vector) -> Vector:
+    """Swap a body vector (..., 3) between FRD and FLU. Its own inverse."""
+    return np.stack([v[..., 0], -v[..., 1], -v[..., 2]], axis=-1)
+
+
+flu_to_frd = frd_to_flu
+
+
+def quat_multiply(a: Vector, b: Vector) -> Vector:
+    """Return the Hamilton product a ⊗ b of two quaternions (4,)."""
+    w1, x1, y1, z1 = a
+    w2, x2, y2, z2 = b
+    return np.array(
+        [
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ]
+    )
+
+
+def quat_conjugate(q: Vector) -> Vector:
+    """Return the inverse rotation of a unit quaternion (4,)."""
+    return np.array([q[0], -q[1], -q[2], -q[3]])
+
+
+def quat_normalize(q: Vector) -> Vector:
+    """Return q (4,) scaled to length 1 with w >= 0. Raises ValueError on a zero quaternion."""
+    norm = float(np.linalg.norm(q))
+    if norm == 0.0:
+        raise ValueError("a zero quaternion is no rotation")
+    return q / (norm if q[0] >= 0.0 else -norm)
+
+
+def quat_to_matrix(q: Vector) -> Vector:
+    """Return the rotation matrix (3, 3) of a unit quaternion (4,): v_world = R v_body."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_rotate(q: Vector, v: Vector) -> Vector:
+    """Rotate a body vector (3,) into the world by a unit quaternion (4,)."""
+    rotated: Vector = quat_to_matrix(q) @ v
+    return rotated
+
+
+def quat_from_rotation_vector(r: Vector) -> Vector:
+    """Return the unit quaternion (4,) of a rotation vector (3,) [rad]."""
+    angle = math.sqrt(float(r[0] * r[0] + r[1] * r[1] + r[2] * r[2]))
+    if angle < 1e-8:
+        return quat_normalize(np.array([1.0, 0.5 * r[0], 0.5 * r[1], 0.5 * r[2]]))
+    s = math.sin(0.5 * angle) / angle
+    return np.array([math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2]])
+
+
+def quat_from_euler(roll: float, pitch: float, yaw: float) -> Vector:
+    """Return the unit quaternion (4,) of aerospace Euler angles [rad]."""
+    cr, sr = math.cos(0.5 * roll), math.sin(0.5 * roll)
+    cp, sp = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    cy, sy = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+class Euler(NamedTuple):
+    """Aerospace Euler angles [rad]."""
+
+    roll: float
+    pitch: float
+    yaw: float
+
+
+def quat_to_euler(q: Vector) -> Euler:
+    """Return the aerospace Euler angles of a unit quaternion (4,)."""
+    w, x, y, z = (float(c) for c in q)
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return Euler(roll, pitch, yaw)
+
+
+def quats_to_euler(q: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return roll, pitch, yaw, each (...), of unit quaternions (..., 4); as `quat_to_euler`."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return roll, pitch, yaw
+
+
+def quat_yaw(q: Vector) -> float:
+    """Return the heading [rad] of a unit quaternion (4,), 0 = north, positive to the east."""
+    w, x, y, z = q
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+# The quaternion of the axis swap ENU <- NED, as (w, x, y, z): half a turn about (1, 1, 0)/sqrt 2.
+_ENU_FROM_NED = np.array([0.0, SQRT_HALF, SQRT_HALF, 0.0])
+# FRD <- FLU: half a turn about the forward axis.
+_FRD_FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+
+
+def quat_ned_frd_to_enu_flu(q: Vector) -> Vector:
+    """Turn an attitude NED <- FRD (4,) into the same attitude as ENU <- FLU (4,)."""
+    return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
+
+
+def quat_enu_flu_to_ned_frd(q: Vector) -> Vector:
+    """Turn an attitude ENU <- FLU (4,) into the same attitude as NED <- FRD (4,)."""
+    return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
+
+
+def quat_wxyz_to_xyzw(q: Vector) -> tuple[float, float, float, float]:
+    """Reorder to pybullet's and scipy's scalar-last quaternion."""
+    return float(q[1]), float(q[2]), float(q[3]), float(q[0])
+
+
+def quat_xyzw_to_wxyz(q: tuple[float, float, float, float]) -> Vector:
+    """Reorder from pybullet's and scipy's scalar-last quaternion (4,)."""
+    return np.array([q[3], q[0], q[1], q[2]])
+
+
+def ned_to_heading(v: Vector, yaw: float | Vector) -> Vector:
+    """Rotate world vectors (..., 3) by yaw (...) into the heading frame (forward, right, down).
+
+    The heading frame is MAVLink's BODY_NED: yaw follows the vehicle, roll and pitch stay level.
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    north, east = v[..., 0], v[..., 1]
+    return np.stack([c * north + s * east, c * east - s * north, v[..., 2]], axis=-1)
+
+
+def heading_to_ned(v: Vector, yaw: float | Vector) -> Vector:
+    """Rotate heading-frame vectors (..., 3) (forward, right, down) by yaw (...) into NED."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    forward, right = v[..., 0], v[..., 1]
+    return np.stack([c * forward - s * right, s * forward + c * right, v[..., 2]], axis=-1)
+
+
+class Geodetic(NamedTuple):
+    """A point on the globe."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    """Above mean sea level, positive up [m]."""
+
+
+def local_to_geodetic(ned: Vector, origin: Geodetic) -> Geodetic:
+    """Map a local NED position (3,) [m] to the globe.
+
+    Azimuthal equidistant projection on a sphere, as PX4's MapProjection::reproject
+    (Snyder, Map Projections, USGS 1395, eqs. 20-14, 20-15).
+    """
+    x, y = float(ned[0]) / EARTH_RADIUS_M, float(ned[1]) / EARTH_RADIUS_M
+    c = math.hypot(x, y)
+    altitude = origin.altitude_m - float(ned[2])
+    if c == 0.0:
+        return Geodetic(origin.latitude_deg, origin.longitude_deg, altitude)
+    lat0 = math.radians(origin.latitude_deg)
+    sin_c, cos_c = math.sin(c), math.cos(c)
+    lat = math.asin(cos_c * math.sin(lat0) + x * sin_c * math.cos(lat0) / c)
+    lon = math.radians(origin.longitude_deg) + math.atan2(
+        y * sin_c, c * math.cos(lat0) * cos_c - x * math.sin(lat0) * sin_c
+    )
+    return Geodetic(math.degrees(lat), math.degrees(lon), altitude)
+
+
+def geodetic_to_local(point: Geodetic, origin: Geodetic) -> Vector:
+    """Map a point on the globe to local NED (3,) [m]; inverse of `local_to_geodetic`."""
+    lat0, lat = math.radians(origin.latitude_deg), math.radians(point.latitude_deg)
+    dlon = math.radians(point.longitude_deg - origin.longitude_deg)
+    cos_c = math.sin(lat0) * math.sin(lat) + math.cos(lat0) * math.cos(lat) * math.cos(dlon)
+    c = math.acos(min(1.0, max(-1.0, cos_c)))
+    k = 1.0 if c < 1e-12 else c / math.sin(c)
+    north = k * (math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(dlon))
+    east = k * math.cos(lat) * math.sin(dlon)
+    down = origin.altitude_m - point.altitude_m
+    return np.array([north * EARTH_RADIUS_M, east * EARTH_RADIUS_M, down])

@@ -1,0 +1,93 @@
+"""The camera's frames in lockstep: from the plant to the companion through memory."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from airl_mav.camera.frame import Frame
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
+from companion.camera import ReceivedFrame
+
+
+class UnderWay:
+    """Frames between their exposure and the companion."""
+
+    def __init__(self, transport_us: int) -> None:
+        """Take the time from a frame's exposure until it lies decoded in the companion [µs]."""
+        self.published = threading.Event()
+        """Set with every frame that is sent; whoever waits for one clears it first."""
+        self._transport_us = transport_us
+        self._frames: deque[Frame] = deque()
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame on its way."""
+        self._frames.append(frame)
+        self.published.set()
+
+    def arrived(self, now_us: int) -> Frame | None:
+        """Take out what has arrived by `now_us` [µs]; return the newest, None if nothing has."""
+        newest = None
+        while (next_us := self.next_us) is not None and next_us <= now_us:
+            newest = self._frames.popleft()
+        return newest
+
+    @property
+    def next_us(self) -> int | None:
+        """When the next one arrives [µs]; None: none is under way."""
+        return self._frames[0].capture_time_us + self._transport_us if self._frames else None
+
+    def clear(self) -> None:
+        """Forget all frames."""
+        self._frames.clear()
+
+
+class MemoryCamera:
+    """Both ends of the camera: `firmware.FrameServer` and, by `latest`, `camera.FrameSource`."""
+
+    endpoint = "memory"
+
+    def __init__(self, transport_us: int) -> None:
+        """Take the time from a frame's exposure until it lies decoded in the companion [µs]."""
+        self.clock: Clock | None = None
+        """The companion's."""
+        self._under_way = UnderWay(transport_us)
+        self._newest: ReceivedFrame | None = None
+
+    def publish(self, frame: Frame) -> None:
+        """Send a frame on its way."""
+        self._under_way.send(frame)
+
+    def close(self) -> None:
+        """Forget all frames."""
+        self._under_way.clear()
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the newest frame that has arrived, without waiting; None before the first."""
+        now_us = 0 if self.clock is None else self.clock.time_us()
+        arrived = self._under_way.arrived(now_us)
+        if arrived is not None:
+            self._newest = ReceivedFrame(arrived, now_us)
+        return self._newest
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen; see `companion.camera.FrameSource`.
+
+        Here the time-out counts in simulated time.
+        """
+        clock, under_way = self.clock, self._under_way
+        if clock is None:
+            raise RuntimeError("nobody looks: the camera has no companion's clock")
+        deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
+        while True:
+            newest = self.latest()
+            if newest is not None and newest.frame.sequence != newer_than_sequence:
+                return newest
+            if clock.time_us() >= deadline_us:
+                return None
+            if under_way.next_us is not None:
+                clock.sleep_until(min(deadline_us, under_way.next_us))
+            else:
+                under_way.published.clear()
+                clock.sleep_until(deadline_us, under_way.published)

@@ -1,0 +1,145 @@
+"""Vehicle and flight controller on a simulated clock that a companion in another process shares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from airl_mav.flight.judge import Referee, Task, Verdict
+from airl_mav.lockstep.conductor import Conductor
+from airl_mav.lockstep.digest import SEEN, FlightDigest
+from airl_mav.lockstep.judging import Judge
+from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
+from airl_mav.lockstep.token_camera import TokenCamera
+from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
+from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from airl_mav.rehearsal.following import Follower
+from firmware_sim.firmware import BuiltinAvionics, Firmware, FrameServer, Loaded
+from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+
+@dataclass(frozen=True)
+class RemotePlan:
+    """How flights go; the same for all."""
+
+    transport_us: int
+    """From a frame's exposure until the companion sees it [µs]."""
+    tokens: TokenSettings
+    speed: float | None = None
+    """Greatest number of simulated seconds per wall second; None: as fast as it goes."""
+    goal_radius_m: float | None = None
+    """The referee's; None: there is none."""
+    time_limit_s: float = 0.0
+    """The referee's."""
+
+
+class RemoteStage:
+    """One flight. The sockets stay their owner's, for the next one."""
+
+    def __init__(
+        self,
+        endpoint: UdpEndpoint,
+        frames: FrameServer,
+        plan: RemotePlan,
+        *,
+        broken_off: Callable[[], bool],
+    ) -> None:
+        """Put everything together; nothing moves yet.
+
+        Args:
+            endpoint: Where the companion is, or will be.
+            frames: Where its camera's frames go.
+            plan: How it flies.
+            broken_off: Asked while the companion is waited for; True gives it up.
+        """
+        self.on_phase: Callable[[str, int], None] | None = None
+        """Called with every phase that the companion enters, and the simulated time, if set."""
+        self.on_verdict: Callable[[Verdict], None] | None = None
+        """Called when the flight is decided, if set."""
+        self.on_tick: Callable[[Simulation], None] | None = None
+        """Called after every tick, if set."""
+        self._plan = plan
+        self._digest = FlightDigest()
+        camera = TokenCamera(frames, plan.transport_us)
+        self._partner = TokenPartner(
+            endpoint, camera, plan.tokens, broken_off=broken_off, phase=self._enter
+        )
+        memory = MemoryEndpoint()
+        self._conductor = Conductor(memory, self._partner, self._digest, plan.speed)
+        server = MavlinkServer([lockstep_link(memory)], boot_unix_us=BOOT_UNIX_US)
+        self.firmware = Firmware(BuiltinAvionics(server), camera, self._conductor)
+        self.firmware.on_tick = self._look
+        self._judge = Judge(None, self._digest, order=self._partner.order)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the companion has ended, or was given up."""
+        return self._conductor.ended
+
+    @property
+    def turns(self) -> int:
+        """Turns that the companion has had."""
+        return self._partner.turns
+
+    @property
+    def time_us(self) -> int:
+        """Simulated time [µs]."""
+        return self._conductor.clock.time_us()
+
+    def load(self, setup: EpisodeSetup, tlog: Path | None) -> Loaded:
+        """Set up the episode; the companion begins a moment later.
+
+        Args:
+            setup: The episode.
+            tlog: Where its MAVLink log goes; None: no log.
+        """
+        plan = self._plan
+        loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
+        follower = None
+        if plan.goal_radius_m is not None and setup.arena is not None:
+            goal = (float(setup.arena.goal[0]), float(setup.arena.goal[1]))
+            task = Task(goal, plan.goal_radius_m, plan.time_limit_s)
+            follower = Follower(Referee(task), loaded.time_us)
+        self._judge = Judge(follower, self._digest, order=self._partner.order, judged=self._decide)
+        self._conductor.begin(loaded.time_us + COMPANION_STARTS_US)
+        return loaded
+
+    def step(self) -> None:
+        """Fly one tick, with whatever the companion does before it.
+
+        Raises:
+            LockstepError: The companion is gone, or does not keep to the turns.
+        """
+        self.firmware.step()
+
+    def lanes(self) -> dict[str, str]:
+        """Return the fingerprint of the flight by lane; call once, at its end.
+
+        What the policy saw is not in it: that is the companion's to know.
+        """
+        simulation = self.firmware.simulation
+        if simulation is not None:
+            self._digest.add_setpoints(simulation.setpoints.arrays())
+        return {name: lane for name, lane in self._digest.lanes().items() if name != SEEN}
+
+    def close(self) -> None:
+        """Let the companion go and forget the flight."""
+        self._partner.close()
+        self.firmware.close()
+
+    def _enter(self, phase: str, time_us: int) -> None:
+        if self.on_phase is not None:
+            self.on_phase(phase, time_us)
+        self._judge.enter(phase, time_us)
+
+    def _decide(self, verdict: Verdict) -> None:
+        if self.on_verdict is not None:
+            self.on_verdict(verdict)
+
+    def _look(self, simulation: Simulation) -> None:
+        self._judge.look(simulation)
+        if self.on_tick is not None:
+            self.on_tick(simulation)

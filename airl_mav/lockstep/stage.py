@@ -1,0 +1,133 @@
+"""Vehicle, flight controller, MAVSDK and a companion on one simulated clock, put together."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from pathlib import Path
+from types import TracebackType
+
+from airl_mav.core.errors import UsageError
+from airl_mav.lockstep.camera import MemoryCamera
+from airl_mav.lockstep.conductor import Conductor
+from airl_mav.lockstep.digest import FlightDigest
+from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
+from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from companion.conducted import ConductedClock
+from companion.link import RAW_URL, MavsdkLink
+from firmware_sim.firmware import BuiltinAvionics, Firmware
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+HEARD_TIMEOUT_S = 10.0
+"""Longest wait of the companion for the heartbeat that it has been fed [wall s]."""
+
+
+class Stage:
+    """One flight of any companion program. Use as a context manager."""
+
+    def __init__(
+        self,
+        *,
+        transport_us: int = 0,
+        digest: FlightDigest | None = None,
+        speed: float | None = None,
+        partner: ThreadPartner | None = None,
+    ) -> None:
+        """Put everything together; nothing moves yet.
+
+        Args:
+            transport_us: From a frame's exposure until it lies decoded in the companion [µs].
+            digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
+            speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
+            partner: Runs the companion; None: as it should be run.
+        """
+        self._partner = partner or ThreadPartner()
+        self.abandon = threading.Event()
+        """Makes the link break off whatever it waits for."""
+        endpoint = MemoryEndpoint()
+        self.conductor = Conductor(endpoint, self._partner, digest, speed)
+        self.clock = ConductedClock(self.conductor.clock, self._partner.sleep)
+        """The companion's clock, and its watchdog's guard."""
+        self.camera = MemoryCamera(transport_us)
+        """The companion's source of frames."""
+        self.camera.clock = self.clock
+        server = MavlinkServer([lockstep_link(endpoint)], boot_unix_us=BOOT_UNIX_US)
+        self.firmware = Firmware(BuiltinAvionics(server), self.camera, self.conductor)
+        self._open = ExitStack()
+
+    def __enter__(self) -> Stage:
+        """Make the link."""
+        # In the order of need: the companion's thread ends before its link does.
+        self._open.enter_context(closing(self.firmware))
+        self.link = MavsdkLink(RAW_URL, self.clock, self.abandon, lambda: self.conductor.heard)
+        """The companion's link; `run` connects it."""
+        self._open.enter_context(closing(self.link))
+        self._open.enter_context(closing(self._partner))
+        self._partner.attach(self.link)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End the companion and release everything."""
+        self._open.close()
+
+    def run(
+        self,
+        setup: EpisodeSetup,
+        program: Callable[[], None],
+        *,
+        tlog: Path | None = None,
+        begun: Callable[[int], None] = lambda _started_us: None,
+        linger_us: int = 0,
+    ) -> Simulation:
+        """Fly until the companion's program has ended.
+
+        Args:
+            setup: The episode.
+            program: What the companion does, on a thread of its own, with `link` connected;
+                simulated time moves only while it sleeps by `clock`.
+            tlog: Where the MAVLink log goes; None: no log.
+            begun: Called with the simulated time of the reset [µs].
+            linger_us: Fly on for so long when the program has ended [µs].
+
+        Returns:
+            The simulation as it stands at the end; closed with the stage.
+
+        Raises:
+            UsageError: The program found that it cannot be flown.
+            LockstepError: The companion hangs, or broke.
+        """
+        firmware, conductor = self.firmware, self.conductor
+        started_us = firmware.load(setup, tlog, BOOT_UNIX_US).time_us
+        begun(started_us)
+
+        def connected() -> None:
+            self.link.connect(HEARD_TIMEOUT_S)
+            program()
+
+        self._partner.start(connected)
+        conductor.begin(started_us + COMPANION_STARTS_US)
+        while not conductor.ended:
+            firmware.step()
+        self._raise_what_broke()
+        until_us = conductor.clock.time_us() + linger_us
+        while conductor.clock.time_us() < until_us:
+            firmware.step()
+        assert firmware.simulation is not None  # noqa: S101 (loaded above)
+        return firmware.simulation
+
+    def _raise_what_broke(self) -> None:
+        error = self._partner.error
+        if isinstance(error, UsageError):
+            raise error
+        if error is not None:
+            raise LockstepError(f"the companion broke: {type(error).__name__}: {error}") from error

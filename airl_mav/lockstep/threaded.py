@@ -1,0 +1,187 @@
+"""The companion in a thread of this process: MAVSDK on raw bytes, and a clock that is conducted.
+
+One of the two threads works at any moment: the conductor's, or the companion's. MAVSDK's own
+threads work always; a barrier tells when they are through. MAVSDK takes in and sends out messages
+one after the other in one queue, so the answer to a PING proves that everything fed before is in
+its getters, and that everything it was told to send before has come out.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from queue import Empty, SimpleQueue
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.frames import newest_heartbeat
+from airl_mav.lockstep.turns import Turn
+from companion.conducted import Abandoned
+from companion.link import MavsdkLink
+from firmware_sim.mavlink.codec import Encoder, dialect
+
+FIRST_BARRIER = 0x8000_0000
+"""Sequence number of the first barrier's PING: those of the autopilot's own stream stay below."""
+
+PATIENCE_S = 60
+"""Longest turn of the companion [s of wall time, while this process runs]."""
+
+PING_AGAIN_S = 0.1
+"""A barrier's PING is repeated after so long without an answer [wall s]."""
+
+GREATEST_GAP_US = 2 * US_PER_S
+"""A longer time between two looks was no waiting: the process was stopped [µs of wall time]."""
+
+HEARTBEAT_S = 1.0
+"""The newest heartbeat is repeated so often in a long turn [wall s]."""
+
+_PING: int = dialect.MAVLINK_MSG_ID_PING
+
+
+class ThreadPartner:
+    """Runs a companion. Implements `turns.Partner`."""
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+        """What ended the companion, if it was not its own end."""
+        # Of the standard library's queues the one that never blocks the putter: MAVSDK's thread
+        # must not wait for anybody.
+        self._inbox: SimpleQueue[bytes | Turn] = SimpleQueue()
+        # A bare lock as a baton: a Semaphore is made of several, and ten times as slow.
+        self._go = threading.Lock()
+        self._go.acquire()
+        self._abandoned = False
+        self._link: MavsdkLink | None = None
+        self._feed: Callable[[bytes], None] = lambda _: None
+        self._heartbeat = b""
+        self._barriers = FIRST_BARRIER
+        self._encoder = Encoder()
+        self._thread: threading.Thread | None = None
+
+    def attach(self, link: MavsdkLink) -> None:
+        """Take the link, made with `RAW_URL`, that the companion will use."""
+        self._link = link
+        self._feed = link.exchange_raw(self._inbox.put)
+
+    def start(self, program: Callable[[], None]) -> None:
+        """Start the companion; it waits for its first turn."""
+        self._thread = threading.Thread(
+            target=self._run, args=(program,), name="companion", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the companion wherever it waits for its turn."""
+        self._abandoned = True
+        with suppress(RuntimeError):  # it holds the baton already, or has ended
+            self._go.release()
+        if self._thread is not None:
+            self._thread.join(timeout=1.0)
+
+    # --- the conductor's thread
+
+    def send(self, frames: bytes) -> None:
+        """Feed MAVSDK."""
+        self._heartbeat = newest_heartbeat(frames) or self._heartbeat
+        self._feed(frames)
+
+    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+        """Let the companion work until it sleeps; see `turns.Partner`."""
+        del now_us  # its clock is the conductor's
+        self._settle(handle)
+        sent_before = self._setpoints_sent
+        self._go.release()
+        turn = self._work(handle)
+        # A command is answered before its caller goes on; a setpoint may still be under way.
+        if self._setpoints_sent != sent_before:
+            self._settle(handle)
+        return replace(turn, setpoints_sent=self._setpoints_sent)
+
+    def _settle(self, handle: Callable[[bytes], None]) -> None:
+        """Wait until MAVSDK has taken in and sent out everything so far."""
+        number = self._barriers
+        self._barriers += 1
+        ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
+        wanted = number.to_bytes(4, "little")
+        waited = Patience()
+        again_s = 0.0
+        while (so_far_s := waited.so_far_s()) < PATIENCE_S:
+            if so_far_s >= again_s:
+                # MAVSDK answers no PING of a vehicle that it has only just heard of: ask again
+                # then. A second answer is passed over.
+                self._feed(ping)
+                again_s = so_far_s + PING_AGAIN_S
+            with suppress(Empty):
+                item = self._inbox.get(timeout=PING_AGAIN_S)
+                if not isinstance(item, bytes):
+                    raise LockstepError("the companion gave back a turn that it did not have")
+                if _is_ping(item) and item[18:22] == wanted:
+                    return
+                handle(item)
+        raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
+
+    def _work(self, handle: Callable[[bytes], None]) -> Turn:
+        """Wait for the end of the companion's turn."""
+        waited = Patience()
+        heartbeat_s = HEARTBEAT_S
+        while waited.so_far_s() < PATIENCE_S:
+            with suppress(Empty):
+                item = self._inbox.get(timeout=HEARTBEAT_S)
+                if not isinstance(item, bytes):
+                    return item
+                handle(item)
+            if waited.so_far_s() >= heartbeat_s:
+                # MAVSDK gives a vehicle up after 3 s without a heartbeat, by the wall clock, and
+                # then finds no autopilot to connect to.
+                self._feed(self._heartbeat)
+                heartbeat_s += HEARTBEAT_S
+        raise LockstepError(f"the companion hangs: its turn did not end in {PATIENCE_S} s")
+
+    @property
+    def _setpoints_sent(self) -> int:
+        return 0 if self._link is None else self._link.setpoints_sent
+
+    # --- the companion's thread
+
+    def sleep(self, wake_us: int, interrupt: threading.Event | None) -> None:
+        """Give the turn back until simulated `wake_us` [µs], or until `interrupt` is set."""
+        self._inbox.put(Turn(wake_us, interrupt))
+        self._await_turn()
+
+    def _await_turn(self) -> None:
+        self._go.acquire()
+        if self._abandoned:
+            raise Abandoned
+
+    def _run(self, program: Callable[[], None]) -> None:
+        try:
+            self._await_turn()
+            program()
+        except Abandoned:
+            return
+        except BaseException as error:  # handed to whoever conducts
+            self.error = error
+        self._inbox.put(Turn(None))
+
+
+class Patience:
+    """Adds up wall time in which somebody waited; a process that is stopped does not wait."""
+
+    def __init__(self) -> None:
+        self._clock = WallClock()
+        self._seen_us = 0
+        self._waited_us = 0
+
+    def so_far_s(self) -> float:
+        """Return what has been waited [s]. To be asked more often than `GREATEST_GAP_US`."""
+        now_us = self._clock.time_us()
+        self._waited_us += min(now_us - self._seen_us, GREATEST_GAP_US)
+        self._seen_us = now_us
+        return self._waited_us / US_PER_S
+
+
+def _is_ping(frame: bytes) -> bool:
+    return len(frame) >= 24 and int.from_bytes(frame[7:10], "little") == _PING

@@ -1,0 +1,307 @@
+"""The companion in another process, maybe in another language: turns pass over its MAVLink link.
+
+The vehicle sends its telemetry, and behind it a STATUSTEXT that gives the turn; the companion sends
+what it has to command, and behind it one that gives the turn back. Until then simulated time
+stands. See docs/lockstep.md, "In two processes".
+"""
+
+from __future__ import annotations
+
+import re
+import select
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.frames import datagrams, newest_heartbeat
+from airl_mav.lockstep.token_camera import TokenCamera
+from airl_mav.lockstep.turns import Turn
+from airl_mav.rehearsal.following import Order
+from companion.tokens import Order as Word
+from companion.tokens import Phase, TurnBack, TurnGiven
+from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
+from firmware_sim.mavlink.endpoint import UdpEndpoint
+
+LONGEST_DATAGRAM = 1400
+"""Frames of telemetry share a datagram up to this size [bytes]; MAVSDK reads 2048 at a time."""
+
+LONGEST_REST_US = US_PER_S
+"""The companion has a turn at least this often, wanted or not, so that what is sent to it fits into
+its socket's buffer even when it does not read [µs]."""
+
+KNOCK_S = 0.1
+"""Before the companion is there, a heartbeat goes out so often [wall s]."""
+
+FIRST_REPEAT_S, LAST_REPEAT_S = 0.02, 1.0
+"""The turn is given again after the first, then twice that, up to the last [wall s]."""
+
+SLICE_S = 0.2
+"""Longest wait before anything else is looked at [wall s]."""
+
+_TURN_BACK = re.compile(r"D\d+\b")
+
+
+@dataclass(frozen=True)
+class TokenSettings:
+    """How patient the vehicle is with its companion."""
+
+    turn_us: int = 20_000
+    """A companion that does not say when it wants the next turn has it so long after [µs]."""
+    patience_s: float = 60.0
+    """Longest turn of the companion [s of wall time, while this process runs]."""
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """What the companion waits for."""
+
+    wake_us: int
+    event: str
+    setpoints_sent: int
+
+
+class TokenPartner:
+    """Passes the turns. One flight. Implements `turns.Partner`."""
+
+    def __init__(
+        self,
+        endpoint: UdpEndpoint,
+        camera: TokenCamera,
+        settings: TokenSettings,
+        *,
+        broken_off: Callable[[], bool] = lambda: False,
+        phase: Callable[[str, int], None] = lambda _phase, _time_us: None,
+    ) -> None:
+        """Wait for nobody yet.
+
+        Args:
+            endpoint: Where the companion is, or will be.
+            camera: Its frames.
+            settings: How patient to be.
+            broken_off: Asked again and again while waiting for the companion; True ends the wait
+                and, for this flight, the companion.
+            phase: Called with each phase that the companion tells, and the simulated time [µs].
+        """
+        self._endpoint = endpoint
+        self._camera = camera
+        self._settings = settings
+        self._broken_off = broken_off
+        self._phase = phase
+        self._order: Word = ""
+        self._ordered = threading.Event()
+        self._encoder = Encoder()
+        self._decoder = Decoder(datagrams=True)
+        self._heartbeat = b""
+        self._heard = False
+        """Whether the companion is there: before, nothing but heartbeats is sent."""
+        self._backlog: list[bytes] = []
+        """All telemetry before the first turn."""
+        self._number = 0
+        self._rest: _Rest | None = None
+        self._unseen = False
+        """Whether the camera's newest frame has not been sent yet."""
+        self._early: list[WireMessage] = []
+        """What came before the first turn."""
+        self._phases: set[str] = set()
+        """Told in this turn."""
+        socket = endpoint.fileno()
+        if socket is None:
+            raise ValueError("the endpoint is closed")
+        self._socket = socket
+        endpoint.receive()  # what is left of another flight
+
+    @property
+    def turns(self) -> int:
+        """Turns given so far."""
+        return self._number
+
+    def order(self, order: Order) -> None:
+        """Tell the companion what to do, in its next turn."""
+        self._order = "land" if order is Order.LAND else "abandon"
+        self._ordered.set()
+
+    def close(self) -> None:
+        """Tell the companion that nobody conducts it any more."""
+        if self._heard:
+            self._heard = False
+            self._say(TurnGiven(self._number + 1, 0, order="end"))
+
+    # --- turns.Partner
+
+    def send(self, frames: bytes) -> None:
+        """Pass on telemetry, at once if the companion is there."""
+        self._heartbeat = newest_heartbeat(frames) or self._heartbeat
+        if self._number == 0:
+            self._backlog.append(frames)
+        if self._heard:
+            self._send_frames(frames)
+
+    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+        """Let the companion work until it sleeps; see `turns.Partner`."""
+        arrived = self._camera.arrive(now_us)
+        self._unseen = self._unseen or arrived
+        if self._rest is not None and not self._wakes(self._rest, now_us, arrived):
+            return self._asleep(self._rest)
+        if not self._heard and not self._knock():
+            return Turn(None)
+        over = TurnGiven(self._number, now_us)
+        self._number += 1
+        # What is left from before must not fill the socket's buffer.
+        self._hear([*self._early, *self._received()], over, handle)
+        self._early.clear()
+        self._phases.clear()
+        given = TurnGiven(self._number, now_us, self._camera.sequence, self._order)
+        back = self._exchange(given, handle)
+        if back is None:
+            return Turn(None)
+        if back.ended:
+            self.close()
+            return Turn(None)
+        self._rest = self._understood(back, now_us)
+        return self._asleep(self._rest)
+
+    # --- until when it sleeps
+
+    def _understood(self, back: TurnBack, now_us: int) -> _Rest:
+        wake_us = back.wake_us
+        if wake_us is None:
+            wake_us = now_us + self._settings.turn_us
+        elif wake_us <= now_us:
+            raise LockstepError(
+                f"the companion's {back.text()!r}: accepted: a time after now, {now_us} µs"
+            )
+        # It goes back to sleep when it is woken too early.
+        wake_us = min(wake_us, now_us + LONGEST_REST_US)
+        return _Rest(wake_us, back.event, back.setpoints_sent or 0)
+
+    def _wakes(self, rest: _Rest, now_us: int, arrived: bool) -> bool:
+        """Return whether that is over now."""
+        if now_us >= rest.wake_us:
+            return True
+        if rest.event == "frame":
+            return arrived
+        return rest.event == "stop" and self._ordered.is_set()
+
+    def _asleep(self, rest: _Rest) -> Turn:
+        """Return until when, or what, the conductor may go on without it."""
+        wake_us, interrupt = rest.wake_us, None
+        if rest.event == "frame":
+            under_way = self._camera.under_way
+            if under_way.next_us is not None:
+                wake_us = min(wake_us, under_way.next_us)
+            else:
+                interrupt = under_way.published
+                interrupt.clear()
+        elif rest.event == "stop" and not self._order:
+            interrupt = self._ordered
+        return Turn(wake_us, interrupt, rest.setpoints_sent)
+
+    # --- passing the turn
+
+    def _knock(self) -> bool:
+        """Send heartbeats until the companion answers with anything; False: broken off."""
+        while not self._broken_off():
+            self._endpoint.send(self._heartbeat)
+            if self._wait(KNOCK_S) and (early := self._received()):
+                self._early = early
+                self._heard = True
+                self._send_frames(b"".join(self._backlog))
+                return True
+        return False
+
+    def _exchange(self, given: TurnGiven, handle: Callable[[bytes], None]) -> TurnBack | None:
+        """Give the turn, again and again, until it comes back; None: broken off."""
+        again = False
+        # Counted in repetitions, not read off a clock: a process that was stopped has not waited.
+        for again_s in _repeats(self._settings.patience_s):
+            if again:
+                self._repeat()
+            if again or self._unseen:
+                self._camera.send()
+            again, self._unseen = True, False
+            self._say(given)
+            stopwatch = WallClock()
+            while (left_s := again_s - stopwatch.time_us() / US_PER_S) > 0.0:
+                if self._wait(left_s):
+                    back = self._hear(self._received(), given, handle)
+                    if back is not None:
+                        return back
+                if self._broken_off():
+                    return None
+        raise LockstepError(
+            f"the companion is gone: it did not give back turn {given.number} in "
+            f"{self._settings.patience_s:g} s"
+        )
+
+    def _repeat(self) -> None:
+        """Send again what goes before the turn."""
+        if self._number == 1:
+            # The companion may have come up while the telemetry was being sent.
+            self._send_frames(b"".join(self._backlog))
+        else:
+            # MAVSDK gives a vehicle up after 3 s without one, by the wall clock.
+            self._endpoint.send(self._heartbeat)
+
+    def _hear(
+        self, messages: list[WireMessage], given: TurnGiven, handle: Callable[[bytes], None]
+    ) -> TurnBack | None:
+        """Handle what has arrived; return the turn if it is given back.
+
+        Raises LockstepError for words that cannot be understood.
+        """
+        found = None
+        for message in messages:
+            text = message.text if message.get_type() == "STATUSTEXT" else ""
+            if (back := TurnBack.parse(text)) is not None:
+                if back.number > given.number:
+                    raise LockstepError(f"the companion's {text!r}: accepted: D{given.number}")
+                if back.number == given.number:
+                    found = back
+            elif _TURN_BACK.match(text):
+                raise LockstepError(
+                    f"the companion's {text!r}; accepted: D<turn> [<wake_us> [<setpoints> "
+                    "[frame|stop]]], D<turn> end"
+                )
+            elif (phase := Phase.parse(text)) is not None:
+                self._enter(phase, given)
+            else:
+                handle(bytes(message.get_msgbuf()))
+        return found
+
+    def _enter(self, phase: Phase, given: TurnGiven) -> None:
+        """Pass on a phase, once however often it is told."""
+        if phase.number == given.number and phase.name not in self._phases:
+            self._phases.add(phase.name)
+            self._phase(phase.name, given.time_us)
+
+    # --- the socket
+
+    def _received(self) -> list[WireMessage]:
+        chunks = self._endpoint.receive()
+        return [message for chunk in chunks for message in self._decoder.feed(chunk)]
+
+    def _say(self, given: TurnGiven) -> None:
+        text = given.text().encode()
+        message = dialect.MAVLink_statustext_message(dialect.MAV_SEVERITY_DEBUG, text)
+        self._endpoint.send(self._encoder.pack(message))
+
+    def _send_frames(self, frames: bytes) -> None:
+        for datagram in datagrams(frames, LONGEST_DATAGRAM):
+            self._endpoint.send(datagram)
+
+    def _wait(self, seconds: float) -> bool:
+        """Wait until something arrives; return whether it has."""
+        ready, _, _ = select.select([self._socket], [], [], min(seconds, SLICE_S))
+        return bool(ready)
+
+
+def _repeats(total_s: float) -> Iterator[float]:
+    """Yield waits that get longer, up to a total [s]."""
+    wait_s = FIRST_REPEAT_S
+    while total_s > 0.0:
+        yield min(wait_s, total_s)
+        total_s -= wait_s
+        wait_s = min(2.0 * wait_s, LAST_REPEAT_S)

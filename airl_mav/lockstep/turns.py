@@ -1,0 +1,45 @@
+"""Turns: simulated time stands while the companion works; then it says until when it sleeps."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from airl_mav.core.constants import US_PER_S
+
+COMPANION_STARTS_US = US_PER_S // 10
+"""The companion begins so long after the flight controller has booted [µs]."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How the companion gave its turn back."""
+
+    wake_us: int | None
+    """When it wants the next one [µs of simulated time]; None: it has ended."""
+    interrupt: threading.Event | None = None
+    """Wakes it earlier when set."""
+    setpoints_sent: int = 0
+    """Setpoints that it has handed to MAVSDK so far."""
+
+
+class Partner(Protocol):
+    """The companion as the conductor sees it, in a thread or behind a socket."""
+
+    def send(self, frames: bytes) -> None:
+        """Pass on telemetry; it is in the companion's hands when its next turn begins."""
+        ...
+
+    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+        """Let the companion work until it sleeps, while simulated time stands at `now_us` [µs].
+
+        Args:
+            now_us: Simulated time [µs].
+            handle: Called with every MAVLink frame that the companion sends; it answers by `send`.
+
+        Raises:
+            LockstepError: The turn does not come back.
+        """
+        ...

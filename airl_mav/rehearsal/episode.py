@@ -1,0 +1,253 @@
+"""One episode of a rehearsal: what is planned, what is known of it, how it is saved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome, Referee
+from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.matching import match_setpoints, stamps_of
+from airl_mav.latency.stamps import STAMPS
+from airl_mav.rehearsal.channel import Ended, Loaded, State
+from airl_mav.rehearsal.following import Follower
+from airl_mav.rehearsal.run_folder import TICK_LATENESS, RunFolder
+from companion.mission import CAMERA_SILENT, LINK_LOST
+
+SEPARATED = (LINK_LOST, CAMERA_SILENT)
+"""Why a mission ends when both processes live but no longer hear each other: one of them stood
+still for seconds, or the host has too much to do."""
+
+
+@dataclass(frozen=True)
+class ProcessPlan:
+    """How to start one process: module and arguments."""
+
+    module: str
+    arguments: list[str]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything a rehearsal needs to know."""
+
+    firmware: ProcessPlan
+    companion: ProcessPlan
+    arena: str
+    seed: int
+    episodes: int
+    goal_radius_m: float
+    time_limit_s: float
+    speed: float
+    computer_watts: float
+    load_timeout_s: float | None = None
+    """Longest wait for the vehicle to stand ready at the start [wall s]; None: as for any answer.
+    Real firmware must be started, or is waited for."""
+    arena_seed: int | None = None
+    """Of the arena of all episodes; None: each one's own seed."""
+
+    def arena_seed_of(self, seed: int) -> int:
+        """Return the seed of the arena of an episode."""
+        return seed if self.arena_seed is None else self.arena_seed
+
+
+@dataclass
+class Episode:
+    """What is known of a running episode."""
+
+    index: int
+    seed: int
+    loaded: Loaded
+    follower: Follower
+    stopwatch: WallClock
+    wall_us: int | None = None
+    """Wall time from the reset to the verdict."""
+    state: State | None = None
+    verdict_state: State | None = None
+    ended: Ended | None = None
+    navigating_us: int | None = None
+    """When navigation began, by the companion's clock, which has given up no time [µs]."""
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def referee(self) -> Referee:
+        """The referee."""
+        return self.follower.referee
+
+    @property
+    def separated(self) -> str | None:
+        """Why it ended before its verdict, if the processes no longer heard each other."""
+        verdict, ended = self.referee.verdict, self.ended
+        if verdict is None or verdict.outcome is not Outcome.ABORTED or ended is None:
+            return None
+        return ended.reason if ended.reason in SEPARATED else None
+
+    @property
+    def slipped_us(self) -> int:
+        """Simulated time given up so far [µs]."""
+        return 0 if self.state is None else self.state.slipped_us - self.loaded.slipped_us
+
+
+def save_episode(
+    episode: Episode, plan: Plan, folder: RunFolder, record_path: Path, decisions_path: Path
+) -> EpisodeRecord:
+    """Join what both processes left of an episode and save it in the run folder.
+
+    Args:
+        episode: The episode, judged.
+        plan: What was planned.
+        folder: The run.
+        record_path: The firmware's arrays; removed afterwards.
+        decisions_path: The companion's decision log; may be missing; removed afterwards.
+    """
+    arrays = _read(record_path)
+    trajectory = Trajectory.from_arrays(_part(arrays, "trajectory"))
+    latency = _part(arrays, "estimate", keep_prefix=True)
+    latency[TICK_LATENESS] = arrays["tick/lateness_us"]
+    if decisions_path.exists():
+        latency |= join_stamps(
+            _read(decisions_path), _part(arrays, "setpoints"), arrays["tick/slips_us"]
+        )
+    record = _record(episode, plan, trajectory, arrays["tick/slips_us"])
+    folder.save_episode(record, trajectory, latency)
+    record_path.unlink()
+    decisions_path.unlink(missing_ok=True)
+    return record
+
+
+def _record(
+    episode: Episode, plan: Plan, trajectory: Trajectory, slips: NDArray[np.int64]
+) -> EpisodeRecord:
+    state, loaded, began_us = episode.verdict_state, episode.loaded, episode.navigating_us
+    return judged_record(
+        episode.referee,
+        trajectory,
+        # What the referee knew in flight was the time given up by its newest state, an older one.
+        None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
+        index=episode.index,
+        seed=episode.seed,
+        arena=plan.arena,
+        arena_seed=plan.arena_seed_of(episode.seed),
+        goal=loaded.goal,
+        started_us=loaded.time_us,
+        computer_watts=plan.computer_watts,
+        wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
+        slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
+        battery_remaining=state.battery if state else None,
+        notes=tuple(episode.notes),
+    )
+
+
+def judged_record(
+    referee: Referee,
+    trajectory: Trajectory,
+    navigation_us: int | None,
+    *,
+    index: int,
+    seed: int,
+    arena: str,
+    arena_seed: int,
+    goal: tuple[float, float],
+    started_us: int,
+    computer_watts: float,
+    wall_s: float | None,
+    slipped_us: int,
+    battery_remaining: float | None,
+    notes: tuple[str, ...],
+    sha256: dict[str, str] | None = None,
+) -> EpisodeRecord:
+    """Return the record of a flight that a referee has watched; see `EpisodeRecord`.
+
+    `navigation_us` is when navigation began, by the clock of the trajectory [µs].
+    """
+    verdict = referee.verdict or referee.abort(started_us, "no verdict")
+    quality = None
+    if navigation_us is not None and verdict.time_us >= navigation_us:
+        quality = measure_quality(trajectory, navigation_us, verdict.time_us, computer_watts)
+    return EpisodeRecord(
+        index=index,
+        seed=seed,
+        arena=arena,
+        arena_seed=arena_seed,
+        outcome=verdict.outcome,
+        reason=verdict.reason,
+        goal=goal,
+        goal_radius_m=referee.task.goal_radius_m,
+        time_limit_s=referee.task.time_limit_s,
+        started_us=started_us,
+        navigation_us=navigation_us,
+        ended_us=verdict.time_us,
+        wall_s=wall_s,
+        slipped_us=slipped_us,
+        battery_remaining=battery_remaining,
+        quality=quality,
+        notes=notes,
+        sha256=sha256,
+    )
+
+
+COMPANION_STAMPS = tuple(name for name in STAMPS if name != "capture_us")
+"""Stamps by the companion's clock; the exposure of a frame is by the simulator's."""
+
+
+def join_stamps(
+    decisions: dict[str, NDArray[Any]],
+    setpoints: dict[str, NDArray[Any]],
+    slips: NDArray[np.int64],
+) -> dict[str, NDArray[Any]]:
+    """Return the decision log with the times at which the autopilot accepted and applied each.
+
+    Args:
+        decisions: The companion's log, by column.
+        setpoints: The firmware's log, by column; empty where nobody can look into it.
+        slips: (k, 2) times at which simulated time was given up, and how much [µs].
+    """
+    by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
+    if not setpoints:
+        return {**decisions, **by_simulator}
+    index = match_setpoints(
+        by_simulator["sent_us"],
+        decisions["setpoint"],
+        setpoints["accepted_us"],
+        setpoints["setpoint"],
+    )
+    return {
+        **decisions,
+        **by_simulator,
+        "accepted_us": stamps_of(index, setpoints["accepted_us"]),
+        "motor_us": stamps_of(index, setpoints["motor_us"]),
+    }
+
+
+def without_slips(times_us: NDArray[np.int64], slips: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return times (n,) of a clock that ran on as the simulator's clock tells them [µs].
+
+    Both agreed at the start of the episode. Each slip set the simulator's clock back to the tick
+    that was due: what happened while it stood still happened at that tick.
+    """
+    told = times_us.copy()
+    given_up_us = 0
+    for tick_us, lost_us in slips:
+        told -= np.clip(times_us - (tick_us + given_up_us), 0, lost_us)
+        given_up_us += lost_us
+    return told
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as archive:
+        return {key: archive[key] for key in archive.files}
+
+
+def _part(
+    arrays: dict[str, NDArray[Any]], prefix: str, *, keep_prefix: bool = False
+) -> dict[str, NDArray[Any]]:
+    cut = 0 if keep_prefix else len(prefix) + 1
+    return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}

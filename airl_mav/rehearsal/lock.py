@@ -1,0 +1,73 @@
+"""A folder that belongs to one run at a time, and to all processes of it."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+
+PATIENCE_S = 20.0
+"""How long the processes of a run that was killed may take to end [wall s]."""
+
+LOOK_S = 0.05
+"""How often they are looked for [wall s]."""
+
+
+@contextmanager
+def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
+    """Keep a folder, made when there is none, to this process and those that inherit the lock.
+
+    The lock ends with the last process that has the descriptor, however that ends: the processes of
+    a run that was killed are waited for, as they hold its ports and may still write.
+
+    Args:
+        path: The folder.
+        say: Is told, in words, when somebody else has it.
+
+    Yields:
+        A descriptor to be passed to child processes.
+
+    Raises:
+        UsageError: Another run has the folder, or it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        # The folder itself: a file of its own would have to be cleaned up.
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise UsageError(f"--out {path}: {error.strerror}") from None
+    try:
+        _acquire(descriptor, path, say)
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _acquire(descriptor: int, path: Path, say: Callable[[str], None]) -> None:
+    if _try(descriptor):
+        return
+    say(f"{path}: waiting for the processes of an earlier run to end")
+    clock = WallClock()
+    while not _try(descriptor):
+        now_us = clock.time_us()
+        if now_us > PATIENCE_S * US_PER_S:
+            raise UsageError(f"--out {path}: another run flies into it; accepted: a new folder")
+        clock.sleep_until(now_us + int(LOOK_S * US_PER_S))
+
+
+def _try(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        # Not every file system (of a network, above all) has such locks. Then two runs in one
+        # folder are the user's own business.
+        return True
+    return True

@@ -1,0 +1,268 @@
+"""A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
+
+An episode is saved when it has been flown whole. One that lost a process on the way is flown again
+by two new ones, from its seed: nothing of the lost one enters the records but a note.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Protocol
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Referee, Task, TruthSample, Verdict
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.rehearsal.channel import (
+    Abort,
+    Ended,
+    Event,
+    FinishEpisode,
+    Fly,
+    Loaded,
+    LoadEpisode,
+    Progress,
+    Saved,
+    State,
+    Text,
+)
+from airl_mav.rehearsal.crew import COMPANION, FIRMWARE, Crew, LostError
+from airl_mav.rehearsal.episode import Episode, Plan, save_episode
+from airl_mav.rehearsal.following import TAKEOFF_LIMIT_S, Follower, Order
+from airl_mav.rehearsal.run_folder import RunFolder
+from airl_mav.rehearsal.workers import TRIES
+
+WRAP_UP_S = 90.0
+"""Longest time from the verdict to the companion's report: landing included [simulated s]."""
+
+
+class RehearsalError(Exception):
+    """The run cannot go on; the message says why."""
+
+
+class Observer(Protocol):
+    """Whoever shows the progress. All calls come from one thread."""
+
+    def waiting(self, what: str) -> None:
+        """Something is being waited for."""
+        ...
+
+    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+        """An episode begins."""
+        ...
+
+    def phase(self, phase: str, time_us: int) -> None:
+        """The companion has entered a phase."""
+        ...
+
+    def state(self, state: State, started_us: int) -> None:
+        """The vehicle's true state."""
+        ...
+
+    def text(self, text: Text) -> None:
+        """The autopilot said something."""
+        ...
+
+    def finished(self, record: EpisodeRecord) -> None:
+        """An episode has been saved."""
+        ...
+
+    def lost(self, what: str) -> None:
+        """An episode was lost and begins again."""
+        ...
+
+
+class Rehearsal:
+    """Runs a plan. Use as a context manager: whatever happens, both processes end."""
+
+    def __init__(
+        self, plan: Plan, folder: RunFolder, observer: Observer, keeps: Sequence[int] = ()
+    ) -> None:
+        """Take the plan; nothing is started yet.
+
+        Args:
+            plan: What is flown.
+            folder: Where everything goes.
+            observer: Who looks on.
+            keeps: File descriptors that the processes inherit: locks.
+        """
+        self._plan = plan
+        self._folder = folder
+        self._observer = observer
+        self._keeps = keeps
+        self._crew: Crew | None = None
+
+    def __enter__(self) -> Rehearsal:
+        """Return the rehearsal."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End both processes."""
+        self._dismiss()
+
+    def run(self, done: Collection[int] = ()) -> None:
+        """Fly the episodes; each is saved as it ends.
+
+        Args:
+            done: Numbers of those that need not be flown.
+
+        Raises:
+            UsageError: A process says that its input cannot be used.
+            RehearsalError: An episode was lost too often.
+        """
+        for index in range(self._plan.episodes):
+            if index not in done:
+                self._fly_surely(index)
+
+    def _fly_surely(self, index: int) -> None:
+        """Fly an episode; when it is lost, again with two new processes."""
+        flight = f"flight {index:03d}, seed {self._plan.seed + index}"
+        notes: list[str] = []
+        while True:
+            try:
+                self._fly(index, notes)
+            except LostError as error:
+                self._dismiss()
+                notes.append(f"flown again: {error.what}")
+                if len(notes) == TRIES:
+                    raise RehearsalError(f"{flight}: lost {TRIES} times; at last {error}") from None
+                self._observer.lost(f"{flight} begins again: {error}")
+            else:
+                return
+
+    def _present(self) -> Crew:
+        """Return the two processes; started when there are none."""
+        if self._crew is None:
+            # Known before it is started: who is interrupted meanwhile still ends it.
+            self._crew = crew = Crew()
+            self._observer.waiting("starting firmware and companion")
+            plan = self._plan
+            crew.start(plan.firmware, plan.companion, self._folder.path, self._keeps)
+        return self._crew
+
+    def _dismiss(self) -> None:
+        crew, self._crew = self._crew, None
+        if crew is not None:
+            crew.stop()
+
+    # --- one episode
+
+    def _fly(self, index: int, notes: Sequence[str]) -> None:
+        """Fly an episode and save it. Raises LostError when it is none."""
+        crew, plan, folder = self._present(), self._plan, self._folder
+        seed = plan.seed + index
+        record_path = folder.path / f".episode-{index:03d}.npz"
+        decisions_path = folder.path / f".decisions-{index:03d}.npz"
+        for path in (record_path, decisions_path):
+            path.unlink(missing_ok=True)
+        crew.send(
+            FIRMWARE,
+            LoadEpisode(
+                episode=index,
+                arena=plan.arena,
+                arena_seed=plan.arena_seed_of(seed),
+                seed=seed,
+                tlog=str(folder.tlog_path(index).absolute()),
+                record=str(record_path.absolute()),
+            ),
+        )
+        loaded = crew.wait_for(Loaded, self._look, plan.load_timeout_s)
+        task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
+        follower = Follower(Referee(task), loaded.time_us)
+        episode = Episode(index, seed, loaded, follower, WallClock(), notes=list(notes))
+        self._observer.episode(index, seed, loaded.goal)
+        crew.send(
+            COMPANION,
+            Fly(
+                episode=index,
+                goal=loaded.goal,
+                epoch_ns=loaded.epoch_ns,
+                latency_seed=seed,
+                record=str(decisions_path.absolute()),
+            ),
+        )
+        limit_s = (TAKEOFF_LIMIT_S + plan.time_limit_s + WRAP_UP_S) / plan.speed
+        try:
+            crew.pump(lambda _, event: self._follow(crew, episode, event), limit_s, "the flight")
+        except LostError as error:
+            if not crew.lives(FIRMWARE):
+                raise
+            # The firmware still flies. Whatever is wrong with the companion, its setpoints end
+            # here; see the failsafe through.
+            crew.stop_one(COMPANION)
+            seen = self._watch_failsafe(crew, episode)
+            raise LostError("; ".join((error.what, *seen)), error.detail) from None
+        if (reason := episode.separated) is not None:
+            raise LostError(f"firmware and companion lost each other ({reason})")
+        crew.send(FIRMWARE, FinishEpisode())
+        crew.wait_for(Saved, self._look)
+        self._observer.finished(save_episode(episode, plan, folder, record_path, decisions_path))
+
+    def _follow(self, crew: Crew, episode: Episode, event: Event) -> bool:
+        """Take one event of a flight; True when it is over."""
+        referee = episode.referee
+        if isinstance(event, State):
+            self._see(crew, episode, event)
+        elif isinstance(event, Progress):
+            self._observer.phase(event.phase, event.time_us)
+            if event.phase == "navigating":
+                episode.navigating_us = event.time_us
+                referee.start_navigation(event.time_us - episode.slipped_us)
+        elif isinstance(event, Text):
+            self._observer.text(event)
+        elif isinstance(event, Ended):
+            episode.ended = event
+            episode.notes.extend(event.notes)
+            if referee.verdict is None:
+                now_us = episode.state.time_us if episode.state else episode.loaded.time_us
+                self._judge(episode, referee.abort(now_us, event.reason))
+            return True
+        return False
+
+    def _see(self, crew: Crew, episode: Episode, state: State) -> None:
+        episode.state = state
+        self._observer.state(state, episode.loaded.time_us)
+        judged = episode.referee.verdict is not None
+        order = episode.follower.see(
+            TruthSample(state.time_us, state.position, state.collision, state.battery)
+        )
+        verdict = episode.referee.verdict
+        if verdict is not None and not judged:
+            self._judge(episode, verdict)
+        if order is not None:
+            crew.send(COMPANION, Abort(land=order is Order.LAND))
+
+    def _judge(self, episode: Episode, verdict: Verdict) -> None:
+        if episode.wall_us is None:
+            episode.wall_us = episode.stopwatch.time_us()
+            episode.verdict_state = episode.state
+        self._observer.phase(verdict.outcome.value, verdict.time_us)
+
+    def _watch_failsafe(self, crew: Crew, episode: Episode) -> list[str]:
+        """The companion is gone: watch what the flight controller does, until it is down.
+
+        Returns:
+            What the autopilot said.
+        """
+        self._observer.waiting("companion lost: watching the failsafe land the vehicle")
+        said: list[str] = []
+
+        def down(_name: str, event: Event) -> bool:
+            if isinstance(event, Text):
+                self._observer.text(event)
+                said.append(f"autopilot at {event.time_us / US_PER_S:.2f} s: {event.text}")
+            if isinstance(event, State):
+                self._observer.state(event, episode.loaded.time_us)
+                return not event.armed
+            return False
+
+        try:
+            crew.pump(down, WRAP_UP_S / self._plan.speed, "the vehicle to come down")
+        except LostError as error:
+            said.append(error.what)
+        return said
+
+    def _look(self, event: Event) -> None:
+        """Take an event that nobody waits for."""
+        if isinstance(event, Text):
+            self._observer.text(event)

@@ -1,0 +1,201 @@
+"""What real firmware takes its vehicle for, against what the vehicle is: found out on the ground.
+
+A wrong order of motors flips a vehicle the moment it lifts off, and the log then shows nothing but
+a controller that fights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from airl_mav.profiles.vehicle import (
+    CORNERS,
+    COUNTER_CLOCKWISE,
+    ArduPilot,
+    Corner,
+    Px4,
+    VehicleProfile,
+)
+from firmware_sim.external.parameter_client import Value, same
+from firmware_sim.flight_controller import FirmwareMissingError
+
+MOTORS = range(4)
+
+SITL_OUTPUT, HITL_OUTPUT = "PWM_MAIN_FUNC{}", "HIL_ACT_FUNC{}"
+"""PX4's parameter that says what hangs on output {}."""
+
+GROUND_LOSS = "NAV_DLL_ACT"
+"""PX4's parameter of what the loss of the ground station does; 0 = nothing."""
+
+_PX4_MOTOR_1 = 101
+"""PX4's output function of motor 1 (docs: Actuator Configuration)."""
+
+_PX4_MULTIROTOR = 0
+"""PX4's CA_AIRFRAME."""
+
+_ARDUPILOT_MOTOR_1 = 33
+"""ArduPilot's SERVOn_FUNCTION of motor 1."""
+
+_ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
+"""Corner of each motor of ArduCopter's quad X: AP_MotorsMatrix, MOTOR_FRAME_TYPE_X."""
+
+
+class Airframe(Protocol):
+    """What one kind of firmware must be set to."""
+
+    firmware: str
+    """What the firmware is called in messages: PX4."""
+
+    @property
+    def motors(self) -> Sequence[Corner]:
+        """Corner of the motor on each of its outputs."""
+        ...
+
+    @property
+    def frame(self) -> Mapping[str, Value]:
+        """What makes the firmware fly such a frame, motors on their outputs: never set by us."""
+        ...
+
+    @property
+    def settings(self) -> Mapping[str, Value]:
+        """Parameters and what they must be: set where we may, checked otherwise."""
+        ...
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        ...
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that the firmware flies, in words."""
+        ...
+
+
+class Px4Airframe:
+    """A quad by PX4's control allocation: rotor positions and turns, output functions."""
+
+    firmware = "PX4"
+
+    def __init__(self, vehicle: VehicleProfile, px4: Px4, output: str) -> None:
+        """Take the vehicle.
+
+        Args:
+            vehicle: Its rotors.
+            px4: What is said of PX4.
+            output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
+        """
+        self.motors = px4.motors
+        self.number = px4.airframe
+        """SYS_AUTOSTART."""
+        self._output = output
+        self.frame: dict[str, Value] = {
+            "CA_AIRFRAME": _PX4_MULTIROTOR,
+            "CA_ROTOR_COUNT": len(MOTORS),
+            **{output.format(i + 1): _PX4_MOTOR_1 + CORNERS.index(self.motors[i]) for i in MOTORS},
+        }
+        self.settings: dict[str, Value] = {
+            "THR_MDL_FAC": vehicle.rotor.thrust_curve,
+            **vehicle.rotor.px4_geometry(),
+            **px4.parameters,
+        }
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        return [GROUND_LOSS, *self.frame, *self.settings]
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that PX4 flies, in words."""
+        if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
+            return (
+                f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
+                f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
+            )
+        for output, expected in enumerate(self.motors, start=1):
+            name = self._output.format(output)
+            motor = int(held[name]) - _PX4_MOTOR_1
+            if motor not in MOTORS:
+                return f"PX4's {name} is {held[name]}: expected a motor, 101 to 104"
+            found = _corner(held, motor)
+            if found != expected:
+                return (
+                    f"PX4's output {output} ({name} = {held[name]}) turns the motor {found} "
+                    f"(CA_ROTOR{motor}_PX, _PY), the vehicle's is {expected}: wrong motor order"
+                )
+            turn, positive = float(held[f"CA_ROTOR{motor}_KM"]), expected in COUNTER_CLOCKWISE
+            if (turn > 0.0) != positive:
+                way = "counter-clockwise" if turn > 0.0 else "clockwise"
+                return (
+                    f"PX4's motor {expected} turns {way} (CA_ROTOR{motor}_KM = {turn:g}), the "
+                    "vehicle's the other way: wrong motor order"
+                )
+        return None
+
+
+class ArduPilotAirframe:
+    """A quad by ArduCopter's frame class and type, and its output functions."""
+
+    firmware = "ArduPilot"
+
+    def __init__(self, ardupilot: ArduPilot) -> None:
+        self.motors = ardupilot.motors
+        self._kind: dict[str, int] = {
+            "FRAME_CLASS": ardupilot.frame_class,
+            "FRAME_TYPE": ardupilot.frame_type,
+        }
+        self.frame: dict[str, Value] = {
+            f"SERVO{i + 1}_FUNCTION": _ARDUPILOT_MOTOR_1 + CORNERS.index(self.motors[i])
+            for i in MOTORS
+        }
+        self.settings: dict[str, Value] = {**self._kind, **ardupilot.parameters}
+
+    def names(self) -> list[str]:
+        """Return all parameters that must be known."""
+        return [*self.frame, *self.settings]
+
+    def problem(self, held: Mapping[str, Value]) -> str | None:
+        """Return what is wrong with the frame that ArduCopter flies, in words."""
+        for name, expected in self._kind.items():
+            if held[name] != expected:
+                return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
+        for output, corner in enumerate(self.motors, start=1):
+            function = int(held[f"SERVO{output}_FUNCTION"])
+            found = _ARDUPILOT_QUAD_X.get(function - _ARDUPILOT_MOTOR_1 + 1)
+            if found != corner:
+                return (
+                    f"ArduPilot's output {output} (SERVO{output}_FUNCTION = {function}) turns "
+                    f"{'no motor' if found is None else 'the motor ' + found}, the vehicle's is "
+                    f"{corner}: wrong motor order"
+                )
+        return None
+
+
+def px4_airframe(vehicle: VehicleProfile, output: str) -> Px4Airframe:
+    """Return what PX4 must be set to. Raises UsageError when the profile does not say it."""
+    if vehicle.px4 is None:
+        raise FirmwareMissingError(
+            "--vehicle: its profile has no table [px4]: accepted: one as quad's"
+        )
+    return Px4Airframe(vehicle, vehicle.px4, output)
+
+
+def ardupilot_airframe(vehicle: VehicleProfile) -> ArduPilotAirframe:
+    """Return what ArduPilot must be set to. Raises UsageError when the profile does not say it."""
+    if vehicle.ardupilot is None:
+        raise FirmwareMissingError(
+            "--vehicle: its profile has no table [ardupilot]: accepted: one as quad's"
+        )
+    return ArduPilotAirframe(vehicle.ardupilot)
+
+
+def differences(held: Mapping[str, Value], wanted: Mapping[str, Value]) -> list[str]:
+    """Return what is set otherwise than wanted, in words, one each."""
+    return [
+        f"{name} = {held[name]:g} (vehicle: {value:g})"
+        for name, value in wanted.items()
+        if name in held and not same(held[name], value)
+    ]
+
+
+def _corner(held: Mapping[str, Value], motor: int) -> str:
+    forward, right = float(held[f"CA_ROTOR{motor}_PX"]), float(held[f"CA_ROTOR{motor}_PY"])
+    return f"{'front' if forward > 0.0 else 'rear'} {'right' if right > 0.0 else 'left'}"

@@ -1,0 +1,1 @@
+"""ArduPilot SITL as the flight controller, over its JSON interface."""

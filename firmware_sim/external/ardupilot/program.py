@@ -1,0 +1,102 @@
+"""ArduCopter SITL as a program: where it is, how it is started, its ports."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from airl_mav.core.location import HOME
+from airl_mav.core.ports import LOOPBACK
+from firmware_sim.external.parameter_file import ardupilot_file
+from firmware_sim.external.process.child import Start
+from firmware_sim.flight_controller import FirmwareMissingError
+
+SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
+"""Where instance 0 sends its servo packets, and how far the next one's port is (`-I`)."""
+
+LAYOUTS = (".", "bin", "build/sitl/bin")
+"""Where below a folder arducopter is looked for: the program's own, a build, a source tree."""
+
+PROGRAM = "arducopter"
+OBSERVER_PORT = 14030
+"""UDP port on which an ArduPilot that the user starts is listened to; each instance the next."""
+
+PARAMETERS = "vehicle.parm"
+
+
+@dataclass(frozen=True)
+class Links:
+    """UDP ports on the loopback address that ArduPilot's serial ports talk to."""
+
+    api: int
+    """Of the companion's MAVSDK (serial 0)."""
+    gcs: int
+    """Of the ground station (serial 1)."""
+    observer: int
+    """Ours (serial 2)."""
+
+
+def find_arducopter(path: Path) -> Path:
+    """Return the program of a build or a source tree, or itself.
+
+    Raises:
+        FirmwareMissingError: There is none.
+    """
+    if path.is_file():
+        return path.resolve()
+    for layout in LAYOUTS:
+        program = (path / layout / PROGRAM).resolve()
+        if program.is_file():
+            return program
+    raise FirmwareMissingError(
+        f"--ardupilot-dir {path}: no {PROGRAM}: accepted: the program, its folder, or the source "
+        "tree after `./waf configure --board sitl && ./waf copter`"
+    )
+
+
+def simulator_port(instance: int) -> int:
+    """Return the UDP port of an instance's simulator."""
+    return SIMULATOR_PORT + PORTS_PER_INSTANCE * instance
+
+
+def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
+    """Return program and arguments.
+
+    Args:
+        program: How it is called.
+        instance: Its instance number, which moves the simulator's port.
+        links: Where it talks to.
+        defaults: File of default parameters, relative to its working directory.
+    """
+    home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
+    return [
+        program,
+        *("--model", f"JSON:{LOOPBACK}", "--sim-port-out", str(simulator_port(instance))),
+        *(f"-I{instance}", "--wipe", "--speedup", "1", "--home", home, "--defaults", defaults),
+        *("--serial0", f"udpclient:{LOOPBACK}:{links.api}"),
+        *("--serial1", f"udpclient:{LOOPBACK}:{links.gcs}"),
+        *("--serial2", f"udpclient:{LOOPBACK}:{links.observer}"),
+    ]
+
+
+def start(
+    program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
+) -> Start:
+    """Return how it is started, its parameters in a file.
+
+    Args:
+        program: The program itself.
+        instance: Its instance number, which moves the simulator's port.
+        links: Where it talks to.
+        settings: Parameters, by name.
+        folder: Where it runs, and where the file is put.
+    """
+    (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
+    return Start(command(str(program), instance, links, PARAMETERS), {})
+
+
+def how_to_start(instance: int, links: Links) -> str:
+    """Return the command with which a user starts ArduCopter from its source tree."""
+    return shlex.join(command(f"build/sitl/bin/{PROGRAM}", instance, links, PARAMETERS))

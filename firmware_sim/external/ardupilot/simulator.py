@@ -1,0 +1,261 @@
+"""ArduPilot SITL behind our plant: its JSON simulator interface over UDP, in lockstep.
+
+ArduPilot sends a servo packet, waits for one state line, advances to the line's time and sends the
+next packet. It sends the same packet again after a second without an answer.
+
+Whether it is armed does not travel on this interface: `armed` is whether a motor is commanded to
+turn. ArduCopter turns an armed vehicle's motors on the ground, too (MOT_SPIN_ARM).
+
+Source: ArduPilot libraries/SITL/SIM_JSON.cpp, checked against a running ArduCopter 4.7.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK
+from firmware_sim.external.ardupilot.json_messages import (
+    ServoPacket,
+    ServoPacketError,
+    parse_servos,
+    state_line,
+)
+from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
+from firmware_sim.external.bridge import nobody_to_look_after
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.mavlink.endpoint import Address
+
+SILENCE_S = 5.0
+"""A packet may take so long [wall s]."""
+
+NEWCOMER_S = 0.5
+"""Ours is gone when another one starts while it says nothing for so long [wall s]."""
+
+MAX_GARBAGE = 100
+"""So many datagrams in a row are no slip of somebody else's, once ArduPilot was heard."""
+
+RATES_HZ = range(50, 10_001)
+"""What a frame rate may be [Hz]: lines less than 0.1 s apart, and a clock of whole microseconds."""
+
+_SLICE_S = 0.1
+"""Longest single wait [wall s]: `alive` is asked in between."""
+
+_MAX_DATAGRAM = 4096
+
+MOTORS = 4
+"""Servo outputs 1 to 4 are the motors; what hangs on which is the airframe's business."""
+
+
+class ArdupilotBridge:
+    """One ArduPilot, one episode. Implements `bridge.Bridge`."""
+
+    def __init__(
+        self,
+        port: int = SIMULATOR_PORT,
+        *,
+        pwm_min_us: int = 1000,
+        pwm_max_us: int = 2000,
+        rate_hz: int | None = None,
+        silence_s: float = SILENCE_S,
+    ) -> None:
+        """Open the port; nothing is sent before ArduPilot is heard.
+
+        Args:
+            port: UDP port on the loopback address, see `ardupilot_program.simulator_port`.
+            pwm_min_us: Pulse of a motor that stands (MOT_PWM_MIN) [µs].
+            pwm_max_us: Pulse of full thrust (MOT_PWM_MAX) [µs].
+            rate_hz: Lines a second of simulated time; None = what ArduPilot asks for. It goes by
+                the time of the lines, whatever it asks for, but arms only with 1.8 times its loop
+                rate (SCHED_LOOP_RATE, 400 Hz) or more.
+            silence_s: How long a packet may take [wall s].
+
+        Raises:
+            UsageError: The port is taken.
+        """
+        self.rate_hz = rate_hz or 0
+        self.armed = False
+        self.time_us = 0
+        self.port = port
+        self.garbage = 0
+        """Datagrams so far that were no servo packets."""
+        self._run = 0
+        """How many of them came in a row."""
+        self._pwm_min_us, self._span_us = pwm_min_us, pwm_max_us - pwm_min_us
+        self._silence_us = int(silence_s * US_PER_S)
+        self._alive: Callable[[], None] = nobody_to_look_after
+        self._truth: Callable[[], Truth] | None = None
+        self._address: Address | None = None
+        self._packet: ServoPacket | None = None
+        """The newest one: what the next line answers."""
+        self._newcomer = False
+        """A first packet came from somebody else."""
+        self._veteran = False
+        """A later packet came from somebody else: its time cannot start at 0 again."""
+        self._base_us: int | None = None
+        """Simulated time that is 0 to ArduPilot."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(_SLICE_S)
+        try:
+            self._socket.bind((LOOPBACK, port))
+        except OSError as error:
+            self._socket.close()
+            raise UsageError(
+                f"--instance: UDP port {port} of {LOOPBACK} cannot be bound "
+                f"({error.strerror}): another simulator? Choose another instance (its port is "
+                f"{SIMULATOR_PORT} + {PORTS_PER_INSTANCE} x instance)"
+            ) from error
+
+    def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
+        """Wait for the first servo packet; ArduPilot waits for our answer from then on.
+
+        Args:
+            timeout_s: How long [wall s].
+            alive: Called now and then, here and in `step`; raises when the process has died.
+
+        Raises:
+            FirmwareMissingError: No servo packet came in time, or it asks for an impossible rate.
+        """
+        self._alive = alive
+        stopwatch = WallClock()
+        while self._packet is None:
+            alive()
+            if stopwatch.time_us() > timeout_s * US_PER_S:
+                raise FirmwareMissingError(self._nobody(timeout_s))
+            self._packet = self._receive()
+        self.rate_hz = self.rate_hz or self._packet.frame_rate_hz
+        if self.rate_hz not in RATES_HZ:
+            raise FirmwareMissingError(
+                f"ArduPilot asks for {self.rate_hz} Hz (SIM_RATE_HZ): must be in "
+                f"{RATES_HZ.start}..{RATES_HZ.stop - 1}"
+            )
+
+    def see(self, truth: Callable[[], Truth]) -> None:
+        """Take what tells the true state: ArduPilot makes GPS, barometer and compass of it."""
+        self._truth = truth
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Answer the packet that waits, and return the motor commands of the next one.
+
+        The motors are outputs 1 to 4 in this order. ArduCopter's quad X (FRAME_TYPE 1) numbers
+        them as PX4 does: front right, rear left, front left, rear right.
+
+        Raises:
+            FirmwareLostError: ArduPilot died, is silent, started anew or sends garbage.
+        """
+        answered, truth, address = self._packet, self._truth, self._address
+        if answered is None or truth is None or address is None:
+            raise RuntimeError("step() before wait_connected() and see()")
+        if self._base_us is None:
+            # Its time starts at 0 and must move with the first line, too.
+            self._base_us = sample.time_us - US_PER_S // self.rate_hz
+        self.time_us = sample.time_us - self._base_us
+        answered = self._newest(answered)
+        line = state_line(self.time_us, sample, truth())
+        self._socket.sendto(line, address)
+        self._packet = packet = self._next(answered, line)
+        motors = self._motors(packet.pwm_us)
+        self.armed = any(motors)
+        return ActuatorControls(sample.time_us, motors, self.armed)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._socket.close()
+
+    def _newest(self, packet: ServoPacket) -> ServoPacket:
+        """Return the newest packet that has come while nobody asked.
+
+        One line for all of them: a line too many would put ArduPilot a frame ahead for good.
+        """
+        self._socket.settimeout(0.0)
+        try:
+            while True:
+                newer = self._receive()
+                if newer is None:
+                    return packet
+                packet = _follows(packet, newer)
+        finally:
+            self._socket.settimeout(_SLICE_S)
+
+    def _next(self, answered: ServoPacket, line: bytes) -> ServoPacket:
+        """Wait for the packet after the one that was answered with `line`."""
+        stopwatch = WallClock()
+        repeated = False
+        while True:
+            packet = self._receive()
+            if packet is not None:
+                if _follows(answered, packet).frame_count > answered.frame_count:
+                    return packet
+                repeated = True
+                continue
+            silent_us = stopwatch.time_us()
+            self._alive()
+            if self._newcomer and silent_us >= NEWCOMER_S * US_PER_S:
+                raise FirmwareLostError(_RESTARTED)
+            if silent_us >= self._silence_us:
+                raise FirmwareLostError(
+                    f"ArduPilot has sent no servo packet for {self._silence_us / US_PER_S:g} s"
+                )
+            if repeated and self._address is not None:
+                # It asked again and has nothing newer: the line was lost.
+                repeated = False
+                self._socket.sendto(line, self._address)
+
+    def _receive(self) -> ServoPacket | None:
+        """Return the next servo packet of our ArduPilot; None when none came in time.
+
+        Raises FirmwareLostError when it sends nothing but garbage.
+        """
+        for _ in range(MAX_GARBAGE):
+            try:
+                datagram, address = self._socket.recvfrom(_MAX_DATAGRAM)
+            except (BlockingIOError, TimeoutError):
+                return None
+            try:
+                packet = parse_servos(datagram)
+            except ServoPacketError as error:
+                self._reject(error)
+                continue
+            self._run = 0
+            if self._address is None and packet.frame_count == 0:
+                self._address = address
+            if address == self._address:
+                return packet
+            self._newcomer = self._newcomer or packet.frame_count == 0
+            self._veteran = self._veteran or packet.frame_count > 0
+        return None
+
+    def _reject(self, error: ServoPacketError) -> None:
+        self.garbage += 1
+        self._run += 1
+        if self._run >= MAX_GARBAGE and self._address is not None:
+            raise FirmwareLostError(f"{self._run} datagrams in a row are no servo packets: {error}")
+
+    def _motors(self, pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
+        """Return the commands 0..1 of outputs 1 to 4, in this order."""
+        low, span = self._pwm_min_us, self._span_us
+        a, b, c, d = (min(max((pwm - low) / span, 0.0), 1.0) for pwm in pwm_us[:MOTORS])
+        return a, b, c, d
+
+    def _nobody(self, timeout_s: float) -> str:
+        heard = f", only {self.garbage} datagrams of another kind" if self.garbage else ""
+        if self._veteran:
+            heard = ", only one that has flown before (each flight needs a new one)"
+        return (
+            f"no ArduPilot on UDP port {self.port} of {LOOPBACK} in {timeout_s:g} s{heard}: start "
+            f"it with --model JSON:{LOOPBACK} --sim-port-out {self.port}"
+        )
+
+
+_RESTARTED = "ArduPilot started anew in the middle of an episode"
+
+
+def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
+    """Return `after`. Raises FirmwareLostError when it counts from 0 again."""
+    if after.frame_count < before.frame_count:
+        raise FirmwareLostError(_RESTARTED)
+    return after

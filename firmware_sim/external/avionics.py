@@ -1,0 +1,222 @@
+"""Real firmware aboard: booted, its frame checked, watched; for one episode after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import Protocol
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.vehicle import CORNERS
+from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.state import Message, Severity
+from firmware_sim.external.airframe import GROUND_LOSS, Airframe, differences
+from firmware_sim.external.bridge import Bridge
+from firmware_sim.external.observer import Observer
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import ActuatorControls, SensorSample
+from firmware_sim.mavlink.link import LinkCounters
+from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.simulation import EpisodeSetup
+
+ASK_EVERY_S = 0.25
+"""Parameters that have not come are asked for again so often [wall s]."""
+
+FAREWELL_S = 1.5
+"""Firmware that is told to end is simulated on for so long: PX4 takes 0.4 s [simulated s]."""
+
+SHOWN = 4
+"""So many parameters are named in a message."""
+
+READY_LIMIT_S = 120.0
+"""Longest time from power-up until it may be armed [simulated s]: ArduPilot's EKF takes 40."""
+
+
+class Launcher(Protocol):
+    """How one kind of firmware gets going."""
+
+    airframe: Airframe
+    """What it must be set to."""
+    may_set: bool
+    """Whether its parameters are ours to set: it was started by us, for this flight alone."""
+    reboots: bool
+    """Whether it starts anew by itself when told to; else it can only be told to shut down."""
+
+    def launch(self) -> Bridge:
+        """Start it, or wait for it, and return the bridge, connected.
+
+        Raises:
+            FirmwareMissingError: It cannot be started, or never connects.
+            FirmwareLostError: It died on the way.
+        """
+        ...
+
+    def stop(self) -> None:
+        """End what was started; harmless when nothing was."""
+        ...
+
+    def close(self) -> None:
+        """End what was started, for good: nothing temporary is left."""
+        ...
+
+
+class RealFirmware:
+    """Real firmware behind a bridge. Implements `FlightController`."""
+
+    inside = None
+
+    def __init__(self, bridge: Bridge, observer: Observer, launcher: Launcher) -> None:
+        """Take the bridge, what listens to its MAVLink, and how it got going."""
+        self._bridge = bridge
+        self._observer = observer
+        self._launcher = launcher
+        self._output = tuple(launcher.airframe.motors.index(corner) for corner in CORNERS)
+        self._sample: SensorSample | None = None
+        self.rate_hz = bridge.rate_hz
+        self.see = bridge.see
+
+    @property
+    def on_message(self) -> Callable[[Message], None] | None:
+        """Called with every text for the operator, if set."""
+        return self._observer.on_message
+
+    @on_message.setter
+    def on_message(self, call: Callable[[Message], None] | None) -> None:
+        self._observer.on_message = call
+
+    @property
+    def flight(self) -> Flight:
+        """Phase and mode, as its heartbeat says them; the bridge knows sooner if it is armed."""
+        return self._observer.flight(armed=self._bridge.armed)
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Advance it to the sample's time. Raises FirmwareLostError."""
+        self._sample = sample
+        controls = self._bridge.step(sample)
+        m = controls.motors
+        a, b, c, d = self._output
+        return controls._replace(motors=(m[a], m[b], m[c], m[d]))
+
+    def close(self) -> None:
+        """Leave it: what we started is ended, what the user started is told to end or reboot."""
+        if not self._launcher.may_set:
+            self._tell_to_end()
+        self._bridge.close()
+        self._launcher.stop()
+
+    def _tell_to_end(self) -> None:
+        """The word, and the simulated time that it takes to be heard and obeyed."""
+        sample, self._sample = self._sample, None
+        if sample is None:
+            return
+        self._observer.end(reboot=self._launcher.reboots)
+        period_us = US_PER_S // self.rate_hz
+        with suppress(FirmwareLostError):
+            for _ in range(round(FAREWELL_S * self.rate_hz)):
+                sample = sample._replace(time_us=sample.time_us + period_us)
+                self._bridge.step(sample)
+
+
+class BridgedAvionics:
+    """Implements `firmware_sim.firmware.Avionics` with real firmware."""
+
+    def __init__(self, launcher: Launcher, observer: Observer, timeout_s: float) -> None:
+        """Put it together; nothing is started yet.
+
+        Args:
+            launcher: How the firmware gets going.
+            observer: Listens to its MAVLink.
+            timeout_s: Longest wait for any of its answers before it flies [wall s].
+        """
+        self._launcher = launcher
+        self._observer = observer
+        self._timeout_s = timeout_s
+        self._missing: list[str] = []
+        """Parameters that are being waited for."""
+        self.filenos = observer.filenos
+        self.receive = observer.receive
+        self.send = observer.send
+        self.log_to: Callable[[TlogWriter | None], None] = observer.log_to
+        self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
+
+    def boot(self, setup: EpisodeSetup) -> RealFirmware:
+        """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
+        del setup  # Each start is a power-up: it knows nothing of the last flight.
+        self._observer.restart()
+        return RealFirmware(self._launcher.launch(), self._observer, self._launcher)
+
+    def connect(self, tick: Callable[[], int]) -> None:
+        """Fly ticks on the ground until its frame is known to be right and it may be armed.
+
+        Args:
+            tick: Flies a tick and returns its simulated time [µs].
+
+        Raises:
+            FirmwareMissingError: It is silent, its frame is another one, or it never gets ready.
+            FirmwareLostError: It died.
+        """
+        airframe, observer = self._launcher.airframe, self._observer
+        parameters = observer.parameters
+        self._until(tick, lambda: observer.heard, "a MAVLink heartbeat")
+        names = airframe.names()
+        self._until(tick, self._asking(lambda: parameters.ask(names)), "the parameters")
+        # Where a lost ground station has consequences, a rehearsal without one must have them too.
+        observer.poses_as_ground = not parameters.values.get(GROUND_LOSS, 0)
+        problem = airframe.problem(parameters.values)
+        if problem is not None:
+            raise FirmwareMissingError(problem)
+        if self._launcher.may_set:
+            wanted = airframe.settings
+            self._until(tick, self._asking(lambda: parameters.set(wanted)), "set parameters")
+        elif different := differences(parameters.values, airframe.settings):
+            self._say(f"{airframe.firmware} is set otherwise than the vehicle: {_some(different)}")
+        self._until(tick, lambda: observer.ready, "its word that it may be armed")
+
+    def close(self) -> None:
+        """End the firmware, if we started it, and stop listening."""
+        self._launcher.close()
+        self._observer.close()
+
+    def _asking(self, ask: Callable[[], Iterable[str]]) -> Callable[[], bool]:
+        """Return what asks every so often, and says whether nothing is missing any more."""
+        clock, due_us = WallClock(), 0
+
+        def asked() -> bool:
+            nonlocal due_us
+            if clock.time_us() < due_us:
+                return False
+            due_us = clock.time_us() + int(ASK_EVERY_S * US_PER_S)
+            self._missing = list(ask())
+            return not self._missing
+
+        return asked
+
+    def _until(self, tick: Callable[[], int], met: Callable[[], bool], what: str) -> None:
+        observer, clock = self._observer, WallClock()
+        start_us: int | None = None
+        self._missing = []
+        while not met():
+            now_us = tick()
+            observer.receive(now_us)
+            observer.send(now_us)
+            start_us = now_us if start_us is None else start_us
+            late = now_us - start_us > READY_LIMIT_S * US_PER_S
+            if late or clock.time_us() > self._timeout_s * US_PER_S:
+                left = f" ({_some(self._missing)})" if self._missing else ""
+                spent_s = (now_us - start_us) / US_PER_S
+                raise FirmwareMissingError(
+                    f"{self._launcher.airframe.firmware} runs, but {what}{left} did not come in "
+                    f"{clock.time_us() / US_PER_S:.0f} s ({spent_s:.0f} s simulated); it said: "
+                    f"{observer.last_text or 'nothing'}"
+                )
+
+    def _say(self, text: str) -> None:
+        if self._observer.on_message is not None:
+            self._observer.on_message(Message(Severity.WARNING, text))
+
+
+def _some(words: Sequence[str]) -> str:
+    """Return words for a message: a handful, and how many more there are."""
+    more = f" and {len(words) - SHOWN} more" if len(words) > SHOWN else ""
+    return ", ".join(words[:SHOWN]) + more

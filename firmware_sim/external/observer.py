@@ -1,0 +1,242 @@
+"""Listens to real firmware on a MAVLink link of its own: what it does, says, and is set to.
+
+In flight it commands nothing: companion and ground station talk to the firmware directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from firmware_sim.autopilot.commander import Flight
+from firmware_sim.autopilot.state import Message, Severity
+from firmware_sim.external.modes import flight_of
+from firmware_sim.external.parameter_client import ParameterClient
+from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
+from firmware_sim.mavlink.endpoint import Endpoint
+from firmware_sim.mavlink.link import LinkCounters
+from firmware_sim.mavlink.tlog import TlogWriter
+
+SYSTEM_ID = 254
+"""MAVLink system id of the observer: neither the vehicle's nor a ground station's (255)."""
+
+INTERVALS_US: Mapping[str, int] = {
+    "SYS_STATUS": 500_000,
+    "EXTENDED_SYS_STATE": 200_000,
+    "LOCAL_POSITION_NED": 100_000,
+    "ATTITUDE": 100_000,
+    "GLOBAL_POSITION_INT": 200_000,
+    "GPS_RAW_INT": 200_000,
+}
+"""What it asks for, and how often [µs]: little, the link may be a slow one."""
+
+ASK_EVERY_US = 1_000_000
+"""What has not come is asked for again so often [µs]."""
+
+BEAT_EVERY_US = 1_000_000
+"""Its heartbeat [µs]."""
+
+FORCE = 21196
+"""Second parameter of COMPONENT_ARM_DISARM that disarms in any state (MAVLink, common.xml)."""
+
+REBOOT, SHUT_DOWN = 1, 2
+"""First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""
+
+_PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
+
+
+class Observer:
+    """One link to real firmware. Nothing blocks, nothing that arrives raises."""
+
+    def __init__(self, endpoint: Endpoint, name: str) -> None:
+        """Take the link.
+
+        Args:
+            endpoint: Where the firmware is heard.
+            name: What the link is called in the list of links.
+        """
+        self._endpoint = endpoint
+        self._name = name
+        self._decoder = Decoder(datagrams=endpoint.datagrams)
+        self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
+        self._tlog: TlogWriter | None = None
+        self._rx = self._tx = self._ignored = 0
+        self.on_message: Callable[[Message], None] | None = None
+        """Called with every text for the operator, if set."""
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the firmware: another one is about to be heard."""
+        self._now_us = 0
+        self._heard: WireMessage | None = None
+        self._landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
+        self._ready = False
+        self._asked_us = -ASK_EVERY_US
+        self._came: set[str] = set()
+        self._text = ""
+        self.last_text = ""
+        """What it said last."""
+        self._beat_us = -BEAT_EVERY_US
+        self.poses_as_ground = True
+        """Whether it shows itself as a ground station: PX4 sends texts to nobody else."""
+        self.parameters = ParameterClient(self._send)
+
+    @property
+    def heard(self) -> bool:
+        """Whether a heartbeat has been heard."""
+        return self._heard is not None
+
+    @property
+    def autopilot(self) -> int | None:
+        """MAV_AUTOPILOT of its heartbeat; None before the first."""
+        return None if self._heard is None else int(self._heard.autopilot)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it says that it may be armed, and knows where it is.
+
+        ArduPilot may be armed before that, but not flown by setpoints; it tells no position yet.
+        """
+        return self._ready and "LOCAL_POSITION_NED" in self._came
+
+    @property
+    def heartbeat_armed(self) -> bool:
+        """Whether its newest heartbeat says armed (up to 1 s old)."""
+        beat = self._heard
+        return beat is not None and bool(beat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def flight(self, *, armed: bool) -> Flight:
+        """Return phase and mode; `armed` is whether motors may turn."""
+        beat = self._heard
+        if beat is None:
+            return Flight()
+        return flight_of(
+            beat.autopilot, beat.custom_mode, self._landed, armed=armed, ready=self._ready
+        )
+
+    # --- as the firmware process's MAVLink side
+
+    def filenos(self) -> list[int]:
+        """Return the descriptors that become readable when something arrives."""
+        number = self._endpoint.fileno()
+        return [] if number is None else [number]
+
+    def receive(self, now_us: int) -> int:
+        """Take what has arrived at simulated `now_us` [µs]; return how many messages counted."""
+        self._now_us = now_us
+        counted = 0
+        for chunk in self._endpoint.receive():
+            for message in self._decoder.feed(chunk):
+                self._rx += 1
+                self._write(bytes(message.get_msgbuf()))
+                if self._take(message):
+                    counted += 1
+                else:
+                    self._ignored += 1
+        return counted
+
+    def send(self, now_us: int) -> None:
+        """Ask for what has not come yet, and be there; once a tick, simulated `now_us` [µs]."""
+        self._now_us = now_us
+        if self._heard is None:
+            return
+        if self.poses_as_ground and now_us - self._beat_us >= BEAT_EVERY_US:
+            self._beat_us = now_us
+            self._send(
+                dialect.MAVLink_heartbeat_message(
+                    dialect.MAV_TYPE_GCS, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
+                )
+            )
+        if now_us - self._asked_us < ASK_EVERY_US:
+            return
+        self._asked_us = now_us
+        for name, interval_us in INTERVALS_US.items():
+            if name not in self._came:
+                self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us)
+
+    def end(self, *, reboot: bool) -> None:
+        """Tell the firmware to stop its motors, then to start anew or to shut down."""
+        self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
+        self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, REBOOT if reboot else SHUT_DOWN)
+
+    def log_to(self, tlog: TlogWriter | None) -> None:
+        """Write both directions to a tlog from now on; None ends it."""
+        self._tlog = tlog
+
+    def counters(self) -> dict[str, LinkCounters]:
+        """Return the traffic."""
+        return {
+            self._name: LinkCounters(
+                self._rx,
+                self._tx,
+                self._decoder.malformed,
+                self._ignored + self._decoder.unknown,
+                self._endpoint.send_errors,
+            )
+        }
+
+    def close(self) -> None:
+        """Close the endpoint."""
+        self._endpoint.close()
+
+    # --- messages
+
+    def _take(self, message: WireMessage) -> bool:
+        if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return False  # forwarded from the companion or a ground station
+        name = message.get_type()
+        self._came.add(name)
+        if name == "HEARTBEAT":
+            self._heard = message
+            self.parameters.address(
+                message.get_srcSystem(), message.get_srcComponent(), message.autopilot
+            )
+        elif name == "EXTENDED_SYS_STATE":
+            self._landed = int(message.landed_state)
+        elif name == "SYS_STATUS":
+            self._ready = bool(message.onboard_control_sensors_health & _PREARM)
+        elif name == "STATUSTEXT":
+            self._say(message)
+        elif name == "PARAM_VALUE":
+            self.parameters.take(message)
+        else:
+            return False
+        return True
+
+    def _say(self, message: WireMessage) -> None:
+        """Pass on a text; one that comes in pieces (`id` not 0) when its last has come."""
+        number, piece = getattr(message, "id", 0), getattr(message, "chunk_seq", 0)
+        text = str(message.text)
+        # A piece that fills its field is followed by another one.
+        whole = number == 0 or len(text) < TEXT_LENGTH
+        self._text = text if number == 0 or piece == 0 else self._text + text
+        if not whole:
+            return
+        self.last_text = self._text
+        if self.on_message is not None:
+            self.on_message(Message(Severity(min(int(message.severity), 7)), self._text))
+
+    def _command(self, number: int, *parameters: float) -> None:
+        """Send a COMMAND_LONG to whom was heard, if anybody was."""
+        beat = self._heard
+        if beat is None:
+            return
+        p = (*parameters, *([0.0] * (7 - len(parameters))))
+        self._send(
+            dialect.MAVLink_command_long_message(
+                beat.get_srcSystem(), beat.get_srcComponent(), number, 0, *p
+            )
+        )
+
+    def _send(self, message: WireMessage) -> None:
+        frame = self._encoder.pack(message)
+        self._tx += 1
+        self._write(frame)
+        self._endpoint.send(frame)
+
+    def _write(self, frame: bytes) -> None:
+        if self._tlog is not None:
+            self._tlog.write(self._now_us, frame)
+
+
+TEXT_LENGTH = 50
+"""Characters of one STATUSTEXT."""

@@ -1,0 +1,28 @@
+"""Parameters of real firmware as files that its users' tools read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from firmware_sim.external.parameter_client import Value
+
+_INT32, _REAL32 = 6, 9
+"""MAV_PARAM_TYPE, as QGroundControl writes it."""
+
+
+def ardupilot_file(settings: Mapping[str, Value]) -> str:
+    """Return a file of ArduPilot's: `--defaults` of its SITL, Mission Planner, MAVProxy."""
+    return "".join(f"{name} {value:g}\n" for name, value in settings.items())
+
+
+def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
+    """Return a file that QGroundControl loads (Vehicle Setup > Parameters > Tools).
+
+    Source: QGroundControl, file format "Parameters": vehicle id, component id, name, value, type,
+    between tabs.
+    """
+    head = "# Vehicle-Id Component-Id Name Value Type\n"
+    return head + "".join(
+        f"1\t1\t{name}\t{value:.9g}\t{_INT32 if isinstance(value, int) else _REAL32}\n"
+        for name, value in settings.items()
+    )

@@ -1,0 +1,78 @@
+"""How SITL firmware gets going: a program that we start for each flight, or one that the user does.
+
+What is particular to PX4 and to ArduPilot is in `px4_program.py` and `ardupilot_program.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from firmware_sim.external.airframe import Airframe
+from firmware_sim.external.bridge import Bridge, nobody_to_look_after
+from firmware_sim.external.process.child import FirmwareChild, Start
+from firmware_sim.external.process.working_folder import Workplace
+
+
+class SitlLauncher:
+    """Starts a program for each flight, or waits for the user's. An `avionics.Launcher`."""
+
+    def __init__(
+        self,
+        airframe: Airframe,
+        bridge: Callable[[], Bridge],
+        program: Callable[[Path], Start] | None,
+        workplace: Workplace,
+        *,
+        timeout_s: float,
+        reboots: bool,
+    ) -> None:
+        """Take what is started, and what it flies through.
+
+        Args:
+            airframe: What it must be set to.
+            bridge: Opens the simulator's side of its interface, for one flight.
+            program: Called with an empty folder, which it may write files to: how the program is
+                started in it. None = the user starts it.
+            workplace: Where it runs and logs.
+            timeout_s: Longest wait for it to connect [wall s].
+            reboots: Whether it starts anew by itself when told to reboot.
+        """
+        self.airframe = airframe
+        self.may_set = program is not None
+        self.reboots = reboots
+        self._bridge = bridge
+        self._program = program
+        self._workplace = workplace
+        self._timeout_s = timeout_s
+        self._child: FirmwareChild | None = None
+
+    def launch(self) -> Bridge:
+        """Start it, or wait for the user's; see `avionics.Launcher`."""
+        self.stop()
+        alive = nobody_to_look_after
+        bridge = self._bridge()
+        try:
+            if self._program is not None:
+                folder = self._workplace.fresh()
+                self._child = FirmwareChild(
+                    self.airframe.firmware, self._program(folder), folder, self._workplace.log
+                )
+                alive = self._child.check
+            bridge.wait_connected(self._timeout_s, alive)
+        except BaseException:
+            bridge.close()
+            self.stop()
+            raise
+        return bridge
+
+    def stop(self) -> None:
+        """End what was started."""
+        child, self._child = self._child, None
+        if child is not None:
+            child.stop()
+
+    def close(self) -> None:
+        """End it for good; its temporary folder goes."""
+        self.stop()
+        self._workplace.close()

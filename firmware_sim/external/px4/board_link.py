@@ -1,0 +1,205 @@
+"""The line to a PX4 board: found, rebooted, found again, told things."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from firmware_sim.external.observer import SYSTEM_ID
+from firmware_sim.external.px4.board import Board, silence
+from firmware_sim.external.transport.router import Router
+from firmware_sim.external.transport.serial_port import SerialPort
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.mavlink.codec import Encoder, Layout, Values, WireMessage, dialect
+
+REBOOT_S = 10.0
+"""Longest time until it goes down when told to reboot [wall s]."""
+
+QUIET_S = 1.5
+"""A board that says nothing for so long is down: its heartbeat comes every second [wall s]."""
+
+FORCE = 21196.0
+"""COMPONENT_ARM_DISARM in any state."""
+
+_POLL_S = 0.02
+_AGAIN_S = 0.2
+_BEAT_US = US_PER_S
+_MAVLINK_VERSION = 3
+
+
+class BoardLink:
+    """One board on one device, which may vanish and come back while it reboots.
+
+    Nothing is sent to a board before it was heard.
+    """
+
+    def __init__(
+        self, router: Router, device: str, baud: int, *, budget_bytes_s: int, reboot_s: float
+    ) -> None:
+        """Take where the board is; nothing is opened yet.
+
+        Args:
+            router: Gets the line, and keeps its clients.
+            device: Serial device.
+            baud: Bits a second.
+            budget_bytes_s: What clients may send to the board [bytes/s].
+            reboot_s: Longest time until it goes down when told to reboot [wall s].
+        """
+        self.device = device
+        self.clock = WallClock()
+        self.board = Board(self.clock)
+        """What was heard of it; a new one each time that the device is opened."""
+        self._router = router
+        self._baud = baud
+        self._budget_bytes_s = budget_bytes_s
+        self._reboot_us = int(reboot_s * US_PER_S)
+        self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_USER1)
+        self._line: SerialPort | None = None
+        self._beat_due_us = 0
+
+    @property
+    def lost(self) -> str | None:
+        """Why there is no line, None while there is one."""
+        return self._router.lost or (None if self._line else f"{self.device}: not connected")
+
+    # --- coming and going
+
+    def connect(self, timeout_s: float, alive: Callable[[], None], *, returning: bool) -> None:
+        """Return once a board in HIL mode is heard.
+
+        Args:
+            timeout_s: How long to wait [wall s].
+            alive: Called now and then; raises to give up.
+            returning: Whether the device may be away at first: it was there before.
+
+        Raises:
+            UsageError: The device cannot be opened.
+            FirmwareMissingError: Such a board was not heard.
+            FirmwareLostError: The device did not come back.
+        """
+        self.close()
+        deadline_us = self.clock.time_us() + int(timeout_s * US_PER_S)
+        while not self.board.ready:
+            alive()
+            if self._line is None:
+                self._open(deadline_us if returning else 0)
+                continue
+            self._listen()
+            problem = self.board.setup_problem()
+            if problem is not None:
+                raise FirmwareMissingError(f"--serial {self.device}: the board: {problem}")
+            if self._router.lost is not None:
+                # Its boot loader has a USB of its own, and goes when the firmware comes.
+                self.close()
+                returning = True
+            elif self.clock.time_us() > deadline_us and not self.board.ready:
+                raise FirmwareMissingError(
+                    f"--serial {self.device}: no board in HIL mode within {timeout_s:g} s: "
+                    + silence(self.board, self._router)
+                )
+
+    def _open(self, deadline_us: int) -> None:
+        """Open the device, or wait a moment for it; it may be away until then [wall µs]; 0: not."""
+        try:
+            self._line = SerialPort(self.device, self._baud)
+        except UsageError as error:
+            if self.clock.time_us() < deadline_us:
+                select.select([], [], [], _AGAIN_S)
+                return
+            if deadline_us:
+                raise FirmwareLostError(f"the board did not come back: {error}") from error
+            raise
+        self.board = Board(self.clock)
+        self._router.attach(self._line, self._budget_bytes_s)
+        self._router.on_message = self.board.take
+
+    def go_down(self, alive: Callable[[], None]) -> None:
+        """Reboot a board in HIL mode; return when it is down and the device closed.
+
+        Raises:
+            FirmwareLostError: It stays up.
+        """
+        board, clock = self.board, self.clock
+        deadline_us = clock.time_us() + self._reboot_us
+        due_us, heard_us, heard = 0, clock.time_us(), -1
+        while self._router.lost is None and not board.restarted:
+            alive()
+            now_us = clock.time_us()
+            if self._router.received_bytes != heard:
+                heard, heard_us = self._router.received_bytes, now_us
+            elif now_us - heard_us > QUIET_S * US_PER_S:
+                break
+            if not board.rebooting and now_us >= due_us and now_us - heard_us < _AGAIN_S * US_PER_S:
+                due_us = now_us + US_PER_S
+                if board.armed:
+                    self.disarm()  # or it refuses
+                self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
+            if now_us > deadline_us:
+                raise FirmwareLostError(
+                    f"{self.device}: the board does not reboot (it answered "
+                    f"{_result(board.reboot_answer)}): power-cycle it"
+                )
+            self._listen(beat=not board.rebooting)  # nothing to a boot loader
+        self.close()
+
+    def _listen(self, *, beat: bool = True) -> None:
+        select.select([self._router.fileno()], [], [], _POLL_S)
+        self._router.pump()
+        if beat:
+            self.beat()
+
+    # --- talking
+
+    def send(self, layout: Layout, values: Values) -> bool:
+        """Send a message of the simulator's; False when the line did not take it."""
+        return self._router.send(self._encoder.frame(layout, layout.payload(values)))
+
+    def pump(self) -> None:
+        """Take what has come, pass on what is others'."""
+        self._router.pump()
+
+    def beat(self) -> None:
+        """Send a heartbeat when it is due: the board is to know that the line is used."""
+        now_us = self.clock.time_us()
+        if now_us >= self._beat_due_us and self.board.beats:
+            self._beat_due_us = now_us + _BEAT_US
+            self._tell(
+                dialect.MAVLink_heartbeat_message(
+                    dialect.MAV_TYPE_GENERIC,
+                    dialect.MAV_AUTOPILOT_INVALID,
+                    *(0, 0, dialect.MAV_STATE_ACTIVE, _MAVLINK_VERSION),
+                )
+            )
+
+    def disarm(self) -> None:
+        """Disarm a board in HIL mode, in whatever state it is."""
+        if self.board.ready:
+            self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE)
+
+    def _command(self, number: int, first: float, second: float = 0.0) -> None:
+        target = self.board.system, dialect.MAV_COMP_ID_AUTOPILOT1
+        self._tell(
+            dialect.MAVLink_command_long_message(*target, number, 0, first, second, 0, 0, 0, 0, 0)
+        )
+
+    def _tell(self, message: WireMessage) -> None:
+        self._router.send(self._encoder.pack(message))
+
+    def close(self) -> None:
+        """Close the device; harmless when called again."""
+        self._router.on_message = None
+        self._router.detach()
+        line, self._line = self._line, None
+        if line is not None:
+            line.close()
+        self.board = Board(self.clock)
+
+
+def _result(answer: int | None) -> str:
+    if answer is None:
+        return "nothing"
+    known = dialect.enums["MAV_RESULT"].get(answer)
+    return f"MAV_RESULT {answer}" if known is None else str(known.name)

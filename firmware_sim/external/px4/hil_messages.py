@@ -1,0 +1,196 @@
+"""The plant's samples as MAVLink's HIL messages, and HIL_ACTUATOR_CONTROLS as motor commands.
+
+What PX4 reads on its simulator interface (SITL), and on the normal link of a board in HITL.
+Units are those of common.xml and of PX4's reader where it says otherwise. `BatterySample` has no
+message here: PX4 simulates a battery of its own.
+"""
+
+from __future__ import annotations
+
+import math
+
+from airl_mav.core.constants import DEG, GRAVITY_M_S2
+from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
+from airl_mav.core.location import HOME
+from airl_mav.vehicle.atmosphere import altitude_m
+from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
+from firmware_sim.mavlink.codec import Values, WireMessage, dialect, layout
+
+SENSOR = layout("HIL_SENSOR")
+GPS = layout("HIL_GPS")
+STATE = layout("HIL_STATE_QUATERNION")
+
+IMU_FIELDS = (
+    dialect.HIL_SENSOR_UPDATED_XACC
+    | dialect.HIL_SENSOR_UPDATED_YACC
+    | dialect.HIL_SENSOR_UPDATED_ZACC
+    | dialect.HIL_SENSOR_UPDATED_XGYRO
+    | dialect.HIL_SENSOR_UPDATED_YGYRO
+    | dialect.HIL_SENSOR_UPDATED_ZGYRO
+)
+MAG_FIELDS = (
+    dialect.HIL_SENSOR_UPDATED_XMAG
+    | dialect.HIL_SENSOR_UPDATED_YMAG
+    | dialect.HIL_SENSOR_UPDATED_ZMAG
+)
+# The temperature goes with them: PX4 reads it as the barometer's, and only together with it.
+BARO_FIELDS = (
+    dialect.HIL_SENSOR_UPDATED_ABS_PRESSURE
+    | dialect.HIL_SENSOR_UPDATED_PRESSURE_ALT
+    | dialect.HIL_SENSOR_UPDATED_TEMPERATURE
+)
+
+MOTORS = 4
+STILL = (0.0, 0.0, 0.0, 0.0)
+
+TOLERANCE = 1e-3
+"""A motor command may leave 0..1 by rounding."""
+
+COURSE_UNKNOWN = 65_535
+
+_ID = 0
+"""Of the only instance of each sensor; PX4 takes the first IMU's time for its clock."""
+
+_YAW_UNAVAILABLE = 0
+_NO_AIRSPEED = 0.0
+
+_COURSE_MIN_M_S = 0.1
+"""Slower than this a GPS knows no course."""
+
+_DEGREES = 1e7
+_MM = 1e3
+_CM = 1e2
+
+ACCEL_LIMIT_M_S2 = 32_767 / 2048 * GRAVITY_M_S2
+GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * DEG
+"""Range of the inertial sensors that PX4's drivers simulate: 16 g, 2000 deg/s in 16 bits. What lies
+beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would read as a fall."""
+
+_INT16 = (-32_768, 32_767)
+_UINT16 = (0, 65_535)
+_INT32 = (-(2**31), 2**31 - 1)
+
+
+class ControlsError(ValueError):
+    """HIL_ACTUATOR_CONTROLS that no quadrotor can follow."""
+
+
+def sensor(sample: SensorSample, time_us: int) -> Values:
+    """Return HIL_SENSOR at the firmware's time [µs]: what is not in the sample is not updated."""
+    ax, ay, az = _saturated(sample.accel, ACCEL_LIMIT_M_S2)
+    gx, gy, gz = _saturated(sample.gyro, GYRO_LIMIT_RAD_S)
+    fields = IMU_FIELDS
+    mx = my = mz = pressure = height = 0.0
+    if sample.mag is not None:
+        fields |= MAG_FIELDS
+        mx, my, mz = sample.mag.tolist()
+    if sample.pressure_hpa is not None:
+        fields |= BARO_FIELDS
+        pressure = sample.pressure_hpa
+        height = altitude_m(pressure)
+    return (
+        *(time_us, ax, ay, az, gx, gy, gz, mx, my, mz),
+        *(pressure, _NO_AIRSPEED, height, sample.temperature_c, fields, _ID),
+    )
+
+
+def gps(fix: GpsFix, time_us: int) -> Values:
+    """Return HIL_GPS at the firmware's time [µs].
+
+    `eph` and `epv` are standard deviations [cm], not dilutions: so PX4 reads them.
+    """
+    north, east, down = fix.velocity_ned.tolist()
+    speed = math.hypot(north, east)
+    course = COURSE_UNKNOWN
+    if speed >= _COURSE_MIN_M_S:
+        course = round(math.degrees(math.atan2(east, north)) * _CM) % 36_000
+    return (
+        time_us,
+        fix.fix_type,
+        *_geodetic(fix.position),
+        _fit(fix.eph_m * _CM, _UINT16),
+        _fit(fix.epv_m * _CM, _UINT16),
+        _fit(speed * _CM, _UINT16),
+        *(_fit(v * _CM, _INT16) for v in (north, east, down)),
+        course,
+        fix.satellites,
+        _ID,
+        _YAW_UNAVAILABLE,
+    )
+
+
+def state_quaternion(truth: Truth, time_us: int) -> Values:
+    """Return HIL_STATE_QUATERNION at the firmware's time [µs].
+
+    Airspeeds and accelerations are left at 0: `Truth` does not have them, and PX4 only logs them.
+    """
+    return (
+        time_us,
+        *truth.quaternion.tolist(),
+        *truth.angular_velocity.tolist(),
+        *_geodetic(local_to_geodetic(truth.position, HOME)),
+        *(_fit(v * _CM, _INT16) for v in truth.velocity.tolist()),
+        *(0, 0, 0, 0, 0),
+    )
+
+
+def armed(message: WireMessage) -> bool:
+    """Return what HIL_ACTUATOR_CONTROLS says of arming."""
+    return bool(message.mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
+
+
+def lockstep(message: WireMessage) -> bool:
+    """Return whether HIL_ACTUATOR_CONTROLS comes from a build that waits for the simulator."""
+    return bool(message.flags & dialect.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP)
+
+
+def controls(message: WireMessage, time_us: int) -> ActuatorControls:
+    """Return the motor commands of HIL_ACTUATOR_CONTROLS.
+
+    Motors stand still while disarmed, whatever is commanded: PX4 in HITL does command then.
+
+    Args:
+        message: HIL_ACTUATOR_CONTROLS.
+        time_us: Simulated time at which they hold [µs].
+
+    Raises:
+        ControlsError: While armed, a command is no number, or no motor's.
+    """
+    if not armed(message):
+        return ActuatorControls(time_us, STILL, armed=False)
+    a, b, c, d = message.controls[:MOTORS]
+    if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0:
+        return ActuatorControls(time_us, (a, b, c, d), armed=True)
+    for i, value in enumerate((a, b, c, d)):
+        # Written so that NaN fails.
+        if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
+            raise ControlsError(
+                f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}, a motor takes 0..1: is its "
+                "airframe a quadrotor?"
+            )
+    a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
+    return ActuatorControls(time_us, (a, b, c, d), armed=True)
+
+
+def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
+    """Return three axes, each within +-limit."""
+    x, y, z = measured.tolist()
+    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
+        return x, y, z
+    x, y, z = (min(limit, max(-limit, value)) for value in (x, y, z))
+    return x, y, z
+
+
+def _geodetic(point: Geodetic) -> tuple[int, int, int]:
+    """Return latitude, longitude [1e-7 deg], altitude [mm]."""
+    return (
+        round(point.latitude_deg * _DEGREES),
+        round(point.longitude_deg * _DEGREES),
+        _fit(point.altitude_m * _MM, _INT32),
+    )
+
+
+def _fit(value: float, limits: tuple[int, int]) -> int:
+    """Return the nearest integer that the field holds."""
+    low, high = limits
+    return round(min(high, max(low, value)))

@@ -1,0 +1,269 @@
+"""Hardware in the loop: a PX4 board that flies on our sensors over its serial or USB line.
+
+There is no lockstep. The board runs on its own clock; every tick's sensors are sent to it, and its
+newest motor commands are taken as they come, a transfer and a cycle of the board late.
+
+Source: PX4, src/modules/mavlink: mavlink_receiver.cpp (HIL_SENSOR, HIL_GPS),
+streams/HIL_ACTUATOR_CONTROLS.hpp; Commander.cpp (reboot).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import TICK_HZ, US_PER_S
+from airl_mav.core.errors import UsageError
+from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external.px4.board_link import REBOOT_S, BoardLink
+from firmware_sim.external.transport.router import Router
+from firmware_sim.external.transport.serial_port import (
+    BITS_PER_BYTE,
+    DEFAULT_BAUD,
+    carries_bytes_s,
+    check_baud,
+)
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+
+SILENCE_S = 1.0
+"""Longest time without motor commands, once there were some [wall s]."""
+
+FIRST_CONTROLS_S = 10.0
+"""Longest time with sensors but without motor commands [wall s]."""
+
+EPOCH_US = US_PER_S
+"""Time in the first sample [µs]; the board takes its own clock's instead."""
+
+SENSOR_BYTES, GPS_BYTES = 76, 51
+"""Longest frames of HIL_SENSOR and HIL_GPS."""
+
+GPS_HZ = 10
+
+HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
+"""What the simulator sends [bytes/s]."""
+
+HIL_SHARE = 2 / 3
+"""The most that may be of what a line carries: the rest is for companion and ground station."""
+
+USB_CLIENTS_BYTES_S = 100_000
+"""What those may send over USB [bytes/s]: a tenth of what it carries at full speed."""
+
+_CREEP_US = 20
+_BEHIND_US = 20_000
+
+
+class Pace:
+    """Holds ticks to 250 a second of wall time, whatever is asked: the board's clock is no sim's.
+
+    Where ticks are paced already it finds the pace of the punctual ones and waits no more.
+    """
+
+    def __init__(self, clock: WallClock) -> None:
+        self._clock = clock
+        self._origin_us: int | None = None
+        """Wall time of simulated time 0 [µs]."""
+
+    def wait(self, time_us: int) -> None:
+        """Wait for the tick of simulated `time_us`."""
+        now_us = self._clock.time_us()
+        if self._origin_us is None:
+            self._origin_us = now_us - time_us
+        ahead_us = self._origin_us + time_us - now_us
+        if ahead_us > 0:
+            # Somebody else's pace may be ahead of ours for good: give way slowly.
+            self._origin_us -= min(ahead_us, _CREEP_US)
+            self._clock.sleep_until(self._origin_us + time_us)
+        elif ahead_us < -_BEHIND_US:
+            self._origin_us = now_us - time_us
+
+
+class HitlBridge:
+    """Flies one board for one episode. Implements `Bridge`.
+
+    The flight ends (`FirmwareLostError`) when the device goes, when motor commands stay away, when
+    the board restarts or leaves HIL mode, or commands what no motor can do.
+
+    Nothing is sent to a board before it was heard, no sensors before it says that it is in HIL
+    mode, and never HIL_STATE_QUATERNION, which a board takes for its own estimate.
+    """
+
+    rate_hz = TICK_HZ
+
+    def __init__(
+        self,
+        router: Router,
+        device: str,
+        baud: int = DEFAULT_BAUD,
+        *,
+        reboot: bool = True,
+        returning: bool = False,
+        silence_s: float = SILENCE_S,
+        first_controls_s: float = FIRST_CONTROLS_S,
+        reboot_s: float = REBOOT_S,
+    ) -> None:
+        """Take where the board is; nothing is opened yet.
+
+        Args:
+            router: Gets its line, and keeps its clients.
+            device: Serial device.
+            baud: Bits a second.
+            reboot: Whether the board is rebooted once it is found: its estimator may have flown.
+            returning: Whether the device may be away at first: it was there before.
+            silence_s: Longest time between motor commands [wall s].
+            first_controls_s: Longest time until the first motor commands [wall s].
+            reboot_s: Longest time until it goes down when told to reboot [wall s].
+
+        Raises:
+            UsageError: The line is too slow.
+        """
+        self.armed = False
+        self.time_us = 0
+        self.went_down = False
+        """The board was told to reboot by others, and did when this was closed."""
+        self.unsent = 0
+        """Samples that the line did not take."""
+        self._link = BoardLink(
+            router,
+            device,
+            baud,
+            budget_bytes_s=check_line(device, baud),
+            reboot_s=reboot_s,
+        )
+        self._reboot, self._returning = reboot, returning
+        self._silence_us = int(silence_s * US_PER_S)
+        self._first_us = int(first_controls_s * US_PER_S)
+        self._pace = Pace(self._link.clock)
+        self._epoch_us: int | None = None
+        """Simulated time that is 0 to the board [µs]."""
+        self._began_us = 0
+        """When the first sample was sent [wall µs]."""
+        self._stuck_us: int | None = None
+        """Since when the line has taken none [wall µs]."""
+        self._stepped_us = 0
+        """When the newest step was [wall µs]."""
+        self._resumed_us = 0
+        """When we went on after a standstill of our own [wall µs]."""
+
+    def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
+        """Find the board in HIL mode, reboot it, and find it again; see `Bridge`.
+
+        Raises:
+            UsageError: The device cannot be opened.
+            FirmwareMissingError: No board in HIL mode was heard within `timeout_s`, each time.
+            FirmwareLostError: It does not reboot, or does not come back.
+        """
+        self._link.connect(timeout_s, alive, returning=self._returning)
+        if self._reboot:
+            self._link.go_down(alive)
+            self._link.connect(timeout_s, alive, returning=True)
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Send a tick's sensors, take the newest motor commands; none yet: motors stand still.
+
+        Raises:
+            FirmwareLostError: The flight is over.
+            FirmwareMissingError: What it sends first cannot be flown.
+        """
+        self._pace.wait(sample.time_us)
+        link = self._link
+        link.pump()
+        now_us = link.clock.time_us()
+        if self._epoch_us is None:
+            self._epoch_us = sample.time_us - EPOCH_US
+            self._began_us = now_us
+            link.board.controls = None  # of before
+        if now_us - self._stepped_us > self._silence_us // 2:
+            self._resumed_us = now_us  # a board without sensors sends no commands
+        self._stepped_us = now_us
+        self._check(now_us)
+        self._send(sample, sample.time_us - self._epoch_us, now_us)
+        link.beat()
+        message = link.board.controls
+        if message is None:
+            return ActuatorControls(sample.time_us, hil.STILL, armed=False)
+        self.time_us = int(message.time_usec)
+        try:
+            controls = hil.controls(message, sample.time_us)
+        except hil.ControlsError as error:
+            raise FirmwareLostError(f"{link.device}: {error}") from error
+        self.armed = controls.armed
+        return controls
+
+    def see(self, truth: Callable[[], Truth]) -> None:
+        """Do nothing: a board would take the true state for its estimate."""
+
+    def close(self) -> None:
+        """Disarm the board and close the device; harmless when called again."""
+        link = self._link
+        if link.board.rebooting:
+            # Who finds it next must not take it for one that has come up.
+            with suppress(FirmwareLostError):
+                link.go_down(_nobody)
+                self.went_down = True
+        elif self.armed or link.board.armed:
+            link.disarm()
+        link.close()
+
+    def _check(self, now_us: int) -> None:
+        """Raise when the flight is over."""
+        board, device = self._link.board, self._link.device
+        if self._link.lost is not None:
+            raise FirmwareLostError(self._link.lost)
+        if board.rebooting:
+            raise FirmwareLostError(f"{device}: the board was told to reboot, and does")
+        if board.restarted:
+            raise FirmwareLostError(f"{device}: the board has restarted: its clock went back")
+        if not board.hil:
+            raise FirmwareLostError(f"{device}: the board has left HIL mode")
+        quiet_us = now_us - max(board.controls_us, self._resumed_us)
+        if board.controls is not None and quiet_us > self._silence_us:
+            raise FirmwareLostError(
+                f"{device}: board silent: no HIL_ACTUATOR_CONTROLS for "
+                f"{(now_us - board.controls_us) / US_PER_S:.1f} s"
+            )
+        problem = board.setup_problem()
+        if board.controls is None and now_us - self._began_us > self._first_us:
+            problem = (
+                "it sends no HIL_ACTUATOR_CONTROLS: does its firmware have pwm_out_sim, does the "
+                "link allow more than 5000 bytes/s (MAV_0_RATE; USB always does)?"
+            )
+        if problem is not None and self.time_us == 0:
+            raise FirmwareMissingError(f"--serial {device}: the board: {problem}")
+        if problem is not None:
+            raise FirmwareLostError(f"{device}: the board: {problem}")
+        if self._stuck_us is not None and now_us - self._stuck_us > self._silence_us:
+            raise FirmwareLostError(f"{device}: the line takes nothing more: the board hangs")
+
+    def _send(self, sample: SensorSample, time_us: int, now_us: int) -> None:
+        if self._link.send(hil.SENSOR, hil.sensor(sample, time_us)):
+            self._stuck_us = None
+        else:
+            self.unsent += 1
+            self._stuck_us = now_us if self._stuck_us is None else self._stuck_us
+        if sample.gps is not None:
+            self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
+
+
+def check_line(device: str, baud: int) -> int:
+    """Return what clients may send to the board [bytes/s].
+
+    Raises:
+        UsageError: The line does not carry the sensors.
+    """
+    check_baud(baud)
+    carries = carries_bytes_s(device, baud)
+    if carries is None:
+        return USB_CLIENTS_BYTES_S
+    if carries * HIL_SHARE < HIL_BYTES_S:
+        raise UsageError(
+            f"--baud {baud}: {TICK_HZ} HIL_SENSOR a second are {HIL_BYTES_S * BITS_PER_BYTE} bit/s,"
+            f" {device} would carry {baud} for everything: accepted: at least "
+            f"{int(HIL_BYTES_S * BITS_PER_BYTE / HIL_SHARE)} (usual: 460800, 921600), or USB"
+        )
+    return carries - HIL_BYTES_S
+
+
+def _nobody() -> None:
+    """Do nothing: there is no process to look after."""

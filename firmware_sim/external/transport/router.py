@@ -1,0 +1,321 @@
+"""MAVLink between a board on one serial line and those who talk to it over UDP.
+
+The line carries two things at once: the simulator's messages, which stay here, and everything that
+companion and ground station say and hear, which passes unchanged, frame by frame.
+"""
+
+from __future__ import annotations
+
+import selectors
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.external.transport.serial_port import SerialLostError
+from firmware_sim.mavlink.codec import Decoder, WireMessage, dialect, message_id
+from firmware_sim.mavlink.endpoint import Endpoint
+from firmware_sim.mavlink.link import LinkCounters
+
+SIMULATOR_IDS = frozenset(
+    message_id(name)
+    for name in (
+        "HIL_ACTUATOR_CONTROLS",
+        "HIL_CONTROLS",
+        "HIL_GPS",
+        "HIL_OPTICAL_FLOW",
+        "HIL_RC_INPUTS_RAW",
+        "HIL_SENSOR",
+        "HIL_STATE_QUATERNION",
+    )
+)
+"""Pass in neither direction: nobody but us simulates for the board, and nobody else needs it."""
+
+BURST_BYTES = 8192
+"""How much may go to the board at once before the budget counts."""
+
+HEARD_FRAMES = 4096
+"""Frames kept for who listens in this process: ten seconds of a PX4's telemetry."""
+
+
+class Frame(NamedTuple):
+    """One frame as it came."""
+
+    raw: bytes
+    number: int
+    """Message id."""
+    message: WireMessage
+
+    @property
+    def known(self) -> bool:
+        """Whether the dialect has the message, so that its checksum was checked."""
+        return self.number in dialect.mavlink_map
+
+
+class FrameDecoder(Decoder):
+    """A decoder that keeps the bytes, of messages that the dialect lacks too."""
+
+    def __init__(self, *, datagrams: bool) -> None:
+        super().__init__(datagrams=datagrams)
+        self._frames: list[Frame] = []
+
+    def frames(self, data: bytes) -> list[Frame]:
+        """Return the frames completed by a chunk of bytes."""
+        self.feed(data)
+        found, self._frames = self._frames, []
+        return found
+
+    def _decode(self, buffer: bytes, start: int, end: int) -> WireMessage | None:
+        message = super()._decode(buffer, start, end)
+        if message is not None:
+            self._frames.append(Frame(buffer[start:end], int(message.get_msgId()), message))
+        return message
+
+
+class Budget:
+    """So many bytes a second, and a burst of them at once."""
+
+    def __init__(self, bytes_s: int, clock: Clock) -> None:
+        """Start with a full burst.
+
+        Args:
+            bytes_s: In the long run.
+            clock: Wall time.
+        """
+        self._bytes_s = bytes_s
+        self._clock = clock
+        self._left = float(BURST_BYTES)
+        self._then_us = clock.time_us()
+
+    def take(self, count: int) -> bool:
+        """Tell whether `count` bytes may go now; if so they are spent."""
+        now_us = self._clock.time_us()
+        self._left += self._bytes_s * (now_us - self._then_us) / US_PER_S
+        self._left, self._then_us = min(self._left, BURST_BYTES), now_us
+        if count > self._left:
+            return False
+        self._left -= count
+        return True
+
+
+class Line(Protocol):
+    """The board's end; `serial_port.SerialPort` is one. All may raise SerialLostError."""
+
+    def read(self) -> bytes:
+        """Return what has arrived."""
+        ...
+
+    def write(self, data: bytes) -> bool:
+        """Send soon; False when dropped."""
+        ...
+
+    def drain(self) -> None:
+        """Send what waits."""
+        ...
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        ...
+
+
+class _Client:
+    """One UDP end."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.endpoint = endpoint
+        self.decoder = FrameDecoder(datagrams=endpoint.datagrams)
+        self.rx = self.tx = self.refused = 0
+
+
+class Router:
+    """Passes frames on whenever `pump` is called. Nothing blocks; only `send` tells of a loss.
+
+    The line comes and goes (a board's USB vanishes while it reboots), the clients stay.
+    """
+
+    def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
+        """Take the clients' ends.
+
+        Args:
+            clients: Endpoints by the names of their links; they become the router's to close.
+            clock: Wall time.
+        """
+        self.lost: str | None = None
+        """Why the line is gone; None while there is one, or none was there yet."""
+        self.on_message: Callable[[WireMessage], None] | None = None
+        """Called with every message of the board that the dialect knows, if set."""
+        self.received_bytes = 0
+        """From the line since it was attached."""
+        self.speaks_mavlink = False
+        """A frame with a good checksum has come since the line was attached. Nothing is sent
+        before: at the other end may be a boot loader, which takes bytes for commands."""
+        self._clients = {name: _Client(endpoint) for name, endpoint in clients.items()}
+        self._clock = clock
+        self._line: Line | None = None
+        self._line_fd = -1
+        self._decoder = FrameDecoder(datagrams=False)
+        self._budget = Budget(0, clock)
+        self._heard: deque[bytes] = deque(maxlen=HEARD_FRAMES)
+        self._refused = 0
+        self._selector = selectors.DefaultSelector()
+        for client in self._clients.values():
+            number = client.endpoint.fileno()
+            if number is not None:
+                self._selector.register(number, selectors.EVENT_READ)
+
+    # --- the line
+
+    def attach(self, line: Line, budget_bytes_s: int) -> None:
+        """Take a line, in place of another; it stays the caller's to close.
+
+        Args:
+            line: To the board.
+            budget_bytes_s: How much of it clients may use towards the board [bytes/s].
+        """
+        self.detach()
+        self._line, self._line_fd = line, line.fileno()
+        self._selector.register(self._line_fd, selectors.EVENT_READ)
+        self._decoder = FrameDecoder(datagrams=False)
+        self._budget = Budget(budget_bytes_s, self._clock)
+        self._heard.clear()
+        self.lost, self.received_bytes, self.speaks_mavlink = None, 0, False
+
+    def detach(self) -> None:
+        """Let go of the line; call it before the line is closed."""
+        if self._line is not None:
+            self._selector.unregister(self._line_fd)
+            self._line = None
+
+    def send(self, frame: bytes) -> bool:
+        """Send a frame of the simulator's: outside the budget, ahead of everybody else's.
+
+        Return whether it went; False when the line is full, gone (see `lost`), or no MAVLink.
+        """
+        return self._to_line(frame)
+
+    # --- passing on
+
+    def pump(self) -> None:
+        """Pass on everything that has arrived."""
+        for frame in self._from_line():
+            if frame.known:
+                self.speaks_mavlink = True
+            if frame.known and self.on_message is not None:
+                self.on_message(frame.message)
+            if frame.number in SIMULATOR_IDS:
+                continue
+            self._heard.append(frame.raw)
+            for client in self._clients.values():
+                client.endpoint.send(frame.raw)
+                client.tx += 1
+        for client in self._clients.values():
+            for chunk in client.endpoint.receive():
+                for frame in client.decoder.frames(chunk):
+                    client.rx += 1
+                    if frame.number in SIMULATOR_IDS or not self.pass_to_board(frame.raw):
+                        client.refused += 1
+
+    def pass_to_board(self, frame: bytes) -> bool:
+        """Send a client's frame to the board; False when budget or line do not allow it."""
+        return self.speaks_mavlink and self._budget.take(len(frame)) and self._to_line(frame)
+
+    def _from_line(self) -> list[Frame]:
+        line = self._line
+        if line is None:
+            return []
+        try:
+            line.drain()
+            data = line.read()
+        except SerialLostError as error:
+            self._lose(error)
+            return []
+        self.received_bytes += len(data)
+        return self._decoder.frames(data) if data else []
+
+    def _to_line(self, frame: bytes) -> bool:
+        if self._line is None or not self.speaks_mavlink:
+            return False
+        try:
+            return self._line.write(frame)
+        except SerialLostError as error:
+            self._lose(error)
+            return False
+
+    def _lose(self, error: SerialLostError) -> None:
+        # A line that hung up stays readable: waiting for it would never wait again.
+        self.detach()
+        self.lost = str(error)
+
+    # --- who listens
+
+    def take_heard(self) -> list[bytes]:
+        """Return and forget the board's frames that have come since the last call."""
+        heard = list(self._heard)
+        self._heard.clear()
+        return heard
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while the line or a client is."""
+        return self._selector.fileno()  # epoll's or kqueue's, which can be waited for itself
+
+    def counters(self) -> dict[str, LinkCounters]:
+        """Return the traffic with each client."""
+        return {
+            name: LinkCounters(
+                client.rx,
+                client.tx,
+                client.decoder.malformed,
+                client.refused,
+                client.endpoint.send_errors,
+            )
+            for name, client in self._clients.items()
+        }
+
+    def close(self) -> None:
+        """Close the clients' ends; harmless when called again."""
+        self.detach()
+        for client in self._clients.values():
+            client.endpoint.close()
+        self._selector.close()
+
+
+class RouterEnd:
+    """The router as an endpoint for somebody in this process. Implements `Endpoint`.
+
+    It is the one that keeps the router going between ticks, and closes it.
+    """
+
+    datagrams = True
+
+    def __init__(self, router: Router) -> None:
+        self.send_errors = 0
+        self._router = router
+        self._closed = False
+
+    def receive(self) -> list[bytes]:
+        """Pass on what has arrived and return the board's frames, oldest first."""
+        if self._closed:
+            return []
+        self._router.pump()
+        return self._router.take_heard()
+
+    def send(self, data: bytes) -> None:
+        """Send one frame to the board."""
+        if not self._router.pass_to_board(data):
+            self.send_errors += 1
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send frames to the board."""
+        for frame in frames:
+            self.send(frame)
+
+    def fileno(self) -> int | None:
+        """Return a descriptor that is readable when anything of the router's is."""
+        return None if self._closed else self._router.fileno()
+
+    def close(self) -> None:
+        """Close the router."""
+        if not self._closed:
+            self._closed = True
+            self._router.close()

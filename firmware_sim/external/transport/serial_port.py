@@ -1,0 +1,179 @@
+"""A serial port, or USB that looks like one: bytes in, bytes out, nothing blocks."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+from contextlib import suppress
+from pathlib import Path
+
+import serial
+from serial.tools import list_ports
+
+from airl_mav.core.errors import UsageError
+
+DEFAULT_BAUD = 921_600
+
+BAUDS = range(1_200, 12_000_001)
+
+BUFFER_BYTES = 4096
+"""What may wait for the line: a fifth of a second of sensors; older ones are worth nothing."""
+
+BITS_PER_BYTE = 10
+"""On a UART, with start and stop bit."""
+
+_CHUNK = 4096
+_CHUNKS_PER_READ = 16
+"""A flood must not hold up the simulation."""
+
+_LAST_CHANCES, _LAST_CHANCE_S = 10, 0.01
+"""How often and how long the last bytes are waited for [wall s]."""
+
+_NO_UART = ("ttyACM", "pts/", "cu.usbmodem", "tty.usbmodem")
+"""Names of devices without a UART behind them: USB's own serial class, and pseudo-terminals."""
+
+_GONE = select.POLLHUP | select.POLLERR | select.POLLNVAL
+
+_BUSY = (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK)
+_LATER = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
+
+
+class SerialLostError(Exception):
+    """The device was unplugged, or its driver gave up."""
+
+
+class SerialPort:
+    """An open serial device."""
+
+    def __init__(self, device: str, baud: int = DEFAULT_BAUD) -> None:
+        """Open it for us alone, 8N1, without flow control; what had arrived before is dropped.
+
+        Args:
+            device: Path: /dev/ttyACM0, or better one of /dev/serial/by-id.
+            baud: Bits a second; USB and pseudo-terminals do not care.
+
+        Raises:
+            UsageError: It cannot be opened.
+        """
+        check_baud(baud)
+        self.device = device
+        self.dropped = 0
+        """Writes dropped because the line was full."""
+        try:
+            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:
+            raise UsageError(_open_problem(device, baud, error)) from error
+        self._waiting = bytearray()
+        self._fd: int = self._port.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._fd, select.POLLIN)
+
+    def read(self) -> bytes:
+        """Return what has arrived, b"" when nothing has. Raises SerialLostError."""
+        received = bytearray()
+        for _ in range(_CHUNKS_PER_READ):
+            try:
+                # Asked first: a terminal without data and one that hung up both read as b"".
+                events = self._poll.poll(0)
+                if not events:
+                    break
+                chunk = os.read(self._fd, _CHUNK) if events[0][1] & select.POLLIN else b""
+            except OSError as error:
+                if error.errno in _LATER:
+                    break
+                if received:
+                    break  # what came before it went is worth having; the next read tells
+                raise SerialLostError(self._lost(error)) from error
+            if not chunk:
+                if received:
+                    break
+                raise SerialLostError(self._lost(None))
+            received += chunk
+            if len(chunk) < _CHUNK and not events[0][1] & _GONE:
+                break
+        return bytes(received)
+
+    def write(self, data: bytes) -> bool:
+        """Send when the line takes it; False when too much waits already: `data` is dropped.
+
+        Raises SerialLostError.
+        """
+        self.drain()
+        if len(self._waiting) + len(data) > BUFFER_BYTES:
+            self.dropped += 1
+            return False
+        self._waiting += data
+        self.drain()
+        return True
+
+    def drain(self) -> None:
+        """Send as much as the line takes now of what waits. Raises SerialLostError."""
+        while self._waiting:
+            # Not pyserial's write: without a timeout it spins until the line is free.
+            try:
+                sent = os.write(self._fd, self._waiting)
+            except OSError as error:
+                if error.errno in _LATER:
+                    return
+                raise SerialLostError(self._lost(error)) from error
+            if not sent:
+                return
+            del self._waiting[:sent]
+
+    def fileno(self) -> int:
+        """Return the descriptor to wait on."""
+        return self._fd
+
+    def close(self) -> None:
+        """Close it; what the line does not take in a moment is lost. Harmless when called again."""
+        with suppress(SerialLostError, OSError, TypeError):  # pyserial's, when it is closed
+            for _ in range(_LAST_CHANCES):
+                self.drain()
+                if not self._waiting and not self._port.out_waiting:
+                    break
+                select.select([], [], [], _LAST_CHANCE_S)
+            else:
+                # Or closing waits until a line that stands still takes it.
+                self._port.reset_output_buffer()
+        with suppress(OSError):
+            self._port.close()
+
+    def _lost(self, error: OSError | None) -> str:
+        why = "it hung up" if error is None else str(error.strerror)
+        return f"{self.device} is gone ({why}): unplugged, or the board was reset"
+
+
+def check_baud(baud: int) -> None:
+    """Raise UsageError when no device has such a rate."""
+    if baud not in BAUDS:
+        raise UsageError(f"--baud {baud}: must be in {BAUDS[0]}..{BAUDS[-1]}")
+
+
+def carries_bytes_s(device: str, baud: int) -> int | None:
+    """Return what the line carries each way [bytes/s]; None where the baud rate means nothing."""
+    # /dev/serial/by-id is full of links.
+    path = str(Path(device).resolve())
+    if any(name in path for name in _NO_UART):
+        return None
+    return baud // BITS_PER_BYTE
+
+
+def _open_problem(device: str, baud: int, error: Exception) -> str:
+    number = error.errno if isinstance(error, OSError) else None
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        present = ", ".join(sorted(port.device for port in list_ports.comports()))
+        return f"--serial {device}: no such device; there are: {present or 'none'}"
+    if number in (errno.EACCES, errno.EPERM):
+        return (
+            f"--serial {device}: no permission: add yourself to the device's group (Linux: "
+            "sudo usermod -aG dialout $USER, then log in again)"
+        )
+    if number in _BUSY:
+        return (
+            f"--serial {device}: another program has it open (QGroundControl, ModemManager, "
+            "another simulator): close that one first"
+        )
+    if isinstance(error, ValueError):
+        return f"--baud {baud}: {device} cannot do that ({error})"
+    return f"--serial {device}: no serial device ({error})"

@@ -1,0 +1,271 @@
+"""Frames from the plant to the companion: when, of what, and only the newest."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import zmq
+
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import Mount
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
+from companion.camera import ZmqFrameSource
+from firmware_sim.plant.camera_server import CameraServer, DepthCamera
+
+LENS = Intrinsics.from_fov(33, 25, math.pi / 2)
+LOOPBACK = "tcp://127.0.0.1:0"
+
+
+def room(half: float = 20.0, *, pillar_at: float | None = None) -> Arena:
+    """Make a square room, with a pillar of 1 m radius to the north or empty."""
+    n = 0 if pillar_at is None else 1
+    pillars = Obstacles(
+        np.full(n, Shape.CYLINDER, np.int8),
+        np.array([[pillar_at or 0.0, 0.0, -2.0]])[:n],
+        np.array([[1.0, 1.0, 2.0]])[:n],
+        np.zeros(n),
+    )
+    bounds = Bounds(-half, half, -half, half, 5.0)
+    return Arena("room", 0, bounds, (0, 0, 0), pillars, (), np.zeros(2))
+
+
+def camera(rate_hz: float = 30.0, mount: Mount | None = None, arena: Arena | None = None):
+    level = Mount((0.0, 0.0, 0.0), 0.0)
+    return DepthCamera(LENS, mount or level, rate_hz, 60.0, arena or room())
+
+
+def take(cam: DepthCamera, time_us: int = 0, yaw: float = 0.0, arena: Arena | None = None) -> Frame:
+    centers = (arena or room()).obstacles.center
+    return cam.capture(time_us, np.array([0.0, 0, -2]), quat_from_euler(0, 0, yaw), centers)
+
+
+def frame(sequence: int) -> Frame:
+    return Frame(sequence, sequence * 10, np.full((48, 64), sequence, np.uint16), FRAME_LENS)
+
+
+FRAME_LENS = Intrinsics.from_fov(64, 48, math.pi / 2)
+
+
+# --- the camera ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 7.0, 10.0, 29.97, 30.0, 60.0, 90.0, 125.0])
+def test_rate_is_kept_on_average(rate_hz: float) -> None:
+    cam, times = camera(rate_hz), []
+    for time_us in range(0, 10 * US_PER_S, TICK_US):
+        if cam.due(time_us):
+            take(cam, time_us)
+            times.append(time_us)
+    assert len(times) == math.ceil(10 * rate_hz)
+    # Every frame within a tick of its nominal time.
+    late = np.array(times) - np.arange(len(times)) * US_PER_S / rate_hz
+    assert np.all((late >= 0) & (late < TICK_US + 1))
+
+
+def test_missed_frames_are_not_made_up_for() -> None:
+    cam = camera(10.0)
+    take(cam, 0)
+    assert not cam.due(99_999)
+    assert cam.due(100_000)
+    take(cam, 350_000)
+    assert not cam.due(399_999)
+    assert cam.due(400_000)
+
+
+def test_sequence_counts_frames_and_goes_on_after_a_reset() -> None:
+    cam = camera()
+    assert [take(cam, t).sequence for t in (0, 40_000, 80_000)] == [0, 1, 2]
+    nearer = room(10.0)
+    cam.reset(nearer, 1_000)
+    assert not cam.due(999)
+    assert cam.due(1_000)
+    after = take(cam, 1_000)
+    assert (after.sequence, after.capture_time_us) == (3, 1_000)
+    assert after.depth_mm[12, 16] == 10_000
+
+
+def test_frame_shows_the_arena_in_millimetres() -> None:
+    got = take(camera())
+    assert got.intrinsics == LENS
+    assert got.depth_mm.shape == (25, 33)
+    assert np.all(got.depth_mm[12] == 20_000)
+
+
+def test_mount_moves_and_tilts_the_camera() -> None:
+    # 0.5 m ahead of the vehicle, which faces east; looking down 45 degrees from 2 m + 0.25 m.
+    cam = camera(mount=Mount((0.5, 0.0, -0.25), -math.pi / 4))
+    floor = take(cam, yaw=math.pi / 2).depth_mm[12, 16]
+    assert floor == round(2250 * math.sqrt(2.0))
+    ahead = take(camera(mount=Mount((0.5, 0.0, 0.0), 0.0)), yaw=math.pi / 2)
+    assert ahead.depth_mm[12, 16] == 19_500
+
+
+def test_moving_obstacle_is_seen_where_it_is_now() -> None:
+    arena = room(pillar_at=6.0)
+    cam = camera(arena=arena)
+    assert take(cam, arena=arena).depth_mm[12, 16] == 5_000
+    moved = cam.capture(
+        40_000, (0.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), np.array([[9.0, 0.0, -2.0]])
+    )
+    assert moved.depth_mm[12, 16] == 8_000
+
+
+# --- the wire ------------------------------------------------------------------------------------
+
+
+def connected(server: CameraServer, source: ZmqFrameSource) -> None:
+    """Publish frame 0 until the subscription has reached the server."""
+    for _ in range(1000):
+        server.publish(frame(0))
+        if source.wait(-1, 0.02) is not None:
+            return
+    raise AssertionError("the subscriber never got a frame")
+
+
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+def test_frame_arrives_whole(transport: str, tmp_path) -> None:
+    endpoint = LOOPBACK if transport == "tcp" else f"ipc://{tmp_path}/camera"
+    clock = SimClock(5)
+    server = CameraServer(endpoint)
+    source = ZmqFrameSource(server.endpoint, clock)
+    try:
+        assert source.latest() is None
+        connected(server, source)
+        clock.advance(70)
+        server.publish(frame(9))
+        received = source.wait(0, 10.0)
+        assert received is not None
+        assert received.frame.sequence == 9
+        assert received.frame.capture_time_us == 90
+        assert received.received_us == 75
+        np.testing.assert_array_equal(received.frame.depth_mm, frame(9).depth_mm)
+        assert source.latest() is received
+        assert source.wait(9, 0.0) is None
+    finally:
+        source.close()
+        server.close()
+
+
+def test_slow_reader_gets_only_the_newest() -> None:
+    # In-process, so that no transport can hold frames back: what waits is what ZeroMQ keeps.
+    with zmq.Context() as context:
+        server = CameraServer("inproc://camera", context)
+        source = ZmqFrameSource("inproc://camera", SimClock(), context)
+        connected(server, source)
+        for sequence in range(1, 500):
+            server.publish(frame(sequence))
+        received = source.wait(0, 10.0)
+        assert received is not None
+        assert received.frame.sequence == 499
+        assert source.wait(499, 0.05) is None
+        source.close()
+        server.close()
+
+
+def test_stalled_network_cannot_hold_the_simulator() -> None:
+    """A subscriber that stops reading fills the transport; the newest frame still gets through."""
+    server = CameraServer(LOOPBACK)
+    with zmq.Context() as context, context.socket(zmq.SUB) as stalled:
+        stalled.setsockopt(zmq.RCVHWM, 1)
+        stalled.setsockopt(zmq.RCVBUF, 4096)
+        stalled.subscribe(b"")
+        stalled.connect(server.endpoint)
+        while not stalled.poll(20):
+            server.publish(frame(0))
+        n = 5_000  # 31 MB: far more than any socket buffer
+        for sequence in range(1, n):
+            server.publish(frame(sequence))
+        seen = []
+        while not seen or seen[-1] < n - 1:
+            assert stalled.poll(10_000), f"the newest frame never came, last {seen[-1:]}"
+            seen.append(Frame.from_bytes(stalled.recv()).sequence)
+        assert len(seen) < n
+        assert seen == sorted(seen)
+    server.close()
+
+
+def test_restarted_simulator_is_heard_again() -> None:
+    with zmq.Context() as context:
+        server = CameraServer("inproc://camera", context)
+        source = ZmqFrameSource("inproc://camera", SimClock(), context)
+        connected(server, source)
+        server.publish(frame(100))
+        assert source.wait(0, 10.0) is not None
+        server.publish(frame(1))  # counts from the beginning
+        received = source.wait(100, 10.0)
+        assert received is not None
+        assert received.frame.sequence == 1
+        source.close()
+        server.close()
+
+
+def test_malformed_messages_are_counted_and_ignored() -> None:
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        publisher.bind("inproc://camera")
+        source = ZmqFrameSource("inproc://camera", SimClock(), context)
+        while source.malformed == 0:
+            publisher.send(b"no frame")
+            assert source.wait(-1, 0.02) is None
+        bad = source.malformed
+        for data in (b"", frame(1).to_bytes()[:-1], b"\xff" * 10_000):
+            publisher.send(data)
+            assert source.wait(-1, 0.02) is None
+            bad += 1
+            assert source.malformed == bad
+        publisher.send(frame(3).to_bytes())
+        received = source.wait(-1, 10.0)
+        assert received is not None
+        assert received.frame.sequence == 3
+        source.close()
+
+
+def test_waiting_without_a_server_times_out() -> None:
+    source = ZmqFrameSource("tcp://127.0.0.1:9", SimClock())
+    assert source.wait(-1, 0.02) is None
+    source.close()
+
+
+# --- mistakes of the user ------------------------------------------------------------------------
+
+
+def test_taken_port_is_named_with_the_option() -> None:
+    first = CameraServer(LOOPBACK)
+    port = first.endpoint.rsplit(":", 1)[1]
+    assert int(port) > 0
+    with pytest.raises(UsageError, match=rf"camera port {port} is taken.*--camera-port"):
+        CameraServer(f"tcp://127.0.0.1:{port}")
+    first.close()
+    CameraServer(f"tcp://127.0.0.1:{port}").close()  # and it is free again
+
+
+@pytest.mark.parametrize("endpoint", ["here", "smoke://signals", "tcp://127.0.0.1"])
+def test_bad_server_endpoint_is_refused(endpoint: str) -> None:
+    with pytest.raises(UsageError, match=r"camera endpoint .*accepted: tcp://"):
+        CameraServer(endpoint)
+
+
+@pytest.mark.parametrize("endpoint", ["here", "smoke://signals", "tcp://127.0.0.1"])
+def test_bad_source_endpoint_is_refused(endpoint: str) -> None:
+    with pytest.raises(ValueError, match=r"camera endpoint .*accepted: tcp://"):
+        ZmqFrameSource(endpoint, SimClock())
+
+
+def test_companion_side_needs_no_simulator_package() -> None:
+    code = (
+        "import sys, companion.camera\n"
+        "heavy = {'numba', 'pybullet', 'scipy', 'torch', 'matplotlib', 'pydantic'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

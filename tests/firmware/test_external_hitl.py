@@ -1,0 +1,338 @@
+"""A board in HITL over a pseudo-terminal: found, fed, and what can be wrong with it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.errors import UsageError
+from firmware_sim.external.px4.hitl import HitlBridge
+from firmware_sim.external.transport.router import Router
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
+from firmware_sim.mavlink.codec import Encoder
+from tests.support.hitl_peer import HitlPeer
+
+PATIENCE_S = 60.0
+STILL = SensorSample(
+    0,
+    np.array([0.0, 0.0, -9.80665]),
+    np.zeros(3),
+    20.0,
+    BatterySample(16.0, 1.0, 0.0, 1.0),
+    np.array([0.21, 0.0, 0.42]),
+    955.0,
+)
+"""A sample on the ground."""
+
+
+def alive() -> None:
+    """There is no process to look after."""
+
+
+@pytest.fixture
+def peer(tmp_path: Path) -> Iterator[HitlPeer]:
+    peer = HitlPeer(tmp_path)
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def router() -> Iterator[Router]:
+    router = Router({}, WallClock())
+    yield router
+    router.close()
+
+
+class Stepper:
+    """Steps a bridge with samples of a vehicle at rest."""
+
+    def __init__(self, bridge: HitlBridge) -> None:
+        self.bridge = bridge
+        self.time_us = 5_000_000
+
+    def step(self) -> ActuatorControls:
+        self.time_us += TICK_US
+        return self.bridge.step(STILL._replace(time_us=self.time_us))
+
+    def until(self, condition: Callable[[], Any]) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < deadline, "timed out"
+            self.step()
+
+    def forever(self) -> None:
+        self.until(lambda: False)
+
+
+@contextmanager
+def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepper]:
+    """Yield a bridge that has had its board's first motor commands."""
+    bridge = HitlBridge(
+        router, peer.device, **{"reboot": False, "silence_s": PATIENCE_S, **settings}
+    )
+    try:
+        bridge.wait_connected(PATIENCE_S, alive)
+        stepper = Stepper(bridge)
+        stepper.until(lambda: bridge.time_us)
+        yield stepper
+    finally:
+        bridge.close()
+
+
+# --- finding the board
+
+
+def test_a_board_is_rebooted_and_found_again(router: Router, peer: HitlPeer) -> None:
+    bridge = HitlBridge(router, peer.device, silence_s=PATIENCE_S)
+    bridge.wait_connected(PATIENCE_S, alive)
+    assert peer.boots == 2
+    assert not bridge.armed
+    stepper = Stepper(bridge)
+    assert stepper.step().motors == (0.0,) * 4  # no commands yet
+    stepper.until(lambda: bridge.time_us)
+    bridge.close()
+    assert peer.received["HIL_STATE_QUATERNION"] == 0
+
+
+def test_a_board_behind_a_uart_is_rebooted_though_it_does_not_vanish(
+    router: Router, peer: HitlPeer
+) -> None:
+    peer.vanishes, peer.down_s = False, 3.0
+    with connected(router, peer, reboot=True):
+        assert peer.boots == 2
+
+
+def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
+    router: Router, peer: HitlPeer
+) -> None:
+    peer.board.armed = True
+    peer.board.idle = lambda *_: peer.say(
+        Encoder().pack(dialect.MAVLink_heartbeat_message(2, 12, 29 | 32 | 128, 0, 4, 3))
+    )
+    bridge = HitlBridge(router, peer.device, reboot_s=2.0)
+    with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
+        bridge.wait_connected(PATIENCE_S, alive)
+    bridge.close()
+    commands = [(m.command, m.param1, m.param2) for m in decoded(peer.raw, "COMMAND_LONG")]
+    assert commands[:2] == [(400, 0.0, 21196.0), (246, 1.0, 0.0)]
+
+
+def decoded(frames: list[bytes], name: str) -> list[Any]:
+    mav = dialect.MAVLink(None)
+    messages = [mav.decode(bytearray(frame)) for frame in frames]
+    return [message for message in messages if message.get_type() == name]
+
+
+def test_a_board_that_does_not_come_back(router: Router, peer: HitlPeer) -> None:
+    peer.down_s = 1e6
+    bridge = HitlBridge(router, peer.device)
+    with pytest.raises(FirmwareLostError, match=r"did not come back: --serial .*no such device"):
+        bridge.wait_connected(4.0, alive)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"mute": True}, "no byte came.*powered.*SYS_USB_AUTO"),
+        ({"garbled": True}, "bytes came, no MAVLink among them: another baud rate than --baud"),
+    ],
+)
+def test_which_step_is_missing(
+    router: Router, tmp_path: Path, fault: dict[str, Any], words: str
+) -> None:
+    peer = HitlPeer(tmp_path)
+    vars(peer).update(fault)
+    bridge = HitlBridge(router, peer.device)
+    with pytest.raises(FirmwareMissingError, match=f"--serial .* within 2 s: .*{words}"):
+        bridge.wait_connected(2.0, alive)
+    bridge.close()
+    peer.close()
+    assert not peer.received  # nothing was said to what may be anything
+
+
+def test_mavlink_without_an_autopilot(router: Router, peer: HitlPeer) -> None:
+    peer.mute = True
+    bridge = HitlBridge(router, peer.device)
+    radio = Encoder(51, 68).pack(dialect.MAVLink_radio_status_message(1, 1, 1, 1, 1, 1, 1))
+
+    def talk() -> None:
+        peer.mute = False
+        peer.say(radio)
+        peer.mute = True
+
+    with pytest.raises(FirmwareMissingError, match="no heartbeat of an autopilot"):
+        bridge.wait_connected(1.0, talk)
+    bridge.close()
+
+
+@pytest.mark.parametrize(
+    ("beat", "words"),
+    [
+        ((2, 12, 29, 0, 3, 3), "not in HIL mode.*set SYS_HITL = 1.*HIL Quadcopter X"),
+        ((2, 3, 81 | 32, 0, 3, 3), "no PX4"),
+    ],
+)
+def test_a_board_that_is_set_up_otherwise(
+    router: Router, peer: HitlPeer, beat: tuple[int, ...], words: str
+) -> None:
+    peer.mute = True
+    frame = Encoder().pack(dialect.MAVLink_heartbeat_message(*beat))
+    bridge = HitlBridge(router, peer.device)
+
+    def talk() -> None:
+        peer.mute = False
+        peer.say(frame)
+        peer.mute = True
+
+    with pytest.raises(FirmwareMissingError, match=words):
+        bridge.wait_connected(PATIENCE_S, talk)
+    bridge.close()
+    assert peer.received["HIL_SENSOR"] == 0
+
+
+def test_a_device_that_is_not_there_is_told_at_once(router: Router, tmp_path: Path) -> None:
+    bridge = HitlBridge(router, str(tmp_path / "ttyACM0"))
+    with pytest.raises(UsageError, match="no such device"):
+        bridge.wait_connected(1e6, alive)
+
+
+def test_giving_up_while_it_waits(router: Router, peer: HitlPeer) -> None:
+    class StopError(Exception): ...
+
+    def stop() -> None:
+        raise StopError
+
+    peer.mute = True
+    bridge = HitlBridge(router, peer.device)
+    with pytest.raises(StopError):
+        bridge.wait_connected(1e6, stop)
+    bridge.close()
+
+
+# --- in flight
+
+
+def test_motors_stand_still_while_disarmed(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        # The board's outputs are not zero then.
+        assert stepper.step() == ActuatorControls(stepper.time_us, (0.0,) * 4, armed=False)
+
+
+def test_the_boards_own_clock_is_its_time(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        first = stepper.bridge.time_us
+        stepper.until(lambda: stepper.bridge.time_us > first + 100_000)
+        assert stepper.bridge.time_us <= peer.board.time_us
+        # Times sent go on evenly from a small number, wherever simulated time is.
+        assert np.unique(np.diff(peer.sensor_times)).tolist() == [TICK_US]
+        assert peer.sensor_times[0] == 1_000_000
+
+
+def test_ticks_keep_to_250_a_second_however_often_they_are_asked_for(
+    router: Router, peer: HitlPeer
+) -> None:
+    with connected(router, peer) as stepper:
+        began = time.monotonic()
+        for _ in range(250):
+            stepper.step()
+        assert time.monotonic() - began > 0.95  # 1 % faster at most, and the tick before
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (lambda peer: setattr(peer, "mute", True), "board silent: no HIL_ACTUATOR_CONTROLS"),
+        (lambda peer: setattr(peer, "controls", False), "board silent"),
+        (lambda peer: setattr(peer, "garbled", True), "board silent"),
+        (HitlPeer.unplug, "is gone"),
+        (HitlPeer.leave_hil, "left HIL mode"),
+        (lambda peer: setattr(peer, "flags", 1), "flags is 1"),
+    ],
+    ids=["mute", "no controls", "garbled", "unplugged", "no HIL", "flags"],
+)
+def test_a_flight_that_is_over(
+    router: Router, peer: HitlPeer, fault: Callable[[HitlPeer], None], words: str
+) -> None:
+    silence_s = 3.0 if "silent" in words else PATIENCE_S
+    with connected(router, peer, silence_s=silence_s) as stepper:
+        fault(peer)
+        with pytest.raises(FirmwareLostError, match=words):
+            stepper.forever()
+        with pytest.raises(FirmwareLostError, match=words):
+            stepper.step()
+
+
+def test_a_board_that_restarts_in_flight(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        peer.board.time_us += 60_000_000
+        first = stepper.bridge.time_us
+        stepper.until(lambda: stepper.bridge.time_us > first + 50_000_000)
+        peer.reset()
+        with pytest.raises(FirmwareLostError, match="restarted: its clock went back"):
+            stepper.forever()
+
+
+def test_a_board_that_somebody_reboots(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        reboot = dialect.MAVLink_command_long_message(1, 1, 246, 0, 1, 0, 0, 0, 0, 0, 0)
+        assert router.pass_to_board(Encoder(255, 190).pack(reboot))
+        with pytest.raises(FirmwareLostError, match=r"told to reboot|is gone"):
+            stepper.forever()
+
+
+@pytest.mark.parametrize(("flags", "words"), [(1, "lockstep build"), (0b0111, "HIL_ACT_FUNC1")])
+def test_outputs_that_are_no_quadrotors(
+    router: Router, peer: HitlPeer, flags: int, words: str
+) -> None:
+    peer.flags = flags
+    with pytest.raises(FirmwareMissingError, match=words), connected(router, peer) as stepper:
+        stepper.forever()
+
+
+def test_newer_boards_mark_their_motors(router: Router, peer: HitlPeer) -> None:
+    peer.flags = 0b1111
+    with connected(router, peer) as stepper:
+        stepper.step()
+
+
+def test_a_board_that_never_sends_motor_commands(router: Router, peer: HitlPeer) -> None:
+    peer.controls = False
+    bridge = HitlBridge(router, peer.device, reboot=False, first_controls_s=0.5)
+    bridge.wait_connected(PATIENCE_S, alive)
+    with pytest.raises(FirmwareMissingError, match=r"sends no HIL_ACTUATOR_CONTROLS.*pwm_out_sim"):
+        Stepper(bridge).forever()
+    bridge.close()
+
+
+def test_noise_between_frames_does_no_harm(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        peer.noise = b"\xfd\xfe\x00\xff noise \xfd\x10"
+        first = stepper.bridge.time_us
+        stepper.until(lambda: stepper.bridge.time_us > first + 1_500_000)
+
+
+def test_a_standstill_of_ours_is_no_silence_of_the_boards(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer, silence_s=1.5) as stepper:
+        time.sleep(0.5)
+        router.pump()  # what had come before we stopped
+        time.sleep(2.0)  # a board without sensors says nothing more
+        for _ in range(250):
+            stepper.step()
+
+
+def test_a_closed_bridge_can_be_closed_and_not_stepped(router: Router, peer: HitlPeer) -> None:
+    with connected(router, peer) as stepper:
+        stepper.bridge.close()
+        stepper.bridge.close()
+        with pytest.raises(FirmwareLostError, match="not connected"):
+            stepper.step()

@@ -1,0 +1,192 @@
+"""Commands over raw pymavlink: what a real PX4 1.16 was measured to answer."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from firmware_sim.autopilot.state import Arming
+from tests.support.kinematic_autopilot import ORIGIN
+from tests.support.mavlink_clients import RawClient, Rig, text_of
+
+NAN = math.nan
+ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
+
+
+@pytest.fixture
+def rig() -> Rig:
+    return Rig()
+
+
+def test_arming(rig: Rig) -> None:
+    result, _ = rig.command(400, 1)
+    assert result == ACCEPTED
+    assert rig.autopilot.arming is Arming.ARMED
+    assert rig.autopilot.commands == ["arm force=False"]
+    rig.command(400, 1, 21196)
+    rig.command(400, 0)
+    rig.command(400, 0, 21196)  # what MAVSDK 4.1's arm_force() really sends: kill
+    assert rig.autopilot.commands[1:] == [
+        "arm force=True",
+        "disarm force=False",
+        "disarm force=True",
+    ]
+    assert rig.autopilot.arming is Arming.STANDBY
+
+
+def test_texts_go_to_all_links(rig: Rig) -> None:
+    rig.command(400, 1)
+    rig.bench.tick()
+    assert (6, "Armed by external command") in text_of(rig.station.received())
+
+
+def test_refusals_and_their_words(rig: Rig) -> None:
+    rig.climb()
+    result, messages = rig.command(400, 0)
+    assert result == REJECTED
+    assert (2, "Disarming denied: not landed") in text_of(messages)
+    result, messages = rig.command(176, 129, 6, 0)
+    assert result == REJECTED
+    assert (2, "Switching to Offboard is currently not available") in text_of(messages)
+
+
+@pytest.mark.parametrize("action", [2.0, -1.0, NAN, math.inf])
+def test_arm_parameter_must_be_0_or_1(rig: Rig, action: float) -> None:
+    result, messages = rig.command(400, action)
+    assert result == UNSUPPORTED
+    assert text_of(messages) == [(2, f"Unsupported ARM_DISARM param: {action:.3f}")]
+    assert rig.autopilot.commands == []
+
+
+def test_takeoff_altitudes(rig: Rig) -> None:
+    above_sea = ORIGIN.altitude_m + 12.5
+    rig.command(22)
+    rig.command(22, 0, 0, 0, NAN, NAN, NAN, above_sea)
+    int_fields = (1, 1, dialect.MAV_FRAME_GLOBAL_INT, 22, 0, 0, 0, 0, 0, NAN, 0, 0)
+    for frame, altitude in (
+        (dialect.MAV_FRAME_GLOBAL_INT, above_sea),
+        (dialect.MAV_FRAME_GLOBAL, above_sea),
+        (dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT, 7.0),
+        (dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT, 8.0),
+    ):
+        fields = (*int_fields[:2], frame, *int_fields[3:], altitude)
+        rig.client.send(dialect.MAVLink_command_int_message(*fields))
+        rig.bench.tick()
+        assert rig.acknowledged(22)[0] == ACCEPTED
+    expected = [12.5, 12.5, 12.5, 7.0, 8.0]
+    assert rig.autopilot.takeoffs[0] is None
+    assert rig.autopilot.takeoffs[1:] == pytest.approx(expected, abs=1e-4)
+
+
+def test_takeoff_above_sea_level_needs_a_home(rig: Rig) -> None:
+    rig.autopilot.home = None
+    assert rig.command(22, 0, 0, 0, NAN, NAN, NAN, 500.0)[0] == REJECTED
+    assert rig.autopilot.takeoffs == []
+
+
+@pytest.mark.parametrize(
+    ("number", "params", "expected"),
+    [
+        (21, (), "mode LAND"),
+        (20, (), "mode RETURN"),
+        (176, (129, 4, 3), "mode HOLD"),
+        (176, (1, 4, 3), "mode HOLD"),
+        (176, (1, 4, 6), "mode LAND"),
+        (176, (1, 4, 5), "mode RETURN"),
+        (176, (1, 4, 2), "mode TAKEOFF"),
+        (176, (129, 6, 0), "mode OFFBOARD"),
+        (176, (129, 6), "mode OFFBOARD"),  # parameter 3 NaN
+    ],
+)
+def test_mode_commands(rig: Rig, number: int, params: tuple[float, ...], expected: str) -> None:
+    assert rig.command(number, *params)[0] == ACCEPTED
+    assert rig.autopilot.commands == [expected]
+
+
+def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:
+    assert rig.command(176, 1, 99, 0)[0] == ACCEPTED
+    assert rig.autopilot.commands == []
+    assert rig.command(176, 0, 0, 0)[0] == ACCEPTED
+    assert rig.autopilot.commands == []
+
+
+@pytest.mark.parametrize(
+    ("params", "text"),
+    [
+        ((1, 1, 0), "Switching to Manual is currently not available"),
+        ((1, 7, 0), "Switching to Stabilized is currently not available"),
+        ((1, 4, 4), "Switching to Mission is currently not available"),
+        ((1, 4, 0), "Switching to Mission is currently not available"),
+        ((1, 4, 99), "Unsupported auto mode"),
+        ((4, 0, 0), "Switching to Mission is currently not available"),  # base mode: auto
+        ((64, 0, 0), "Switching to Manual is currently not available"),
+        ((80, 0, 0), "Switching to Stabilized is currently not available"),
+    ],
+)
+def test_modes_that_need_a_pilot_or_a_mission(
+    rig: Rig, params: tuple[float, ...], text: str
+) -> None:
+    result, messages = rig.command(176, *params)
+    assert result == REJECTED
+    assert text_of(messages) == [(2, text)]
+    assert rig.autopilot.commands == []
+
+
+def test_set_mode_message_has_no_acknowledgement(rig: Rig) -> None:
+    messages = rig.exchange(dialect.MAVLink_set_mode_message(1, 129, 100_925_440))
+    assert rig.autopilot.commands == ["mode LAND"]
+    assert "COMMAND_ACK" not in {m.get_type() for m in messages}
+    rig.exchange(dialect.MAVLink_set_mode_message(2, 129, 100_925_440))
+    assert rig.autopilot.commands == ["mode LAND"]
+
+
+def test_set_home(rig: Rig) -> None:
+    rig.climb()
+    assert rig.command(179, 1)[0] == ACCEPTED
+    assert rig.autopilot.home is not None
+    assert rig.autopilot.home.altitude_m > ORIGIN.altitude_m + 2.0
+    assert rig.command(179, 0, 0, 0, 0, 47.0, 8.0, 500.0)[0] == DENIED
+
+
+def test_reboot_is_refused(rig: Rig) -> None:
+    assert rig.command(246, 0)[0] == ACCEPTED  # "do nothing"
+    assert rig.command(246, 1)[0] == DENIED
+    rig.command(400, 1)
+    assert rig.command(246, 1)[0] == DENIED
+
+
+@pytest.mark.parametrize("number", [192, 16, 300, 519, 31_000])
+def test_unknown_commands_are_unsupported(rig: Rig, number: int) -> None:
+    assert rig.command(number, 1, 2, 3)[0] == UNSUPPORTED
+
+
+@pytest.mark.parametrize("target", [(2, 1), (1, 100), (0, 0), (0, 1), (255, 190)])
+def test_commands_for_others_are_ignored(rig: Rig, target: tuple[int, int]) -> None:
+    rig.client.command(400, 1, target=target)
+    before = rig.bench.server.counters()["onboard"].ignored
+    rig.bench.tick()
+    assert not [m for m in rig.client.received() if m.get_type() == "COMMAND_ACK"]
+    assert rig.autopilot.arming is Arming.STANDBY
+    assert rig.bench.server.counters()["onboard"].ignored == before + 1
+
+
+def test_a_command_to_all_components_is_ours(rig: Rig) -> None:
+    rig.client.command(400, 1, target=(1, 0))
+    rig.bench.tick()
+    assert rig.acknowledged(400)[0] == ACCEPTED
+
+
+def test_own_words_coming_back_are_ignored(rig: Rig) -> None:
+    echo = RawClient(rig.bench.onboard, ids=(1, 1))
+    echo.command(400, 1)
+    echo.send(dialect.MAVLink_ping_message(1, 1, 0, 0))
+    rig.bench.tick()
+    assert rig.autopilot.arming is Arming.STANDBY
+    assert not [m for m in rig.client.received() if m.get_type() in ("PING", "COMMAND_ACK")]
+
+
+def test_answers_go_to_the_link_that_asked(rig: Rig) -> None:
+    rig.command(400, 1)
+    assert not [m for m in rig.station.received() if m.get_type() == "COMMAND_ACK"]

@@ -1,0 +1,105 @@
+"""The log opens with pymavlink's log reader, also when its writer was killed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as dialect
+
+from firmware_sim.mavlink.tlog import TlogWriter
+from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
+
+
+def read(path: Path) -> list[Any]:
+    log = mavutil.mavlogfile(str(path))
+    messages = []
+    while (message := log.recv_match()) is not None:
+        messages.append(message)
+    log.close()
+    return messages
+
+
+def frame(sequence: int) -> bytes:
+    packed: bytes = dialect.MAVLink_ping_message(1, sequence, 0, 0).pack(
+        dialect.MAVLink(None, 9, 9)
+    )
+    return packed
+
+
+def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) -> None:
+    bench = Bench()
+    client, station = RawClient(bench.onboard), RawClient(bench.gcs)
+    bench.run(0.5)
+    path = tmp_path / "flight-001.tlog"
+    bench.onboard.take()
+    with TlogWriter(path, BOOT_UNIX_US) as tlog:
+        bench.server.log_to(tlog)
+        client.send(dialect.MAVLink_ping_message(1, 77, 0, 0))
+        station.send(dialect.MAVLink_ping_message(1, 99, 0, 0))
+        bench.run(2.0)
+        bench.server.log_to(None)
+        assert not path.exists()
+    sent = bench.onboard.take()
+    bench.run(0.1)
+
+    logged = read(path)
+    assert not tlog.partial_path.exists()
+    own = [m for m in logged if m.get_srcSystem() == 1]
+    assert [bytes(m.get_msgbuf()) for m in own] == sent
+    (other,) = [m for m in logged if m.get_srcSystem() == 245]
+    assert (other.get_type(), other.seq) == ("PING", 77)
+    assert not [m for m in logged if m.get_type() == "PING" and m.seq == 99]
+    for message in own:
+        if message.get_type() == "ATTITUDE":
+            expected_s = BOOT_UNIX_US / 1e6 + message.time_boot_ms / 1e3
+            assert message._timestamp == pytest.approx(expected_s, abs=4e-6)
+
+
+def test_unknown_link() -> None:
+    with pytest.raises(ValueError, match="unpack"):
+        Bench().server.log_to(None, link="nowhere")
+
+
+def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
+    path = tmp_path / "killed.tlog"
+    script = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from firmware_sim.mavlink.tlog import TlogWriter\n"
+        "tlog = TlogWriter(Path(sys.argv[1]), 1_700_000_000_000_000)\n"
+        "frame = bytes.fromhex(sys.argv[2])\n"
+        "for i in range(5_000):\n"
+        "    tlog.write(i * 4_000, frame)\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(path), frame(3).hex()], check=False)
+    assert done.returncode == -9
+    assert not path.exists()
+    messages = read(tmp_path / "killed.tlog.part")
+    assert {m.get_type() for m in messages} == {"PING"}
+    assert 5_000 - 251 <= len(messages) <= 5_000  # at most one second (250 ticks) is missing
+
+
+def test_a_record_cut_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
+    path = tmp_path / "cut.tlog"
+    with TlogWriter(path, BOOT_UNIX_US) as tlog:
+        for i in range(10):
+            tlog.write(i * 4_000, frame(i))
+    path.write_bytes(path.read_bytes()[:-5])
+    assert [m.seq for m in read(path) if m.get_type() == "PING"] == list(range(9))
+
+
+def test_closing_twice_and_overwriting(tmp_path: Path) -> None:
+    path = tmp_path / "a.tlog"
+    for sequence in (1, 2):
+        tlog = TlogWriter(path, BOOT_UNIX_US + 3)  # MAVProxy's link bits stay zero
+        tlog.write(0, frame(sequence))
+        tlog.close()
+        tlog.close()
+    (message,) = read(path)
+    assert (message.seq, message._link) == (2, 0)

@@ -1,0 +1,775 @@
+"""`airl evaluate`: what it flies, what it leaves behind, what it survives."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from airl_mav.arena.generate import generate
+from airl_mav.cli import evaluate_task
+from airl_mav.cli.evaluate import run
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_lockstep import plan_lockstep
+from airl_mav.cli.evaluate_task import sitl_command
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import Ports
+from airl_mav.envs.evaluation import fly_episodes
+from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
+from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
+from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.registry import find_policy
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.rehearsal import chunks, evaluation_gym, run_folder
+from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
+from airl_mav.report import html
+from airl_mav.report.rebuild import rebuild
+from tests.support.linear_policy import ACTIONS, SPEC, weights, write_linear
+from tests.support.ports import choose_ports
+from tests.support.processes import ROOT, wait_until
+
+EPISODES = 30
+LOCKSTEP = {"level": "lockstep"}
+DENSE: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "seed": 20}
+"""Where some flights reach the goal and some do not."""
+
+
+def no_page(run_: LoadedRun, *_: Any, **__: Any) -> Path:
+    """Stand in for `build_report`, where a test looks at the printed table alone."""
+    return run_.path / "report.html"
+
+
+def evaluate(
+    *policies: str | Path, page: bool = False, table: bool = False, **options: Any
+) -> tuple[int, str]:
+    """Run the command in this process; return exit status and output.
+
+    Pages take longer than flights: without `page` none is made, without `table` none printed.
+    """
+    console = Console(record=True, width=100, file=io.StringIO())
+    command = EvaluateCommand(policies=tuple(str(policy) for policy in policies), **options)
+    with ExitStack() as stack:
+        if table:
+            stack.enter_context(patch("airl_mav.report.rebuild.build_report", no_page))
+        elif not page:
+            stack.enter_context(patch("airl_mav.cli.report.run"))
+            stack.enter_context(patch("airl_mav.report.rebuild.rebuild"))
+        code = run(command, console)
+    return code, console.export_text()
+
+
+def same_runs(one: LoadedRun, other: LoadedRun) -> bool:
+    """Return whether two runs hold the same episodes, to the last bit."""
+    if one.episodes != other.episodes or one.trajectories.keys() != other.trajectories.keys():
+        return False
+    paths = all(
+        np.array_equal(array, other.trajectories[i].arrays()[name])
+        for i, path in one.trajectories.items()
+        for name, array in path.arrays().items()
+    )
+    stamps = all(
+        np.array_equal(array, other.latency[i][name])
+        for i, arrays in one.latency.items()
+        for name, array in arrays.items()
+    )
+    return paths and stamps and one.latency.keys() == other.latency.keys()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_pictures() -> Iterator[None]:
+    """Pictures take longer than flights."""
+    with patch.object(html, "MAX_PICTURED", 3):
+        yield
+
+
+@pytest.fixture(scope="module")
+def greedy(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
+    """`airl evaluate greedy`: the run, and what was printed."""
+    out = tmp_path_factory.mktemp("greedy") / "run"
+    code, text = evaluate("greedy", page=True, out=out, **DENSE)
+    assert code == 0
+    return load(out), text
+
+
+@pytest.fixture(scope="module")
+def linear(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_linear(tmp_path_factory.mktemp("policies") / "linear")
+
+
+# --- what is flown
+
+
+def test_episodes_are_those_of_the_seeds(greedy: tuple[LoadedRun, str]) -> None:
+    run_, _ = greedy
+    assert [e.index for e in run_.episodes] == list(range(EPISODES))
+    assert [e.seed for e in run_.episodes] == [20 + i for i in range(EPISODES)]
+    assert run_.info.seeds == tuple(20 + i for i in range(EPISODES))
+    spec = load_profile("arenas", "dense-obstacles", ArenaSpec)
+    for episode in run_.episodes:
+        arena = generate(spec, episode.arena_seed, name="again", vehicle_width_m=0.55)
+        assert episode.goal == tuple(arena.goal)
+        assert episode.arena == "dense-obstacles"
+        assert episode.goal_radius_m == 3.0
+
+
+def test_the_referee_of_the_rehearsal_says_the_same(greedy: tuple[LoadedRun, str]) -> None:
+    run_, _ = greedy
+    assert {e.outcome for e in run_.episodes} >= {Outcome.SUCCESS, Outcome.COLLISION}
+    for episode in run_.episodes:
+        referee = Referee(Task(episode.goal, episode.goal_radius_m, episode.time_limit_s))
+        referee.start_navigation(0)
+        path = run_.trajectories[episode.index]
+        for i, time_us in enumerate(path.time_us.tolist()):
+            hit = episode.reason.partition("hit ")[2] if time_us == episode.ended_us else ""
+            north, east, down = path.position[i]
+            referee.observe(TruthSample(time_us, (north, east, down), hit or None, 0.5))
+        assert referee.verdict is not None
+        assert referee.verdict.outcome is episode.outcome
+        assert referee.verdict.reason == episode.reason
+        assert referee.verdict.time_us == episode.ended_us == path.time_us[-1]
+
+
+def test_a_collision_names_what_stands_there(greedy: tuple[LoadedRun, str]) -> None:
+    run_, _ = greedy
+    spec = load_profile("arenas", "dense-obstacles", ArenaSpec)
+    crashed = [e for e in run_.episodes if e.outcome is Outcome.COLLISION]
+    for episode in crashed:
+        arena = generate(spec, episode.arena_seed, name="again", vehicle_width_m=0.55)
+        where = run_.trajectories[episode.index].position[-1]
+        match = re.fullmatch(r"hit static-(box|cylinder|sphere)-(\d+)", episode.reason)
+        assert match
+        obstacle = int(match[2])
+        reach = np.linalg.norm(arena.obstacles.half_size[obstacle, :2]) + 0.3
+        gap = np.linalg.norm(arena.obstacles.center[obstacle, :2] - where[:2])
+        assert gap < reach
+
+
+def test_quality_is_that_of_the_path(greedy: tuple[LoadedRun, str]) -> None:
+    run_, _ = greedy
+    for episode in run_.episodes:
+        path, q = run_.trajectories[episode.index], episode.quality
+        assert q is not None
+        assert q.flight_time_s == pytest.approx(episode.ended_us / 1e6)
+        length = np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum()
+        assert q.distance_m == pytest.approx(length)
+        # A hovering Iris-class vehicle draws some 430 W.
+        assert 350.0 < q.energy_j / q.flight_time_s < 700.0
+        assert q.computer_energy_j == pytest.approx(350.0 * q.flight_time_s)
+        assert q.takeoff.time_s == q.takeoff.energy_j == 0.0
+        assert 0.9 < (episode.battery_remaining or 0.0) < 1.0
+
+
+def test_same_seeds_same_results_however_many_fly_at_a_time(
+    greedy: tuple[LoadedRun, str], tmp_path: Path
+) -> None:
+    reference, _ = greedy
+    for slots in (1, 7):
+        evaluate("greedy", slots=slots, out=tmp_path / f"{slots}", **DENSE)
+        assert same_runs(load(tmp_path / f"{slots}"), reference)
+
+
+def test_an_episode_does_not_depend_on_the_others(
+    greedy: tuple[LoadedRun, str], tmp_path: Path
+) -> None:
+    reference, _ = greedy
+    evaluate("greedy", out=tmp_path / "one", **(DENSE | {"episodes": 1, "seed": 27}))
+    (episode,) = load(tmp_path / "one").episodes
+    assert replace(episode, index=7) == reference.episodes[7]
+
+
+def by_hand(without: str | None = None) -> Callable[[Encoded], np.ndarray]:
+    """Return the linear policy in numpy."""
+    matrix, bias = weights()
+
+    def decide(encoded: Encoded) -> np.ndarray:
+        parts = {key: array.astype(np.float64) for key, array in encoded.items()}
+        if without is not None:
+            parts[without] *= 0.0
+        flat = parts["depth"].reshape(len(parts["depth"]), -1) / 255.0
+        features = np.concatenate([flat, parts["velocity"], parts["goal"]], axis=1)
+        chosen: np.ndarray = np.argmax(features @ matrix.T + bias, axis=1)
+        return chosen
+
+    return decide
+
+
+@pytest.mark.parametrize("ablate", [None, "depth", "velocity", "goal"])
+def test_a_learned_policy_flies_in_the_environment_of_its_card(
+    linear: Path, tmp_path: Path, ablate: Any
+) -> None:
+    """The same network by hand, in an environment written down here."""
+    options = {"arena": ("static-obstacles",), "time_limit": 25.0}
+    evaluate(linear, episodes=12, seed=3, ablate=ablate, out=tmp_path / "run", **options)
+    spec = EnvironmentSpec(
+        arena="static-obstacles",
+        layout="body",
+        image_width_px=SPEC.width_px,
+        image_height_px=SPEC.height_px,
+        actions=ACTIONS.set,
+        max_speed_m_s=ACTIONS.max_speed_m_s,
+        episode=EpisodeRules(goal_radius_m=2.5, time_limit_s=25.0, hold_s=0.4, altitude_m=2.0),
+    )
+    wanted = {f.seed: f for f in fly_episodes(spec, by_hand(ablate), range(3, 15), slots=5)}
+    run_ = load(tmp_path / "run")
+    assert len(run_.episodes) == len(wanted) == 12
+    for episode in run_.episodes:
+        flown = wanted[episode.seed]
+        assert episode.outcome.name == flown.verdict.name
+        assert episode.ended_us == round(flown.flight_time_s * 1e6)
+        assert episode.quality is not None
+        assert episode.quality.energy_j == pytest.approx(flown.energy_j)
+        assert len(run_.latency[episode.index]["sent_us"]) == flown.decisions
+
+
+def test_ablation_costs_what_the_input_is_worth(linear: Path, tmp_path: Path) -> None:
+    rates = {}
+    for ablate in (None, "depth", "goal"):
+        out = tmp_path / f"{ablate}"
+        evaluate(linear, episodes=20, ablate=ablate, time_limit=25.0, out=out)
+        run_ = load(out)
+        assert run_.info.config["ablate"] == ablate
+        reached = [e for e in run_.episodes if e.outcome is Outcome.SUCCESS and e.quality]
+        times = [e.quality.flight_time_s for e in reached if e.quality]
+        assert reached, ablate
+        rates[ablate] = len(reached) / 20, np.mean(times)
+    assert rates[None][0] > 0.9
+    # Without the goal it flies on; without depth nothing ahead looks free: it creeps.
+    assert rates["goal"][0] < 0.4
+    assert rates["depth"][1] > 1.5 * rates[None][1]
+
+
+def test_random_actions_do_not_depend_on_the_neighbours(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "dithering", epsilon=0.3)
+    for slots in (1, 4):
+        evaluate(folder, episodes=6, slots=slots, out=tmp_path / f"{slots}")
+    assert same_runs(load(tmp_path / "1"), load(tmp_path / "4"))
+    evaluate(write_linear(tmp_path / "sure"), episodes=6, out=tmp_path / "sure-run")
+    assert not same_runs(load(tmp_path / "1"), load(tmp_path / "sure-run"))
+
+
+def test_the_latency_of_a_workload_is_flown_and_told(linear: Path, tmp_path: Path) -> None:
+    options = {"computer": "ras-pi-4", "workload": "template-5x32", "out": tmp_path / "run"}
+    evaluate(linear, episodes=4, **options)
+    run_ = load(tmp_path / "run")
+    t2 = np.concatenate(
+        [
+            (s["action_ready_us"] - s["infer_start_us"])[s["action_ready_us"] >= 0]
+            for s in run_.latency.values()
+        ]
+    )
+    assert t2.mean() / 1e3 == pytest.approx(396.0, rel=0.02)
+    assert 0.03 < t2.std() / t2.mean() < 0.07
+    assert run_.info.setup.injection.origin == "injected"
+    assert "template-5x32" in run_.info.setup.injection.label
+    # As airl-companion draws it: from the episode's seed.
+    rng = np.random.default_rng(1)
+    variance = math.log1p(0.05**2)
+    mean = math.log(396_000.0) - 0.5 * variance
+    first = [round(rng.lognormal(mean, math.sqrt(variance))) for _ in range(3)]
+    stamps = run_.latency[0]
+    assert (stamps["action_ready_us"] - stamps["infer_start_us"])[:3].tolist() == first
+
+
+def test_rules_that_are_asked_for_beat_those_of_the_card(linear: Path, tmp_path: Path) -> None:
+    rules = {"goal_radius": 5.0, "hold": 0.7, "altitude": 1.5, "hover_after": 0.1}
+    evaluate(linear, episodes=2, **rules, out=tmp_path / "run")
+    run_ = load(tmp_path / "run")
+    assert all(e.goal_radius_m == 5.0 for e in run_.episodes)
+    assert run_.info.setup.between_commands == "hover-after 100 ms"
+    assert run_.trajectories[0].position[0].tolist() == [0.0, 0.0, -1.5]
+    sent = run_.latency[0]["sent_us"]
+    assert set(np.diff(sent[sent >= 0]).tolist()) == {700_000}
+
+
+# --- what is shown
+
+
+def wilson(k: int, n: int) -> tuple[float, float]:
+    """Return the 95 % score interval, in closed form."""
+    z, p = 1.959963984540054, k / n
+    centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return centre - half, centre + half
+
+
+def test_the_table_has_rates_with_wilsons_interval(greedy: tuple[LoadedRun, str]) -> None:
+    run_, text = greedy
+    reached = sum(e.outcome is Outcome.SUCCESS for e in run_.episodes)
+    low, high = wilson(reached, EPISODES)
+    (line,) = [line for line in text.splitlines() if line.startswith(" success rate")]
+    assert f"{100 * reached / EPISODES:.0f} %" in line
+    assert f"{100 * low:.0f} … {100 * high:.0f}" in line
+    assert line.split()[-1] == str(EPISODES)
+    assert f"{reached} goal reached" in text
+    for measure in ("flight time", "distance", "energy, vehicle"):
+        (line,) = [line for line in text.splitlines() if line.strip().startswith(measure)]
+        assert "…" in line
+
+
+class Page(HTMLParser):
+    """The words and pictures of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.words, self.images = "", 0
+        self.feed(text)
+
+    def handle_data(self, data: str) -> None:
+        self.words += " " + " ".join(data.split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += tag == "img"
+
+
+def test_the_page_says_what_is_modelled_and_shows_no_real_time(
+    greedy: tuple[LoadedRun, str],
+) -> None:
+    run_, text = greedy
+    page = Page((run_.path / "report.html").read_text(encoding="utf-8"))
+    assert "Level gym measures no time" in page.words
+    assert "Evaluation report" in page.words
+    assert "modelled, n =" in page.words
+    for absent in ("Real time", "tick lateness", "setpoints never accepted", "MAVSDK"):
+        assert absent not in page.words
+        assert absent not in text
+    # Seven stages and their timeline, energy, all flights, the worst in space; a map and a time
+    # figure for each flight that is pictured.
+    assert html.MAX_PICTURED < EPISODES
+    assert page.images == 7 + 4 + 2 * html.MAX_PICTURED
+    assert f"Pictures of {html.MAX_PICTURED} of {EPISODES} flights" in page.words
+    pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
+    assert pictured >= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
+
+
+def test_a_long_table_is_cut_short_and_says_so(
+    greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_, text = greedy
+    assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
+    monkeypatch.setattr(html, "MAX_LISTED", 5)
+    monkeypatch.setattr(html, "MAX_PICTURED", 1)
+    shutil.copytree(run_.path, tmp_path / "copy")
+    _, path = rebuild(tmp_path / "copy")
+    assert path is not None
+    page = Page(path.read_text(encoding="utf-8"))
+    assert f"5 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in page.words
+    failed = sum(e.outcome is not Outcome.SUCCESS for e in run_.episodes)
+    assert page.words.count("m from the goal") <= 5
+    assert page.words.count("hit static") >= min(failed, 5)
+
+
+def test_the_picture_of_all_flights(greedy: tuple[LoadedRun, str]) -> None:
+    """Where a flight failed, the picture is red; where most flew, green."""
+    run_, _ = greedy
+    with Image.open(run_.path / "trajectories.png") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    floor = np.abs(pixels - (248, 247, 244)).sum(axis=2) < 12
+    rows, columns = np.flatnonzero(floor.mean(axis=1) > 0.3), np.flatnonzero(floor.mean(0) > 0.3)
+    # 50 m by 50 m, the start 3 m from the southern wall.
+    scale = (columns[-1] - columns[0] + 1) / 50.0
+    red = np.abs(pixels - (192, 38, 28)).sum(axis=2) < 60
+    crashed = [e for e in run_.episodes if e.outcome is Outcome.COLLISION]
+    assert crashed
+    for episode in crashed:
+        north, east = run_.trajectories[episode.index].position[-1, :2]
+        x = columns[0] + (east + 25.0) * scale
+        y = rows[-1] - (north + 3.0) * scale
+        near = red[round(y) - 5 : round(y) + 6, round(x) - 5 : round(x) + 6]
+        assert near.mean() > 0.2
+    green = (pixels[..., 1] > pixels[..., 0] + 20) & (pixels[..., 1] > pixels[..., 2] + 20)
+    assert green.sum() > 5 * red.sum()
+
+
+def test_obstacles_are_drawn_where_all_flights_share_them(
+    greedy: tuple[LoadedRun, str], tmp_path: Path
+) -> None:
+    run_, _ = greedy
+    evaluate("greedy", episodes=1, seed=4, page=True, out=tmp_path / "one")
+
+    def share(folder: Path) -> float:
+        with Image.open(folder / "trajectories.png") as image:
+            pixels = np.asarray(image.convert("RGB")).astype(int)
+        return float((np.abs(pixels - (0x5B, 0x66, 0x70)).sum(axis=2) < 12).mean())
+
+    assert share(tmp_path / "one") > 0.002 > 4.0 * share(run_.path)
+
+
+# --- what it survives
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
+    """60 flights without any trouble."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert evaluate("greedy", arena=("no-obstacles",), episodes=60, out=out)[0] == 0
+    return load(out)
+
+
+SCRIPT = """
+import sys
+from airl_mav.rehearsal import chunks
+from airl_mav.report import rebuild
+chunks.EVERY_S, chunks.MOST = 60.0, 5
+# The table is printed; the page takes longer than the flights.
+rebuild.build_report = lambda run, *_, **__: run.path / "report.html"
+from airl_mav.cli.main import main
+main()
+"""
+
+
+def start(out: Path) -> subprocess.Popen[str]:
+    words = ["evaluate", "greedy", "--arena", "no-obstacles", "--episodes", "60", "--slots", "4"]
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, *words, "--out", str(out)],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_goes_on_and_ends_as_if_nothing_had_been(
+    number: signal.Signals, reference: LoadedRun, tmp_path: Path
+) -> None:
+    out = tmp_path / "run"
+    process = start(out)
+    lines = out / "episodes.jsonl"
+
+    def some() -> bool:
+        assert process.poll() is None, process.communicate()
+        return lines.exists() and lines.read_bytes().count(b"\n") >= 10
+
+    wait_until(some, "the first episodes")
+    process.send_signal(number)
+    text, _ = process.communicate(timeout=60)
+    assert process.returncode == (-9 if number is signal.SIGKILL else 130), text
+    if number is not signal.SIGKILL:
+        assert "interrupted: what was flown is kept" in text
+        assert "success rate" in text
+    flown = load(out).episodes
+    assert 10 <= len(flown) < 60
+    code, text = evaluate("greedy", arena=("no-obstacles",), episodes=60, out=out)
+    assert code == 0
+    assert f"{len(flown)} of 60 episodes are there" in text
+    assert same_runs(load(out), reference)
+    assert lines.read_bytes().count(b"\n") == 60
+    assert not list(out.glob("*.partial"))
+
+
+def test_a_crash_between_arrays_and_lines_doubles_nothing(
+    reference: LoadedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "run"
+    options = {"arena": ("no-obstacles",), "episodes": 60, "out": out}
+    monkeypatch.setattr(chunks, "EVERY_S", 60.0)
+    monkeypatch.setattr(chunks, "MOST", 20)
+    real, calls = RunFolder.save_episodes, []
+
+    def save(folder: RunFolder, episodes: Sequence[FlownEpisode]) -> None:
+        calls.append(len(episodes))
+        if len(calls) > 1:
+            # The arrays get onto the disk, the lines do not.
+            monkeypatch.setattr(run_folder, "EPISODES_FILE", "lost")
+        real(folder, episodes)
+        if len(calls) > 1:
+            raise OSError("the machine is gone")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RunFolder, "save_episodes", save)
+        with pytest.raises(OSError, match="the machine is gone"):
+            evaluate("greedy", **options)
+    monkeypatch.setattr(run_folder, "EPISODES_FILE", "episodes.jsonl")
+    with np.load(out / "trajectories.npz") as archive:
+        assert len({name.partition("/")[0] for name in archive.files}) == 40
+    lines = (out / "episodes.jsonl").read_bytes()
+    # Nor does half a line matter.
+    (out / "episodes.jsonl").write_bytes(lines[: lines.rfind(b"\n", 0, -1) + 30])
+    held = load(out)
+    assert len(held.episodes) == 19
+    assert evaluate("greedy", **options)[0] == 0
+    assert same_runs(load(out), reference)
+
+
+def test_what_is_finished_is_shown_again_and_not_flown(
+    greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_, text = greedy
+    monkeypatch.setattr(evaluation_gym, "fly_seeds", None)
+    before = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
+    code, again = evaluate("greedy", page=True, slots=3, out=run_.path, **DENSE)
+    assert code == 0
+    assert again.endswith(text)
+    after = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
+    assert before == after
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"seed": 21}, "seed = 20, not 21"),
+        ({"episodes": 31}, "episodes = 30, not 31"),
+        ({"goal_radius": 2.0}, "environment.episode.goal_radius_m = 3.0, not 2.0"),
+        ({"arena": ("no-obstacles",)}, "environment.arena"),
+        ({"computer": "ras-pi-4"}, "environment.delay.computer"),
+    ],
+)
+def test_another_run_is_not_mixed_in(
+    greedy: tuple[LoadedRun, str], change: dict[str, Any], named: str
+) -> None:
+    run_, _ = greedy
+    with pytest.raises(UsageError, match=re.escape(named)):
+        evaluate("greedy", out=run_.path, **(DENSE | change))
+    assert same_runs(load(run_.path), run_)
+
+
+def test_a_retrained_policy_is_another_run(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "policy")
+    evaluate(folder, episodes=1, out=tmp_path / "run")
+    write_linear(folder, broken=True)
+    with pytest.raises(UsageError, match="policy_sha256"):
+        evaluate(folder, episodes=1, out=tmp_path / "run")
+
+
+def test_a_changed_arena_file_is_another_run(tmp_path: Path) -> None:
+    from airl_mav.profiles.loading import profiles_dir
+
+    arena = tmp_path / "mine.toml"
+    text = (profiles_dir() / "arenas" / "no-obstacles.toml").read_text(encoding="utf-8")
+    arena.write_text(text, encoding="utf-8")
+    evaluate("greedy", arena=(str(arena),), episodes=1, out=tmp_path / "run")
+    arena.write_text(text.replace("min_distance_m = 7.0", "min_distance_m = 9.0"))
+    with pytest.raises(UsageError, match=re.escape("profiles_sha256.arena")):
+        evaluate("greedy", arena=(str(arena),), episodes=1, out=tmp_path / "run")
+
+
+# --- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("policies", "options", "named"),
+    [
+        ((), {}, "no policy"),
+        (("telepathy",), {}, "'telepathy'"),
+        (("greedy",), {"arena": ("moon",)}, "'moon'"),
+        (("greedy",), {"vehicle": "zeppelin"}, "'zeppelin'"),
+        (("greedy",), {"computer": "abacus"}, "'abacus'"),
+        (("greedy",), {"workload": "chess"}, "chess"),
+        (("greedy",), {"workload": "estimate", "computer": "ras-pi-4"}, "estimate"),
+        (("greedy",), {"ablate": "depth"}, "not a learned policy"),
+        (("greedy",), {"ablate": "depth", "level": "sitl"}, "--ablate depth"),
+        (("greedy",), {"episodes": 0}, "--episodes 0"),
+        (("greedy",), {"seed": -1}, "--seed -1"),
+        (("greedy",), {"slots": 0}, "--slots 0"),
+        (("greedy",), {"hold": 0.01}, "hold_s = 0.01"),
+        (("greedy",), {"time_limit": math.nan}, "time_limit_s"),
+        (("greedy", "greedy"), {}, "greedy twice"),
+        (("greedy",), {"arena": ("no-obstacles", "no-obstacles")}, "no-obstacles twice"),
+        (("greedy",), {"level": "sitl", "speed": 100.0}, "--speed 100"),
+        (("greedy",), {"workers": 2}, "--workers 2 with --level gym"),
+        (("greedy",), {"level": "sitl", "workers": 2}, "--workers 2 with --level sitl"),
+        (("greedy",), {"tlogs": True}, "--tlogs with --level gym"),
+        (("greedy",), {"workers": 0} | LOCKSTEP, "--workers 0: accepted: 1 <= value <= 256"),
+        (("greedy",), {"workers": 257} | LOCKSTEP, "--workers 257"),
+        (("greedy",), {"speed": 0.001} | LOCKSTEP, "--speed 0.001: accepted: 0.01"),
+        (("greedy",), {"speed": 2000.0} | LOCKSTEP, "--speed 2000"),
+        (("greedy",), {"ablate": "depth"} | LOCKSTEP, "not a learned policy"),
+        (("greedy",), {"arena": ("moon",)} | LOCKSTEP, "'moon'"),
+        (("greedy",), {"hold": 11.0} | LOCKSTEP, "--hold 11"),
+        (("greedy",), {"time_limit": 0.5} | LOCKSTEP, "--time-limit 0.5"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_anything_flies(
+    policies: tuple[str, ...], options: dict[str, Any], named: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=re.escape(named)) as error:
+        evaluate(*policies, out=tmp_path / "run", **options)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_camera_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    narrow = SPEC.model_copy(update={"horizontal_fov_deg": 60.0})
+    folder = write_linear(tmp_path / "narrow", observation=narrow)
+    with pytest.raises(UsageError, match="vehicle quad: camera with a horizontal field of view"):
+        evaluate(folder, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_network_that_gives_no_numbers_ends_in_one_line(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "broken", broken=True)
+    with pytest.raises(UsageError, match=r"policy linear: .*not a number"):
+        evaluate(folder, episodes=2, out=tmp_path / "run")
+
+
+def test_seeds_of_the_training_are_pointed_out(tmp_path: Path) -> None:
+    training = {"arena": "no-obstacles", "first_arena_seed": 5, "last_arena_seed": 9}
+    folder = write_linear(tmp_path / "policy", training=training)
+    for seed, known in ((1, False), (4, True), (9, True), (10, False)):
+        _, text = evaluate(folder, episodes=2, seed=seed, out=tmp_path / f"{seed}")
+        assert ("was trained on seeds from 5 on" in text) == known
+
+
+# --- policies x arenas
+
+
+def test_a_table_of_policies_and_arenas(
+    linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "MAX_PICTURED", 0)
+    out, arenas = tmp_path / "matrix", ("no-obstacles", "static-obstacles")
+    code, text = evaluate("greedy", linear, arena=arenas, episodes=8, seed=3, page=True, out=out)
+    assert code == 0
+    told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
+    assert (told["schema"], told["level"], told["episodes"], told["seed"]) == (1, "gym", 8, 3)
+    assert [(c["policy"], c["arena"]) for c in told["cells"]] == [
+        ("greedy", "no-obstacles"),
+        ("greedy", "static-obstacles"),
+        ("linear", "no-obstacles"),
+        ("linear", "static-obstacles"),
+    ]
+    markdown = (out / "matrix.md").read_text(encoding="utf-8")
+    for cell in told["cells"]:
+        run_ = load(out / cell["folder"])
+        assert [e.seed for e in run_.episodes] == list(range(3, 11))
+        reached = sum(e.outcome is Outcome.SUCCESS for e in run_.episodes)
+        low, high = wilson(reached, 8)
+        assert cell["success_rate"]["value"] == reached / 8
+        assert cell["success_rate"]["low"] == pytest.approx(low)
+        shown = f"{100 * reached / 8:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+        star = " *" if (cell["policy"], cell["arena"]) == ("linear", "no-obstacles") else ""
+        assert shown in text
+        assert shown.replace("[", "\\[").replace("]", "\\]") + star.replace("*", "\\*") in markdown
+        assert (out / cell["folder"] / "report.html").exists()
+    # A cell is what the same evaluation alone is.
+    evaluate("greedy", arena=("static-obstacles",), episodes=8, seed=3, out=tmp_path / "one")
+    assert same_runs(load(out / "greedy-static-obstacles"), load(tmp_path / "one"))
+    assert "goal radius 2.5 m, hold 0.4 s" in markdown
+
+
+def test_a_table_goes_on_where_it_was_left(
+    linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "matrix"
+    options = {"arena": ("no-obstacles", "static-obstacles"), "episodes": 5, "out": out}
+    flights = []
+    real = evaluate_task.EpisodeBar.finished
+
+    def interrupted(bar: evaluate_task.EpisodeBar, record: Any) -> None:
+        real(bar, record)
+        flights.append(record)
+        if len(flights) == 8:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(evaluate_task.EpisodeBar, "finished", interrupted)
+        code, text = evaluate("greedy", linear, slots=2, **options)
+    assert code == 130
+    assert "interrupted" in text
+    told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
+    assert len(told["cells"]) == 2
+    assert evaluate("greedy", linear, **options)[0] == 0
+    told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
+    assert [c["success_rate"]["n"] for c in told["cells"]] == [5, 5, 5, 5]
+
+
+def test_arenas_are_those_of_the_trainings(linear: Path, tmp_path: Path) -> None:
+    evaluate(linear, "greedy", episodes=1, out=tmp_path / "matrix")
+    names = {p.name for p in (tmp_path / "matrix").iterdir() if p.is_dir()}
+    arenas = ("no-obstacles", "static-obstacles")
+    assert names == {f"{p}-{a}" for p in ("linear", "greedy") for a in arenas}
+    evaluate(linear, episodes=1, out=tmp_path / "one")
+    assert load(tmp_path / "one").info.setup.arena.name == "no-obstacles"
+
+
+def test_a_table_and_a_run_do_not_share_a_folder(
+    greedy: tuple[LoadedRun, str], tmp_path: Path
+) -> None:
+    run_, _ = greedy
+    with pytest.raises(UsageError, match="holds a single run"):
+        evaluate("greedy", arena=("no-obstacles", "crowded"), out=run_.path)
+    (tmp_path / "matrix.json").write_text("{}")
+    with pytest.raises(UsageError, match="holds a table"):
+        evaluate("greedy", out=tmp_path)
+
+
+# --- level sitl
+
+
+def test_level_sitl_is_a_rehearsal_by_the_rules_of_the_card(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "policy", hover_after_s=0.06)
+    info = find_policy(str(folder))
+    command = EvaluateCommand((str(folder),), episodes=7, seed=11, level="sitl", speed=2.0)
+    rehearsal = sitl_command(command, info, str(folder), "no-obstacles")
+    assert (rehearsal.policy, rehearsal.arena) == (str(folder), "no-obstacles")
+    assert (rehearsal.episodes, rehearsal.seed, rehearsal.speed) == (7, 11, 2.0)
+    assert rehearsal.watchdog.hover_after_s == 0.06
+    # Left open: airl-sitl takes them from the card as well.
+    assert rehearsal.goal_radius is rehearsal.hold is rehearsal.altitude is None
+    assert (
+        "goal radius 2.5 m, hold 0.4 s"
+        in evaluate_task.prepare(command, str(folder), "no-obstacles").rules
+    )
+
+
+def test_level_lockstep_is_the_same_rehearsal_on_all_usable_cores(tmp_path: Path) -> None:
+    folder = write_linear(tmp_path / "policy", hover_after_s=0.06)
+    options: dict[str, Any] = {"episodes": 7, "seed": 11, "level": "lockstep"}
+    for workers, wanted in ((None, len(os.sched_getaffinity(0))), (5, 5)):
+        command = EvaluateCommand((str(folder),), workers=workers, **options)
+        rehearsal = sitl_command(command, find_policy(str(folder)), str(folder), "no-obstacles")
+        assert rehearsal.lockstep
+        assert rehearsal.speed is None
+        run_, pilot = plan_lockstep(command, rehearsal)
+        assert run_.workers == wanted
+        assert run_.evaluation.seeds == tuple(range(11, 18))
+        assert (pilot.goal_radius_m, pilot.hold_s) == (2.5, 0.4)
+        assert run_.evaluation.config["watchdog"]["hover_after_s"] == 0.06
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("flight")
+@pytest.mark.timeout(300)
+def test_level_sitl_flies(linear: Path, tmp_path: Path) -> None:
+    p = choose_ports()
+    ports = Ports(p.api, p.api_local, p.gcs, p.gcs_local, p.camera)
+    options = {"arena": ("no-obstacles",), "level": "sitl", "ports": ports, "speed": 2.0}
+    out = tmp_path / "run"
+    code, text = evaluate(linear, episodes=1, seed=10, table=True, out=out, **options)
+    assert code == 0
+    assert "success rate" in text
+    (episode,) = load(out).episodes
+    assert (episode.seed, episode.outcome) == (10, Outcome.SUCCESS)
+    # The same seed at level gym has the same arena, and nearly the same flight.
+    evaluate(linear, arena=("no-obstacles",), episodes=1, seed=10, out=tmp_path / "gym")
+    (twin,) = load(tmp_path / "gym").episodes
+    assert twin.goal == episode.goal
+    assert twin.quality is not None
+    assert episode.quality is not None
+    assert twin.quality.distance_m == pytest.approx(episode.quality.distance_m, rel=0.15)
+    code, again = evaluate(linear, episodes=1, seed=10, page=True, out=out, **options)
+    assert code == 0
+    assert "success rate" in again
+    assert (out / "trajectories.png").exists()
+    with pytest.raises(UsageError, match="seed = 10, not 12"):
+        evaluate(linear, episodes=1, seed=12, out=out, **options)

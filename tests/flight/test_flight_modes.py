@@ -1,0 +1,158 @@
+"""Corners of arming, take-off, return and setpoints, flown in simulated time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from airl_mav.core.frames import quat_yaw
+from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.state import Arming, Mode, Result, Setpoint
+from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
+
+STILL = velocity_setpoint(0.0, 0.0, 0.0)
+
+
+def away(rig: Rig, north: float = 0.0, east: float = 0.0) -> float:
+    """Return the true horizontal distance from a place [m]."""
+    return float(np.hypot(rig.truth.position[0] - north, rig.truth.position[1] - east))
+
+
+def disarmed(rig: Rig) -> bool:
+    return rig.ap.flight.phase < Phase.GROUND
+
+
+def test_loss_on_the_ground_starts_no_flight() -> None:
+    for action in (0, 3, 4, 5):
+        with flight(5, parameters={"COM_OBL_RC_ACT": action}) as rig:
+            rig.boot()
+            rig.go_offboard(STILL)
+            assert rig.ap.arm(force=False) is Result.ACCEPTED
+            rig.run(1.0)
+            rig.stream(None)
+            rig.until(lambda: disarmed(rig), 15.0)
+            assert rig.said("Failsafe activated") < rig.said("Disarmed by auto preflight")
+            assert rig.height < 0.01
+
+
+def test_arming_before_convergence_is_refused() -> None:
+    with flight(0) as rig:
+        rig.tick()
+        assert rig.ap.state().status.arming is Arming.BOOT
+        assert rig.ap.arm(force=True) is Result.TEMPORARILY_REJECTED
+        assert not math.isnan(rig.said("Arming denied: Resolve system health failures first"))
+
+
+def test_a_late_take_off_is_not_cut_short() -> None:
+    """The vehicle spools up when the ten seconds end: motors that turn are no standing."""
+    with flight(0) as rig:
+        rig.arm()
+        rig.run(9.5)
+        rig.ap.takeoff(2.0)
+        rig.until(lambda: rig.mode is Mode.HOLD, 12.0)
+        rig.until(lambda: rig.height > 1.5, 6.0)
+
+
+def test_taking_off_right_after_landing() -> None:
+    with flight(0) as rig:
+        rig.take_off(1.5, settle_s=1.0)
+        rig.ap.set_mode(Mode.LAND)
+        rig.until(lambda: rig.ap.flight.phase is Phase.GROUND, 20.0)
+        rig.run(1.0)
+        rig.ap.takeoff(1.5)
+        rig.until(lambda: rig.mode is Mode.HOLD, 12.0)
+        rig.until(lambda: rig.height > 1.0, 6.0)
+
+
+def test_arming_in_the_tick_of_the_disarming_starts_the_clock_anew() -> None:
+    with flight(0) as rig:
+        rig.arm()
+        rig.until(lambda: disarmed(rig), 12.0)
+        assert rig.ap.arm(force=False) is Result.ACCEPTED
+        rig.run(9.9)
+        assert not disarmed(rig)
+
+
+@pytest.mark.parametrize("home_north", [0.0, 12.0])
+def test_return_flies_home_and_lands(home_north: float) -> None:
+    """Home is where the vehicle was armed, also on its second flight."""
+    with flight(2, parameters={"RTL_RETURN_ALT": 8.0, "COM_DISARM_LAND": 0.2}) as rig:
+        home = np.zeros(2)
+        if home_north:
+            rig.take_off(1.5, settle_s=0.0)
+            rig.go_offboard(velocity_setpoint(4.0, 0.0, 0.0))
+            rig.until(lambda: rig.truth.position[0] > home_north, 10.0)
+            rig.ap.set_mode(Mode.LAND)
+            rig.until(lambda: disarmed(rig), 20.0)
+            rig.ap.set_mode(Mode.HOLD)
+            home = rig.truth.position[:2].copy()
+        rig.take_off(2.0, settle_s=0.0)
+        rig.go_offboard(velocity_setpoint(1.0, 4.0, 0.0))
+        rig.run(4.0)
+        rig.stream(None)
+        out = away(rig, *home)
+        assert out > 10.0
+        assert rig.ap.set_mode(Mode.RETURN) is Result.ACCEPTED
+        rig.until(lambda: rig.height > 7.5, 20.0)
+        assert away(rig, *home) > 0.8 * out, "climbs first"
+        rig.until(lambda: disarmed(rig), 60.0)
+        assert away(rig, *home) < 0.6
+        assert rig.height < 0.05
+
+
+def test_home_can_be_moved_to_where_the_vehicle_is() -> None:
+    with flight(2, parameters={"RTL_RETURN_ALT": 4.0}) as rig:
+        rig.take_off(3.0, settle_s=0.0)
+        rig.go_offboard(velocity_setpoint(4.0, 0.0, 0.0))
+        rig.run(4.0)
+        rig.stream(STILL)
+        rig.run(2.0)
+        assert rig.ap.set_home_here() is Result.ACCEPTED
+        home = rig.truth.position.copy()
+        rig.stream(velocity_setpoint(0.0, 4.0, 0.0))
+        rig.run(4.0)
+        rig.stream(None)
+        rig.ap.set_mode(Mode.RETURN)
+        rig.until(lambda: disarmed(rig), 60.0)
+        assert away(rig, *home[:2]) < 0.8
+
+
+def test_nan_is_no_velocity_on_that_axis() -> None:
+    with flight(0) as rig:
+        rig.take_off(3.0, settle_s=1.0)
+        rig.go_offboard(velocity_setpoint(NAN, 1.0, 0.0))
+        rig.run(3.0)
+        assert rig.mode is Mode.OFFBOARD
+        assert abs(rig.truth.velocity[0]) < 0.1
+        assert rig.truth.velocity[1] == pytest.approx(1.0, abs=0.1)
+
+
+def test_heading_is_held_when_none_is_commanded() -> None:
+    with flight(0) as rig:
+        rig.take_off(3.0, settle_s=1.0)
+        rig.go_offboard(velocity_setpoint(0.0, 0.0, 0.0, yaw=1.0))
+        rig.run(4.0)
+        rig.stream(velocity_setpoint(1.0, 0.0, 0.0, yaw=NAN))
+        rig.run(6.0)
+        assert quat_yaw(rig.truth.quaternion) == pytest.approx(1.0, abs=0.05)
+
+
+def test_positions_are_flown_to() -> None:
+    with flight(0) as rig:
+        rig.take_off(3.0, settle_s=1.0)
+        rig.go_offboard(Setpoint(np.array([3.0, -2.0, -5.0]), np.full(3, NAN), 0.0, NAN))
+        rig.run(10.0)
+        assert away(rig, 3.0, -2.0) < 0.4
+        assert rig.height == pytest.approx(5.0, abs=0.4)
+
+
+def test_speed_is_limited() -> None:
+    with flight(0) as rig:
+        rig.take_off(3.0, settle_s=0.0)
+        rig.go_offboard(velocity_setpoint(30.0, 0.0, 0.0))
+        rig.run(8.0)
+        assert rig.ap.state().setpoint.velocity[0] == pytest.approx(12.0)  # MPC_XY_VEL_MAX
+        assert 9.0 < rig.truth.velocity[0] < 12.9
+        assert rig.height == pytest.approx(3.0, abs=1.0)

@@ -1,0 +1,447 @@
+"""Lockstep in two processes: the flight is the one of a single process, whatever happens between.
+
+The reference is `flight.fly`, which flies MAVSDK on raw bytes in a thread: no sockets, no words.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import random
+import re
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pymavlink import mavutil
+
+from airl_mav.cli.lockstep import lockstep_plan, policies
+from airl_mav.cli.sitl_command import SitlCommand, check
+from airl_mav.flight.judge import Outcome
+from airl_mav.lockstep.flight import LockstepPlan, Watching, fly
+from airl_mav.lockstep.remote import RemotePlan, RemoteStage
+from airl_mav.lockstep.tokens import TokenSettings
+from airl_mav.rehearsal.channel import (
+    Ended,
+    Failed,
+    FinishEpisode,
+    Fly,
+    Loaded,
+    LoadEpisode,
+    Ready,
+    Saved,
+)
+from airl_mav.rehearsal.process import Child
+from firmware_sim.mavlink.endpoint import UdpEndpoint
+from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.simulation import EpisodeSetup
+from firmware_sim.warm_up import warm_up
+from tests.support.ports import LOOPBACK, TestPorts, choose_ports
+from tests.support.processes import ROOT, Running, running
+
+pytestmark = [pytest.mark.xdist_group("tokens"), pytest.mark.timeout(300)]
+
+SEED, ARENA = 1, "static-obstacles"
+LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
+TOO_SHORT_S = 3.0
+"""A time limit that no flight keeps."""
+
+
+# --- the reference: one process
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A flight in one process."""
+
+    lanes: dict[str, str]
+    goal: tuple[float, float]
+    outcome: Outcome
+    command: SitlCommand
+    plan: LockstepPlan
+    setup: EpisodeSetup
+
+
+def fly_here(command: SitlCommand) -> Reference:
+    setup, pilot = check(command)
+    seed = command.seed
+    plan = lockstep_plan(command, setup, pilot)
+    goals: list[tuple[float, float]] = []
+    seen: list[Any] = []
+    watching = Watching(begin=goals.append, tick=lambda simulation, _: seen.append(simulation))
+    flown = fly(plan, policies(command, pilot.hold_s)(seed), 0, seed, watching=watching)
+    lanes = {name: (flown.record.sha256 or {})[name] for name in LANES}
+    episode = EpisodeSetup(plan.vehicle, seen[-1]._arena, seed, plan.wind)
+    return Reference(lanes, goals[0], flown.record.outcome, command, plan, episode)
+
+
+@pytest.fixture(scope="module")
+def reference() -> Reference:
+    done = fly_here(SitlCommand(arena=ARENA, seed=SEED, lockstep=True))
+    assert done.outcome is Outcome.SUCCESS
+    return done
+
+
+# --- two processes
+
+
+def firmware_words(ports: TestPorts, *options: str) -> list[str]:
+    words = ["-m", "airl_mav.cli.firmware", "--lockstep", *ports.options()]
+    return [*words, "--arena", ARENA, "--seed", str(SEED), *options]
+
+
+def companion_words(api: int, camera: int, reference: Reference, *options: str) -> list[str]:
+    north, east = reference.goal
+    return [
+        *("-m", "airl_mav.cli.companion", "--lockstep"),
+        *("--policy", reference.command.policy, "--seed", str(reference.command.seed)),
+        *("--connect", f"udpin://{LOOPBACK}:{api}", "--camera", f"tcp://{LOOPBACK}:{camera}"),
+        *("--goal", repr(north), repr(east)),
+        *("--goal-radius-m", repr(reference.plan.pilot.goal_radius_m), *options),
+    ]
+
+
+def radius(reference: Reference) -> tuple[str, str]:
+    return "--goal-radius", repr(reference.plan.goal_radius_m)
+
+
+def lanes_in(*texts: str) -> dict[str, str]:
+    pattern = rf"^({'|'.join(LANES)}) +([0-9a-f]{{64}})$"
+    return dict(re.findall(pattern, "\n".join(texts), re.MULTILINE))
+
+
+@contextmanager
+def both(folder: Path, reference: Reference, *options: str) -> Iterator[tuple[Running, Running]]:
+    """Run both commands."""
+    ports = choose_ports()
+    with (
+        running(firmware_words(ports, *radius(reference), *options), folder) as firmware,
+        running(companion_words(ports.api, ports.camera, reference), folder) as companion,
+    ):
+        yield firmware, companion
+
+
+def finish(firmware: Running, companion: Running) -> dict[str, str]:
+    """Wait for a good end and return all lanes."""
+    assert companion.wait() == 0, companion.text() + firmware.text()
+    assert firmware.wait() == 0, firmware.text()
+    return lanes_in(firmware.text(), companion.text())
+
+
+def test_same_flight_as_in_one_process(reference: Reference, tmp_path: Path) -> None:
+    with both(tmp_path, reference) as (firmware, companion):
+        lanes = finish(firmware, companion)
+    assert lanes == reference.lanes
+    assert "success" in firmware.text()
+
+
+@contextmanager
+def load(loops: int) -> Iterator[None]:
+    """Keep cores busy."""
+    burners = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for burner in burners:
+            burner.kill()
+            burner.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("who", "loops"), [("firmware", 0), ("companion", 2)])
+def test_stopped_and_loaded_processes_fly_the_same(
+    who: str, loops: int, reference: Reference, tmp_path: Path
+) -> None:
+    rng = random.Random()  # the point in the flight is to be another one every time
+    # Slow enough for the flight to last 1.9 s at least.
+    with load(loops), both(tmp_path, reference, "--speed", "15.0") as (firmware, companion):
+        firmware.wait_for_text("arming")
+        time.sleep(rng.uniform(0.0, 1.5))
+        pid = firmware.pid if who == "firmware" else companion.pid
+        os.kill(pid, signal.SIGSTOP)
+        hit = "done" not in firmware.text()
+        time.sleep(2.0)
+        os.kill(pid, signal.SIGCONT)
+        assert finish(firmware, companion) == reference.lanes
+    assert hit, "it was stopped after the flight"
+
+
+# --- the vehicle's side in this process, the companion in another
+
+
+@contextmanager
+def staged(reference: Reference, plan: RemotePlan) -> Iterator[tuple[RemoteStage, TestPorts]]:
+    ports = choose_ports()
+    endpoint = UdpEndpoint(
+        (LOOPBACK, ports.api_local),
+        (LOOPBACK, ports.api),
+        local_option="local",
+        remote_option="remote",
+    )
+    camera = CameraServer(f"tcp://{LOOPBACK}:{ports.camera}")
+    with (
+        closing(endpoint),
+        closing(camera),
+        closing(RemoteStage(endpoint, camera, plan, broken_off=lambda: False)) as stage,
+    ):
+        warm_up(reference.plan.vehicle)
+        stage.load(reference.setup, None)
+        yield stage, ports
+
+
+def remote_plan(reference: Reference, patience_s: float = 60.0) -> RemotePlan:
+    flown = reference.plan
+    return RemotePlan(
+        flown.transport_us,
+        TokenSettings(patience_s=patience_s),
+        None,
+        flown.goal_radius_m,
+        flown.time_limit_s,
+    )
+
+
+def fly_staged(stage: RemoteStage) -> dict[str, str]:
+    while not stage.ended:
+        stage.step()
+    return stage.lanes()
+
+
+@pytest.mark.parametrize(
+    ("command", "outcome"),
+    [
+        (SitlCommand(arena=ARENA, time_limit=TOO_SHORT_S, lockstep=True), Outcome.TIMEOUT),
+        (SitlCommand(arena="crowded", policy="greedy", seed=10, lockstep=True), Outcome.COLLISION),
+    ],
+    ids=["land", "abandon"],
+)
+def test_orders_of_the_referee_arrive_in_their_turn(
+    command: SitlCommand, outcome: Outcome, reference: Reference, tmp_path: Path
+) -> None:
+    """Flights that are called off, in the middle of an action."""
+    successful, reference = reference, fly_here(command)
+    assert reference.outcome is outcome
+    with (
+        staged(reference, remote_plan(reference)) as (stage, ports),
+        running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
+    ):
+        lanes = fly_staged(stage)
+        assert companion.wait() == 1, companion.text()
+    assert "stopped" in companion.text()
+    assert lanes | lanes_in(companion.text()) == reference.lanes
+    # The fingerprint tells flights apart.
+    assert all(reference.lanes[name] != successful.lanes[name] for name in LANES)
+
+
+class Relay:
+    """Passes datagrams on between simulator and companion, but for some words."""
+
+    def __init__(self, near_port: int, far_port: int) -> None:
+        self.dropped: Counter[str] = Counter()
+        self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._near.bind((LOOPBACK, near_port))
+        self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._far.bind((LOOPBACK, 0))
+        self._companion = (LOOPBACK, far_port)
+        self._vehicle: tuple[str, int] | None = None
+        self._rng = random.Random(7)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            ready, _, _ = select.select([self._near, self._far], [], [], 0.1)
+            if self._near in ready:
+                data, self._vehicle = self._near.recvfrom(65_536)
+                if not self._lost(data):
+                    self._far.sendto(data, self._companion)
+            if self._far in ready:
+                data = self._far.recv(65_536)
+                if self._vehicle is not None and not self._lost(data):
+                    self._near.sendto(data, self._vehicle)
+
+    def _lost(self, data: bytes) -> bool:
+        text = data[11:-2] if int.from_bytes(data[7:10], "little") == 253 else b""
+        word = re.match(rb"[FD](?=\d)", text)
+        if word is None or self._rng.random() > 0.1:
+            return False
+        self.dropped[word[0].decode()] += 1
+        return True
+
+    def close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._near.close()
+        self._far.close()
+
+
+def test_lost_words_do_not_change_the_flight(reference: Reference, tmp_path: Path) -> None:
+    with staged(reference, remote_plan(reference)) as (stage, ports):
+        far = choose_ports().api
+        with (
+            closing(Relay(ports.api, far)) as relay,
+            running(companion_words(far, ports.camera, reference), tmp_path) as companion,
+        ):
+            lanes = fly_staged(stage)
+            assert companion.wait() == 0, companion.text()
+    assert min(relay.dropped["F"], relay.dropped["D"]) >= 10, relay.dropped
+    assert lanes | lanes_in(companion.text()) == reference.lanes
+
+
+def test_companion_that_dies_ends_the_flight(reference: Reference, tmp_path: Path) -> None:
+    ports = choose_ports()
+    words = firmware_words(ports, "--companion-timeout", "1", "--speed", "15.0")
+    with (
+        running(words, tmp_path) as firmware,
+        running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
+    ):
+        firmware.wait_for_text("arming")
+        companion.process.kill()
+        assert firmware.wait() == 1
+    last = firmware.text().splitlines()[-1]
+    assert re.fullmatch(r"error: the companion is gone: .* turn \d+ in 1 s", last), firmware.text()
+    assert "Traceback" not in firmware.text()
+
+
+def test_simulator_that_dies_ends_the_companion(reference: Reference, tmp_path: Path) -> None:
+    with staged(reference, remote_plan(reference)) as (stage, ports):
+        words = companion_words(ports.api, ports.camera, reference, "--connect-timeout", "2")
+        with running(words, tmp_path) as companion:
+            while stage.time_us < 2_000_000:
+                stage.step()
+            assert companion.wait() == 1
+    assert companion.text().splitlines()[-1] == "error: the flight controller gave no turn in 2 s"
+
+
+def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path: Path) -> None:
+    with staged(reference, remote_plan(reference)) as (stage, ports):
+        words = companion_words(ports.api, ports.camera, reference)
+        with running(words, tmp_path) as companion:
+            while stage.time_us < 2_000_000:
+                stage.step()
+            stage.close()
+            assert companion.wait() == 1
+    assert companion.text().splitlines()[-1] == "error: the flight controller has ended the flight"
+
+
+# --- under a harness
+
+
+@pytest.mark.slow
+def test_harness_flies_episodes_from_scratch(reference: Reference, tmp_path: Path) -> None:
+    """Two episodes by one pair of processes: each is the flight that its seed is alone."""
+    references = [reference, fly_here(replace(reference.command, seed=SEED + 1))]
+    ports = choose_ports()
+    events: queue.Queue[Any] = queue.Queue()
+    firmware_options = firmware_words(ports, "--control", "stdio", *radius(reference))[2:]
+    companion_options = companion_words(ports.api, ports.camera, reference)[2:]
+    children = {
+        "firmware": Child(
+            "firmware", "airl_mav.cli.firmware", firmware_options, tmp_path / "f.log", events
+        ),
+        "companion": Child(
+            "companion",
+            "airl_mav.cli.companion",
+            [*companion_options, "--control", "stdio"],
+            tmp_path / "c.log",
+            events,
+        ),
+    }
+
+    def wait_for(kind: type[Any]) -> Any:
+        while True:
+            _, event = events.get(timeout=120.0)
+            assert not isinstance(event, Failed), event
+            if isinstance(event, kind):
+                return event
+
+    try:
+        wait_for(Ready)
+        wait_for(Ready)
+        for index, expected in enumerate(references):
+            seed = SEED + index
+            record = tmp_path / f"{index}.npz"
+            children["firmware"].send(
+                LoadEpisode(
+                    episode=index,
+                    arena=ARENA,
+                    arena_seed=seed,
+                    seed=seed,
+                    tlog=None,
+                    record=str(record),
+                )
+            )
+            loaded = wait_for(Loaded)
+            assert loaded.goal == expected.goal
+            assert loaded.epoch_ns is None
+            children["companion"].send(
+                Fly(
+                    episode=index,
+                    goal=loaded.goal,
+                    epoch_ns=None,
+                    latency_seed=seed,
+                    record=str(tmp_path / f"d{index}.npz"),
+                )
+            )
+            ended = wait_for(Ended)
+            assert ended.reason == "goal reached"
+            children["firmware"].send(FinishEpisode())
+            saved = wait_for(Saved)
+            assert saved.sha256 | ended.sha256 == expected.lanes
+            with np.load(record) as arrays:
+                assert arrays["trajectory/time_us"][-1] > 15_000_000
+    finally:
+        for child in children.values():
+            child.stop()
+
+
+# --- another language
+
+
+def test_companion_of_the_documentation_flies_its_square(tmp_path: Path) -> None:
+    """Nothing but pymavlink and a socket, as docs/lockstep.md prints it; twice the same."""
+    text = (ROOT / "docs" / "lockstep.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(import re, socket.*?)```", text, re.DOTALL)
+    assert not re.search(r"airl_mav|mavsdk|companion\.", program)
+    script = tmp_path / "square.py"
+    script.write_text(program, encoding="utf-8")
+    lanes = []
+    for attempt in range(2):
+        ports, tlog = choose_ports(), tmp_path / f"{attempt}.tlog"
+        with (
+            running([str(script), str(ports.api)], tmp_path) as square,
+            running(firmware_words(ports, "--tlog", str(tlog)), tmp_path) as firmware,
+        ):
+            assert square.wait() == 0, square.text()
+            assert firmware.wait() == 0, firmware.text()
+        lanes.append(lanes_in(firmware.text()))
+    assert set(lanes[0]) == set(LANES) - {"observations"}
+    assert lanes[0] == lanes[1]
+    assert "Disarmed by landing" in firmware.text()
+    corners = _local_positions(tlog)
+    # 4 s at 1 m/s a side, less what speeding up takes.
+    assert corners.max(axis=0)[:2] == pytest.approx([4.0, 4.0], abs=0.5)
+    assert corners.min(axis=0)[:2] == pytest.approx([0.0, 0.0], abs=0.5)
+    assert corners[-1][:2] == pytest.approx([0.0, 0.0], abs=0.5)
+    assert corners[:, 2].min() == pytest.approx(-2.4, abs=0.3)
+
+
+def _local_positions(tlog: Path) -> np.ndarray:
+    log = mavutil.mavlink_connection(str(tlog))
+    rows = []
+    while (message := log.recv_match(type="LOCAL_POSITION_NED")) is not None:
+        rows.append((message.x, message.y, message.z))
+    log.close()
+    return np.array(rows)

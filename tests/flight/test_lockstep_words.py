@@ -1,0 +1,310 @@
+"""The words that pass turns, and the vehicle's end of a turn against a companion of the test's."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from airl_mav.cli.firmware_lockstep import LockstepOptions, remote_plan
+from airl_mav.core.errors import UsageError
+from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.token_camera import TokenCamera
+from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
+from airl_mav.lockstep.turns import Turn
+from airl_mav.rehearsal.following import Order
+from companion.tokens import Phase, TurnBack, TurnGiven
+from firmware_sim.firmware import FrameServer
+from firmware_sim.mavlink.codec import Encoder
+from firmware_sim.mavlink.endpoint import UdpEndpoint
+from tests.support.ports import LOOPBACK
+
+# --- words
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (TurnGiven(3, 1_200_000, 17), "F3 1200000 17"),
+        (TurnGiven(1, 100_000), "F1 100000 -1"),
+        (TurnGiven(9, 5, 0, "land"), "F9 5 0 land"),
+        (TurnBack(4), "D4"),
+        (TurnBack(4, 600_000), "D4 600000"),
+        (TurnBack(4, 600_000, 12), "D4 600000 12"),
+        (TurnBack(4, 600_000, 12, "stop"), "D4 600000 12 stop"),
+        (TurnBack(4, ended=True), "D4 end"),
+        (Phase(4, "taking off"), "P4 taking off"),
+    ],
+)
+def test_words_are_read_as_written(words: TurnGiven | TurnBack | Phase, text: str) -> None:
+    assert words.text() == text
+    assert type(words).parse(text) == words
+
+
+def test_longest_words_fit_a_status_text() -> None:
+    day_us = 86_400_000_000
+    assert len(TurnGiven(10**7, day_us, 10**7, "abandon").text()) <= 50
+    assert len(TurnBack(10**7, day_us, 10**7, "frame").text()) <= 50
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "F", "F1", "F1 2", "F1 2 3 up", "Failsafe activated", "D", "D1 x", "Disarmed", "P1"],
+)
+def test_other_texts_are_no_words(text: str) -> None:
+    assert TurnGiven.parse(text) is None
+    assert TurnBack.parse(text) is None
+    assert Phase.parse(text) is None
+
+
+# --- the vehicle's end of a turn
+
+
+class NoCamera:
+    """Implements FrameServer."""
+
+    endpoint = ""
+
+    def publish(self, frame: Any) -> None:
+        """Nobody looks."""
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+class Mate:
+    """A companion that gives each turn back with the next of some texts."""
+
+    def __init__(self, *texts: str) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOOPBACK, 0))
+        self.socket.settimeout(0.1)
+        self.heard: list[Any] = []
+        self.datagrams: list[int] = []
+        self._texts = list(texts)
+        self._mav = dialect.MAVLink(None, 245, 191)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def _run(self) -> None:
+        number = 0
+        while not self._stop.is_set():
+            try:
+                data, vehicle = self.socket.recvfrom(65_536)
+            except TimeoutError:
+                continue
+            if not self.heard:
+                self._send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), vehicle)
+            self.datagrams.append(len(data))
+            messages = self._mav.parse_buffer(data)
+            self.heard += messages
+            for text in (m.text for m in messages if m.get_type() == "STATUSTEXT"):
+                given = TurnGiven.parse(text)
+                if given is not None and given.number > number and self._texts:
+                    number = given.number
+                    answer = dialect.MAVLink_statustext_message(7, self._texts.pop(0).encode())
+                    self._send(answer, vehicle)
+
+    def _send(self, message: Any, vehicle: Any) -> None:
+        self.socket.sendto(message.pack(self._mav), vehicle)
+
+    def kinds(self) -> list[str]:
+        return [m.text if m.get_type() == "STATUSTEXT" else m.get_type() for m in self.heard]
+
+    def close(self) -> None:
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.socket.close()
+
+
+@contextmanager
+def partner(
+    mate: Mate, settings: TokenSettings | None = None, **callbacks: Callable[..., Any]
+) -> Iterator[TokenPartner]:
+    server: FrameServer = NoCamera()
+    remote = mate.socket.getsockname()
+    with (
+        closing(
+            UdpEndpoint((LOOPBACK, 0), remote, local_option="local", remote_option="remote")
+        ) as endpoint,
+        closing(mate),
+        closing(
+            TokenPartner(endpoint, TokenCamera(server, 0), settings or TokenSettings(), **callbacks)
+        ) as made,
+    ):
+        made.send(heartbeat())
+        yield made
+
+
+def heartbeat() -> bytes:
+    return Encoder().pack(dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3))
+
+
+NOW_US = 100_000
+
+
+@pytest.mark.parametrize(
+    ("text", "wake_us", "sent"),
+    [
+        ("D1", NOW_US + 20_000, 0),
+        ("D1 600000", 600_000, 0),
+        ("D1 600000 7", 600_000, 7),
+        ("D1 99000000 7", NOW_US + 1_000_000, 7),
+    ],
+)
+def test_turn_back_says_when_the_next_one_comes(text: str, wake_us: int, sent: int) -> None:
+    mate = Mate(text)
+    mate.start()
+    with partner(mate) as vehicle:
+        assert vehicle.turn(NOW_US, lambda _: None) == Turn(wake_us, None, sent)
+
+
+def test_turn_period_is_an_option() -> None:
+    mate = Mate("D1")
+    mate.start()
+    with partner(mate, TokenSettings(turn_us=5_000)) as vehicle:
+        assert vehicle.turn(NOW_US, lambda _: None).wake_us == NOW_US + 5_000
+
+
+@pytest.mark.parametrize(
+    ("text", "accepted"),
+    [
+        ("D1 100000", "a time after now"),
+        ("D2 600000", "accepted: D1"),
+        ("D1 soon", r"accepted: D<turn> \["),
+    ],
+)
+def test_words_that_make_no_sense_are_refused(text: str, accepted: str) -> None:
+    mate = Mate(text)
+    mate.start()
+    with partner(mate) as vehicle, pytest.raises(LockstepError, match=accepted) as refused:
+        vehicle.turn(NOW_US, lambda _: None)
+    assert text in str(refused.value)
+
+
+def test_end_of_the_companion_is_answered() -> None:
+    mate = Mate("D1 end")
+    mate.start()
+    with partner(mate) as vehicle:
+        assert vehicle.turn(NOW_US, lambda _: None).wake_us is None
+        deadline = time.monotonic() + 10.0
+        while "F2 0 -1 end" not in mate.kinds():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+def test_nothing_but_heartbeats_before_the_companion_is_there() -> None:
+    """Telemetry waits for it, and comes in order, in few datagrams, before the turn."""
+    mate = Mate("D1")
+    encoder = Encoder()
+    pings = [encoder.pack(dialect.MAVLink_ping_message(i, i, 0, 0)) for i in range(100)]
+    with partner(mate) as vehicle:
+        for ping in pings:
+            vehicle.send(ping)
+        waiter = threading.Thread(target=vehicle.turn, args=(NOW_US, lambda _: None))
+        waiter.start()
+        time.sleep(0.3)  # it comes late: several heartbeats lie in its socket
+        mate.start()
+        waiter.join(10.0)
+        assert not waiter.is_alive()
+    kinds = mate.kinds()
+    while kinds[0] == "HEARTBEAT" and kinds[1] == "HEARTBEAT":
+        del kinds[0]
+    assert kinds[0] == "HEARTBEAT"  # the one of the telemetry
+    assert kinds[1:101] == ["PING"] * 100
+    assert kinds[101] == "F1 100000 -1"
+    pinged = [m.seq for m in mate.heard if m.get_type() == "PING"]
+    assert pinged[:100] == list(range(100))
+    assert max(mate.datagrams) <= 1400
+    assert sum(1 for size in mate.datagrams if size > 100) <= 10
+
+
+def test_answers_are_not_repeated() -> None:
+    """A second COMMAND_ACK would be taken for the answer to the next command of that kind."""
+    mate = Mate()
+    mate.start()
+    answer = Encoder().pack(dialect.MAVLink_command_ack_message(400, 0))
+    with (
+        partner(mate, TokenSettings(patience_s=0.5)) as vehicle,
+        pytest.raises(LockstepError, match="the companion is gone"),
+    ):
+        vehicle.turn(NOW_US, lambda _: vehicle.send(answer))
+    kinds = mate.kinds()
+    assert kinds.count("F1 100000 -1") >= 3
+    assert kinds.count("COMMAND_ACK") == 1
+
+
+def test_wait_for_a_companion_can_be_broken_off() -> None:
+    stop = threading.Event()
+    with partner(Mate(), broken_off=stop.is_set) as vehicle:
+        threading.Timer(0.3, stop.set).start()
+        assert vehicle.turn(NOW_US, lambda _: None).wake_us is None
+
+
+def test_order_ends_a_sleep_that_asks_for_it() -> None:
+    mate = Mate("D1 600000 0 stop", "D2 700000 0")
+    mate.start()
+    with partner(mate) as vehicle:
+        turn = vehicle.turn(NOW_US, lambda _: None)
+        assert turn.interrupt is not None
+        assert not turn.interrupt.is_set()
+        vehicle.order(Order.LAND)
+        assert turn.interrupt.is_set()
+        assert vehicle.turn(300_000, lambda _: None) == Turn(700_000, None, 0)
+    assert "F2 300000 -1 land" in mate.kinds()
+
+
+def test_phases_are_told_once() -> None:
+    told: list[tuple[str, int]] = []
+    mate = Mate("P1 arming")
+    mate.start()
+    settings = TokenSettings(patience_s=0.5)
+
+    def note(name: str, time_us: int) -> None:
+        told.append((name, time_us))
+
+    with (
+        partner(mate, settings, phase=note) as vehicle,
+        pytest.raises(LockstepError, match="the companion is gone"),
+    ):
+        vehicle.turn(NOW_US, lambda _: None)
+    assert told == [("arming", NOW_US)]
+
+
+# --- options
+
+
+@pytest.mark.parametrize(
+    ("options", "speed", "named"),
+    [
+        (LockstepOptions(transport_ms=-1.0), None, "--transport-ms"),
+        (LockstepOptions(turn_us=0), None, "--turn-us"),
+        (LockstepOptions(turn_us=2_000_000), None, "--turn-us"),
+        (LockstepOptions(companion_timeout=0.0), None, "--companion-timeout"),
+        (LockstepOptions(goal_radius=0.0), None, "--goal-radius"),
+        (LockstepOptions(time_limit=0.0), None, "--time-limit"),
+        (LockstepOptions(), 0.01, "--speed"),
+    ],
+)
+def test_options_out_of_range_are_refused(
+    options: LockstepOptions, speed: float | None, named: str
+) -> None:
+    with pytest.raises(UsageError, match=named):
+        remote_plan(options, speed)
+
+
+@pytest.mark.parametrize(("speed", "paced"), [(None, None), ("max", None), (2.0, 2.0)])
+def test_pace_is_as_fast_as_it_goes_unless_asked(speed: Any, paced: float | None) -> None:
+    plan = remote_plan(LockstepOptions(transport_ms=7.0), speed)
+    assert plan.speed == paced
+    assert plan.transport_us == 7_000

@@ -1,0 +1,487 @@
+"""`airl profile`: what it measures, what it writes, and what flies from it afterwards."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from airl_mav.cli import profile, profile_hil
+from airl_mav.cli.companion_command import CompanionCommand, sampler
+from airl_mav.cli.profile_command import ProfileCommand
+from airl_mav.cli.profile_plan import Measured, planned
+from airl_mav.cli.profile_report import correlation_line, stages_of, verdict
+from airl_mav.core.clock import WallClock
+from airl_mav.core.errors import UsageError
+from airl_mav.core.machine import MachineState
+from airl_mav.core.ports import Ports
+from airl_mav.latency.clock_offset import Exchanges
+from airl_mav.latency.stages import STAGES
+from airl_mav.latency.stamps import DecisionLog
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.computer_file import existing_profile, write_profile
+from airl_mav.profiles.loading import list_profiles
+from companion.mission import MissionResult
+from tests.support.ports import choose_ports
+from tests.support.processes import ROOT
+from tests.unit.test_companion_light import BLOCK
+
+SMALL = {"network": "2x4", "image": "64x48"}
+
+
+def profiled(command: ProfileCommand) -> str:
+    """Run the command; return what it printed."""
+    console = Console(file=io.StringIO(), width=200, force_terminal=False)
+    assert profile.run(command, console) == 0
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert isinstance(printed, str)
+    return printed
+
+
+def bare(out: Path, **options: object) -> ProfileCommand:
+    given = {"on": "box", "out": out, "decisions": 80, "warm_up": 5, **options}
+    return ProfileCommand(**given)  # type: ignore[arg-type]
+
+
+def test_profile_flies(tmp_path: Path) -> None:
+    printed = profiled(bare(tmp_path))
+    path = tmp_path / "box.toml"
+    computer = load_computer(str(path))
+    work = computer.workloads["static-obstacles-bare"]
+    stamps = np.load(tmp_path / "box.static-obstacles-bare.npz")
+    took_us = stamps["action_ready_us"] - stamps["infer_start_us"]
+    assert all(stamps[key].dtype == np.int64 for key in stamps.files)
+    assert len(took_us) == 80
+    # In their order, as the replay wants them.
+    assert work.latency.samples_ms == tuple(took_us / 1000.0)
+    assert "--computer" in printed
+    assert f"{path} --workload static-obstacles-bare" in printed
+    command = CompanionCommand(computer=str(path), workload="static-obstacles-bare")
+    drawn = sampler(command, 1)
+    assert drawn is not None
+    assert {drawn.sample_us() for _ in range(80)} == set(took_us.tolist())
+    # This very policy on that computer: found by its digest, in a rehearsal.
+    found = sampler(CompanionCommand(computer=str(path), control="stdio"), 1)
+    assert found is not None
+
+
+def test_what_is_said(tmp_path: Path) -> None:
+    printed = profiled(bare(tmp_path))
+    assert "this computer adds" in printed
+    assert "396 ms" in printed
+    assert "--network 5x32 --image 256x154" in printed
+    assert "the first 5 decisions of a flight" in printed
+    assert "first inference" in printed
+    row = next(line for line in printed.splitlines() if "t2 infer" in line)
+    assert row.count("too few") == 2  # p99, p99.9 of 80
+    assert "autocorrelation of t2" in printed
+    assert "governor" in printed
+
+
+def test_other_workloads_are_kept(tmp_path: Path) -> None:
+    profiled(bare(tmp_path, watts=6.4, price=80.0))
+    profiled(bare(tmp_path, decisions=30, workload="again"))
+    computer = load_computer(str(tmp_path / "box.toml"))
+    assert list(computer.workloads) == ["static-obstacles-bare", "again"]
+    assert len(computer.workloads["static-obstacles-bare"].latency.samples_ms or ()) == 80
+    assert len(computer.workloads["again"].latency.samples_ms or ()) == 30
+    assert (computer.watts, computer.price_usd) == (6.4, 80.0)
+    assert "not measured" not in computer.source
+
+
+def test_power_that_nobody_gave_is_said_to_be_unknown(tmp_path: Path) -> None:
+    profiled(bare(tmp_path))
+    held = load_computer(str(tmp_path / "box.toml"))
+    assert held.watts == 0.0
+    assert "watts: not measured" in held.source
+    profiled(bare(tmp_path, watts=5.0))
+    later = load_computer(str(tmp_path / "box.toml"))
+    assert later.watts == 5.0
+    assert "watts: not measured" not in later.source
+
+
+def test_facts_beside_the_samples(tmp_path: Path) -> None:
+    profiled(bare(tmp_path))
+    facts = json.loads((tmp_path / "box.static-obstacles-bare.json").read_text())
+    assert facts["schema"] == 1
+    assert facts["command"]["decisions"] == 80
+    assert facts["stages_us"]["t2"]["n"] == 80
+    assert facts["stages_us"]["t2"]["p99"] is None
+    assert facts["first_us"] > 0
+    assert set(facts["before"]) == set(facts["after"])
+
+
+def test_random_network_needs_no_policy(tmp_path: Path) -> None:
+    printed = profiled(bare(tmp_path, **SMALL))
+    work = load_computer(str(tmp_path / "box.toml")).workloads["template-2x4-64x48-bare"]
+    assert (work.network.layers, work.network.filters) == (2, 4)
+    assert (work.network.image_width_px, work.network.image_height_px) == (64, 48)
+    assert work.policy_sha256 is None
+    assert "airl evaluate POLICY --computer" in printed
+
+
+def test_every_shipped_profile_is_written_as_it_was_read(tmp_path: Path) -> None:
+    for name in list_profiles("computers"):
+        path = tmp_path / f"{name}.toml"
+        write_profile(path, load_computer(name))
+        assert load_computer(str(path)) == load_computer(name)
+
+
+def test_paper_network_has_its_size() -> None:
+    paper = load_computer("ras-pi-4").workloads["template-5x32"].network
+    from airl_mav.policy.template import template_size
+
+    assert template_size(5, 32, 154, 256, 25) == (paper.parameters, paper.macs)
+
+
+def test_verdict_follows_the_measurement(tmp_path: Path) -> None:
+    with planned(bare(tmp_path)) as plan:
+        assert verdict(plan, np.full(1000, 100)).startswith("this computer adds no gap for")
+        assert "0.02% of its decision period of 0.5 s" in verdict(plan, np.full(1000, 100))
+        assert verdict(plan, np.full(1000, 20_000)).startswith("this computer adds a small gap")
+        assert verdict(plan, np.full(1000, 396_000)).startswith("this computer adds a gap for")
+        # A rare stall is not hidden behind the median: the p99 decides.
+        rare = np.full(1000, 100)
+        rare[::50] = 400_000
+        assert verdict(plan, rare).startswith("this computer adds a gap for")
+
+
+def test_runs_of_slow_decisions_are_seen() -> None:
+    rng = np.random.default_rng(1)
+    noise = rng.integers(1_000, 2_000, 1_000)
+    assert "hardly matters" in correlation_line(noise)
+    runs = noise + 1_000 * (np.arange(1_000) // 20 % 2)
+    assert "the order of the samples matters" in correlation_line(runs)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"policy": "telepathy"}, "no such policy; known: greedy"),
+        ({"policy": "greedy"}, "POLICY greedy: has no network"),
+        ({"policy": "static-obstacles", "network": "2x4"}, "accepted: one of them"),
+        ({"network": "five"}, "--network five: accepted: LAYERSxFILTERS"),
+        ({"network": "0x32"}, "--network 0x32: accepted"),
+        ({"network": "2x4", "image": "big"}, "--image big: accepted: WIDTHxHEIGHT"),
+        ({"network": "2x4", "image": "4000x4"}, "width_px = 4000: accepted: 4 <= value <= 640"),
+        ({"network": "20x256", "image": "640x480"}, "parameters; accepted: at most 475,000,000"),
+        ({"network": "2x4", "image": "50x50", "level": "sitl"}, "--image 50x50: vehicle"),
+        ({"network": "2x4", "runtime": "torch"}, "--runtime torch with --network: accepted: onnx"),
+        ({"decisions": 5}, "--decisions 5: accepted: 10 <= value"),
+        ({"warm_up": 0}, "--warm-up 0: accepted: 1 <= value"),
+        ({"on": "../x"}, "--on '../x': accepted: letters"),
+        ({"watts": -1.0}, "--watts -1: accepted"),
+        ({"vehicle": "quad-256x144"}, "--vehicle quad-256x144: camera"),
+    ],
+)
+def test_what_cannot_be_used(tmp_path: Path, options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(message)):
+        profile.run(bare(tmp_path, **options), Console(file=io.StringIO()))
+    assert not list(tmp_path.iterdir())
+
+
+def test_file_of_another_machine_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "box.toml"
+    write_profile(path, load_computer("ras-pi-4"))
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match=r"Cortex-A72.*accepted: another --on or --out"):
+        profile.run(bare(tmp_path), Console(file=io.StringIO()))
+    assert path.read_bytes() == before
+    assert existing_profile(path, "4 x Arm Cortex-A72, 1.5 GHz") is not None
+
+
+LIGHT = """
+import sys
+from airl_mav.cli import main
+sys.argv = ["airl", *sys.argv[1:]]
+main.main()
+"""
+
+
+def in_light_install(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run `airl` where only the companion's installation is there."""
+    # A learned policy needs ONNX Runtime, which the light installation has.
+    block = BLOCK.replace("'onnxruntime', ", "")
+    absent = "\nimport importlib.util as u\nfound = u.find_spec\n" + (
+        "def find_spec(name, package=None):\n"
+        "    try:\n"
+        "        return found(name, package)\n"
+        "    except ImportError:\n"
+        "        return None\n"
+        "u.find_spec = find_spec\n"
+    )
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", absent + block + LIGHT, *words],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path), "COLUMNS": "120"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_light_installation_measures(tmp_path: Path) -> None:
+    done = in_light_install(tmp_path, "profile", "--decisions", "20", "--on", "pi")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "computers/pi.toml").exists()
+
+
+def test_light_installation_has_help(tmp_path: Path) -> None:
+    for words in ([], ["profile"], ["evaluate"], ["train"]):
+        done = in_light_install(tmp_path, *words, "--help")
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "extra"),
+    [
+        (["evaluate", "static-obstacles"], "sim"),
+        (["arena"], "sim"),
+        (["profile", "--network", "2x4"], "profile"),
+        (["profile", "--level", "sitl"], "sim"),
+    ],
+)
+def test_light_installation_says_what_to_install(
+    tmp_path: Path, words: list[str], extra: str
+) -> None:
+    done = in_light_install(tmp_path, *words)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("error: not installed: ")
+    assert line.endswith(f"pip install 'airl-mav[{extra}]'")
+    assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_profile_writes_nothing(tmp_path: Path) -> None:
+    words = [sys.executable, "-u", "-m", "airl_mav.cli.main", "profile"]
+    process = subprocess.Popen(
+        [*words, "--decisions", "100000", "--out", str(tmp_path / "out")],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert "profile" in process.stdout.readline()
+    assert "network" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[0]
+    assert process.returncode == 130, rest
+    assert "interrupted: nothing was written" in rest
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("flight")
+def test_stages_in_flight(tmp_path: Path) -> None:
+    free = choose_ports()
+    ports = Ports(
+        api_port=free.api,
+        api_local_port=free.api_local,
+        gcs_port=free.gcs,
+        gcs_local_port=free.gcs_local,
+        camera_port=free.camera,
+    )
+    command = bare(tmp_path, level="sitl", decisions=70, warm_up=10, ports=ports)
+    printed = profiled(command)
+    stamps = np.load(tmp_path / "box.static-obstacles-sitl.npz")
+    assert len(stamps["sent_us"]) == 70
+    order = [stamps[stage.start] for stage in STAGES[:6]]
+    assert all((later >= sooner).mean() > 0.95 for sooner, later in pairwise(order))
+    held = stamps["held_until_us"] - stamps["sent_us"]
+    assert (held >= 50_000).mean() > 0.95
+    assert (np.diff(stamps["sent_us"]) >= 50_000).mean() > 0.95
+    assert "link" in printed
+    assert "timing was measured, not flying well" in printed
+    assert "static-obstacles-sitl" in load_computer(str(tmp_path / "box.toml")).workloads
+
+
+def test_busy_machine_is_said_to_be_so() -> None:
+    idle = MachineState(None, None, None, None, None, (0.1, 3.0, 3.0))
+    assert profile.busy_remark(idle, 2) is None
+    assert profile.busy_remark(replace(idle, load=None), 2) is None
+    remark = profile.busy_remark(replace(idle, load=(8.5, 0.0, 0.0)), 2)
+    assert remark is not None
+    assert "load average 8.50 on 2 usable cores" in remark
+
+
+AHEAD_US = 5_000_000
+
+
+def flown_beside(simulator_us: Callable[[int], int]) -> profile_hil.Flown:
+    """A flight of 40 decisions against a simulator whose clock is a function of ours."""
+
+    def asked(start_us: int, n: int, interval_us: int, trip_us: int) -> Exchanges:
+        sent = start_us + interval_us * np.arange(n)
+        remote = np.array([simulator_us(int(t) + trip_us // 2) for t in sent])
+        return Exchanges(sent, remote, sent + trip_us)
+
+    log = DecisionLog()
+    for i in range(40):
+        seen_us = 2_000_000 + 60_000 * i
+        stamps = (np.array([8_000, 8_100, 9_000, 9_100, 59_100]) + seen_us).tolist()
+        log.record(simulator_us(seen_us), *stamps, (0.0, 0.0, 0.0, 0.0))
+    return profile_hil.Flown(
+        MissionResult("stopped", (), log),
+        asked(0, 100, 5_000, 400),
+        asked(1_000_000, 50, 100_000, 700),
+        asked(7_000_000, 100, 5_000, 600),
+    )
+
+
+def test_exposures_are_brought_to_this_computers_clock() -> None:
+    flown = flown_beside(lambda own_us: own_us + AHEAD_US)
+    stamps, seen, remarks = profile_hil.joined(flown, 10)
+    assert seen == "capture_us"
+    t1_us = stamps["decoded_us"] - stamps["capture_us"]
+    assert (np.abs(t1_us - 8_000) <= stamps["capture_uncertainty_us"]).all()
+    # Between half of 400 and half of 600, and 2 for two clocks of whole microseconds.
+    assert stamps["capture_uncertainty_us"].min() >= 200
+    assert stamps["capture_uncertainty_us"].max() <= 303
+    assert len(stamps["decoded_us"]) == 30
+    # Those of decisions only, not of take-off and landing.
+    first_us, last_us = stamps["exchange_sent_us"][[0, -1]]
+    assert stamps["infer_start_us"][0] <= first_us < last_us <= stamps["held_until_us"][-1]
+    assert "least round trip 0.400 ms" in remarks[0]
+    assert "least round trip 0.600 ms" in remarks[0]
+    assert "50 of 50 exchanges in flight agree" in remarks[0]
+    measured = Measured((stamps,), seen, 0, 0)
+    stages = stages_of(measured)
+    assert set(stages["mavlink_round_trip"].tolist()) == {700}
+    assert stages["t1_uncertainty"].max() == stamps["capture_uncertainty_us"].max()
+    assert stages["link"].size == stages["end_to_end"].size == 0
+
+
+@pytest.mark.parametrize(
+    ("simulator_us", "why"),
+    [
+        # It fell behind in flight, and gave up time.
+        (lambda own_us: own_us + AHEAD_US - 300_000 * (own_us > 3_000_000), "ppm"),
+        (lambda own_us: 2 * own_us, "as if a clock did not keep real time"),
+    ],
+)
+def test_clocks_that_cannot_be_related(simulator_us: Callable[[int], int], why: str) -> None:
+    stamps, seen, (remark,) = profile_hil.joined(flown_beside(simulator_us), 10)
+    assert seen == "decoded_us"
+    assert "capture_us" not in stamps
+    assert remark.startswith("t1, link, control and end to end were not measured (-)")
+    assert why in remark
+    assert "t1_uncertainty" not in stages_of(Measured((stamps,), seen, 0, 0))
+
+
+def test_an_autopilot_without_timesync() -> None:
+    none = Exchanges(*(np.zeros(0, np.int64) for _ in range(3)))
+    flown = replace(
+        flown_beside(lambda own_us: own_us + AHEAD_US), before=none, between=none, after=none
+    )
+    stamps, seen, (remark,) = profile_hil.joined(flown, 10)
+    assert (seen, len(stamps["exchange_sent_us"])) == ("decoded_us", 0)
+    assert "0 answers in a row" in remark
+
+
+def test_frames_of_yet_another_clock() -> None:
+    flown = flown_beside(lambda own_us: own_us + AHEAD_US)
+    shifted = [
+        Exchanges(row.sent_us, row.remote_us - 20_000, row.received_us)
+        for row in (flown.before, flown.between, flown.after)
+    ]
+    flown = profile_hil.Flown(flown.result, *shifted)
+    _, seen, (remark,) = profile_hil.joined(flown, 10)
+    assert seen == "decoded_us"
+    assert "30 frames would have been decoded before they were exposed" in remark
+
+
+FIRMWARE_THAT_TELLS_ITS_EPOCH = """
+import sys
+import airl_mav.cli.firmware as cli
+
+fly = cli.fly
+
+def told(firmware, *rest):
+    fly(firmware, *rest)
+    print("epoch_ns", firmware.epoch_ns, flush=True)
+    print("slipped_us", firmware.slipped_us, flush=True)
+
+cli.fly = told
+cli.main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("flight")
+def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks: list[WallClock] = []
+
+    def made() -> WallClock:
+        clocks.append(WallClock())
+        return clocks[-1]
+
+    monkeypatch.setattr(profile_hil, "WallClock", made)
+    free = choose_ports()
+    words = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
+    log_path = tmp_path / "firmware.log"
+    with log_path.open("wb") as log:
+        firmware = subprocess.Popen(
+            [*words, *free.options()],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=log,
+            stderr=log,
+        )
+        try:
+            command = bare(
+                tmp_path,
+                level="hil",
+                decisions=70,
+                warm_up=10,
+                connect=f"udpin://127.0.0.1:{free.api}",
+                camera=f"tcp://127.0.0.1:{free.camera}",
+            )
+            printed = profiled(command)
+        finally:
+            firmware.terminate()
+            firmware.wait(30)
+    stamps = np.load(tmp_path / "box.static-obstacles-hil.npz")
+    facts = json.loads((tmp_path / "box.static-obstacles-hil.json").read_text())
+    counts = {key: stage["n"] for key, stage in facts["stages_us"].items()}
+    assert "motor_us" not in stamps.files
+    assert len(stamps["sent_us"]) == 70
+    assert "link, control and end to end were not measured" in printed
+    assert (counts["t2"], counts["t3"], counts["period"]) == (70, 70, 69)
+    assert (counts["link"], counts["end_to_end"]) == (0, 0)
+    trips = stamps["exchange_received_us"] - stamps["exchange_sent_us"]
+    assert counts["mavlink_round_trip"] == len(trips) >= 10
+    assert "MAVLink round trip" in printed
+    told = dict(re.findall(r"^(epoch_ns|slipped_us) (\d+)$", log_path.read_text(), re.MULTILINE))
+    if counts["t1"] == 0:
+        # Refused, and rightly: this host could not keep pace.
+        assert int(told["slipped_us"]) > 0
+        return
+    # Here both clocks are one, and the truth is known.
+    assert counts["t1"] == counts["t1_uncertainty"] == 70
+    assert re.search(r"t1 fetch ±\d+\.\d+", printed)
+    ahead_us = (clocks[0].epoch_ns - int(told["epoch_ns"])) / 1_000
+    error_us = stamps["capture_us"] - (stamps["capture_simulator_us"] - ahead_us)
+    within_us = stamps["capture_uncertainty_us"]
+    assert (np.abs(error_us) <= within_us).all()
+    assert (within_us < 4_000).all()
+    # What the true clock gives, as level sitl does, lies within what is printed.
+    true_t1_us = stamps["decoded_us"] - (stamps["capture_simulator_us"] - ahead_us)
+    shown, most_us = facts["stages_us"]["t1"], facts["stages_us"]["t1_uncertainty"]["max"]
+    true_p50_us = np.percentile(true_t1_us, 50.0, method="inverted_cdf")
+    assert abs(shown["p50"] - true_p50_us) <= most_us
+    assert abs(shown["mean"] - true_t1_us.mean()) <= most_us

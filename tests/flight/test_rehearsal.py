@@ -1,0 +1,616 @@
+"""The harness's part of an episode: every order of events has one outcome.
+
+The two processes are stood in for, so that events come in exactly the order that a test asks for;
+`test_sitl.py` and `test_faults.py` fly real ones.
+"""
+
+from __future__ import annotations
+
+import queue
+import re
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.setup import Part, Setup
+from airl_mav.latency.injection import NOTHING_INJECTED
+from airl_mav.latency.stamps import DecisionLog
+from airl_mav.rehearsal import crew, rehearsal
+from airl_mav.rehearsal.channel import (
+    Abort,
+    Ended,
+    Event,
+    Failed,
+    FinishEpisode,
+    Fly,
+    Loaded,
+    LoadEpisode,
+    Progress,
+    Ready,
+    Saved,
+    State,
+    Text,
+)
+from airl_mav.rehearsal.crew import COMPANION, FIRMWARE
+from airl_mav.rehearsal.episode import Plan, ProcessPlan
+from airl_mav.rehearsal.process import Exited
+from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
+from airl_mav.rehearsal.run_folder import RunFolder, load
+
+GOAL = (10.0, 0.0)
+START_US = 1_000_000
+
+Item = tuple[str, Event | Exited]
+Script = list[Item | Callable[[], None]]
+
+
+def at(seconds: float, north: float = 0.0, **more: Any) -> Item:
+    """A state of the vehicle, so long after the reset."""
+    fields: dict[str, Any] = {
+        "time_us": START_US + round(seconds * 1e6),
+        "position": (north, 0.0, -2.0),
+        "speed_m_s": 0.0,
+        "yaw": 0.0,
+        "battery": 1.0,
+        "collision": None,
+        "mode": "offboard",
+        "armed": True,
+        "landed": False,
+        "slipped_us": 0,
+    }
+    return FIRMWARE, State(**(fields | more))
+
+
+def phase(name: str, seconds: float) -> Item:
+    return COMPANION, Progress(phase=name, time_us=START_US + round(seconds * 1e6))
+
+
+def ended(reason: str = "goal reached", *notes: str) -> Item:
+    return COMPANION, Ended(reason=reason, notes=notes, path="")
+
+
+class Stage:
+    """Stands in for both processes; plays a script when told to fly."""
+
+    def __init__(self, *scripts: Script) -> None:
+        self.scripts = list(scripts)
+        self.events: queue.Queue[Item] | None = None
+        self.children: dict[str, FakeChild] = {}
+        """The newest of each."""
+        self.all: list[FakeChild] = []
+        self.on_abort: Callable[[Abort], list[Item]] = lambda _: [ended("stopped")]
+        self.saves = True
+        self.slips: list[tuple[int, int]] = []
+        """When the firmware has given up time, and how much [µs]."""
+        self.starts: list[list[Item]] = []
+        """What is said at each start; both are ready when nothing is left of it."""
+
+    def put(self, *items: Item) -> None:
+        assert self.events is not None
+        for item in items:
+            self.events.put(item)
+
+    def requests(self, name: str, kind: type) -> list[Any]:
+        children = [child for child in self.all if child.name == name]
+        return [r for child in children for r in child.requests if isinstance(r, kind)]
+
+
+class FakeChild:
+    """Answers requests at once, through the queue."""
+
+    stage: Stage
+
+    def __init__(self, name: str, *arguments: Any, keeps: Sequence[int]) -> None:
+        assert keeps == (7,)
+        self.name, self.ending, self.stopped, self.log = name, False, 0, Path(f"{name}.log")
+        self.requests: list[Any] = []
+        stage = self.stage
+        stage.events = arguments[-1]
+        stage.children[name] = self
+        stage.all.append(self)
+        if name == COMPANION:
+            ready: list[Item] = [(FIRMWARE, Ready()), (COMPANION, Ready())]
+            stage.put(*(stage.starts.pop(0) if stage.starts else ready))
+
+    def send(self, request: Any) -> None:
+        self.requests.append(request)
+        stage = self.stage
+        if self.ending:
+            return
+        if isinstance(request, LoadEpisode):
+            self.record = Path(request.record)
+            stage.put(
+                (
+                    FIRMWARE,
+                    Loaded(
+                        episode=request.episode,
+                        time_us=START_US,
+                        epoch_ns=0,
+                        slipped_us=0,
+                        goal=GOAL,
+                    ),
+                )
+            )
+        elif isinstance(request, Fly):
+            self.decisions = Path(request.record)
+            for item in stage.scripts.pop(0):
+                if callable(item):
+                    item()
+                else:
+                    stage.put(item)
+        elif isinstance(request, Abort):
+            stage.put(*stage.on_abort(request))
+        elif isinstance(request, FinishEpisode) and stage.saves:
+            write_record(self.record, stage.slips)
+            stage.put((FIRMWARE, Saved(path=str(self.record))))
+
+    def stop(self) -> None:
+        self.ending = True
+        self.stopped += 1
+
+    def kill(self) -> None:
+        self.ending = True
+
+    def log_tail(self) -> str:
+        return "last words"
+
+
+def write_record(path: Path, slips: Sequence[tuple[int, int]]) -> None:
+    """What the firmware leaves of an episode: 100 s at 10 m/s to the north."""
+    n = 5001
+    time_us = START_US + np.arange(n, dtype=np.int64) * 20_000
+    position = np.zeros((n, 3))
+    position[:, 0] = 0.2 * np.arange(n)
+    arrays: dict[str, Any] = {
+        "trajectory/time_us": time_us,
+        "trajectory/position": position,
+        "trajectory/velocity": np.tile([10.0, 0.0, 0.0], (n, 1)),
+        "trajectory/quaternion": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        "trajectory/power_w": np.full(n, 100.0),
+        "setpoints/accepted_us": np.array([START_US + 2_100_000]),
+        "setpoints/motor_us": np.array([START_US + 2_103_000]),
+        "setpoints/setpoint": np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        "estimate/time_us": np.zeros(0, np.int64),
+        "tick/lateness_us": np.zeros(3, np.int64),
+        "tick/slips_us": np.array(slips, np.int64).reshape(-1, 2),
+    }
+    np.savez(path, **arrays)
+
+
+class Silent:
+    """An observer that keeps the records."""
+
+    def __init__(self) -> None:
+        self.records: list[EpisodeRecord] = []
+        self.texts: list[str] = []
+        self.losses: list[str] = []
+
+    def waiting(self, what: str) -> None: ...
+    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None: ...
+    def phase(self, phase: str, time_us: int) -> None: ...
+    def state(self, state: State, started_us: int) -> None: ...
+
+    def text(self, text: Text) -> None:
+        self.texts.append(text.text)
+
+    def finished(self, record: EpisodeRecord) -> None:
+        self.records.append(record)
+
+    def lost(self, what: str) -> None:
+        self.losses.append(what)
+
+
+class Run:
+    """One rehearsal on a stage."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
+        FakeChild.stage = stage
+        monkeypatch.setattr(crew, "Child", FakeChild)
+        monkeypatch.setattr(crew, "REPLY_TIMEOUT_S", 0.3)
+        part = Part("x")
+        setup = Setup("sitl", part, part, part, part, 2.0, NOTHING_INJECTED, 1.0, "persist")
+        self.folder = RunFolder.create(folder / "run", "test", {}, setup=setup)
+        self.stage = stage
+        self.observer = Silent()
+        process = ProcessPlan("nothing", [])
+        self.plan = Plan(process, process, "corridor", 5, len(stage.scripts), 3.0, 60.0, 1.0, 2.0)
+
+    def fly(self, episodes: int | None = None, done: Collection[int] = ()) -> list[EpisodeRecord]:
+        if episodes is not None:
+            self.plan = replace(self.plan, episodes=episodes)
+        with Rehearsal(self.plan, self.folder, self.observer, keeps=(7,)) as flown:
+            flown.run(done)
+        assert all(child.stopped for child in self.stage.all)
+        return self.observer.records
+
+
+@pytest.fixture
+def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Run]:
+    return lambda *scripts, folder="": Run(tmp_path / folder, monkeypatch, Stage(*scripts))
+
+
+FLOWN: Script = [
+    at(0.5),
+    phase("navigating", 2.0),
+    at(2.5, 1.0),
+    at(9.0, 8.0),
+    ended(),
+]
+
+
+def test_two_good_episodes(play: Callable[..., Run]) -> None:
+    run = play(FLOWN, FLOWN)
+    first, second = run.fly()
+    for index, record in enumerate((first, second)):
+        assert (record.index, record.seed, record.arena_seed) == (index, 5 + index, 5 + index)
+        assert record.outcome == "success"
+        assert record.quality is not None
+        assert record.quality.flight_time_s == pytest.approx(7.0)
+        assert record.quality.distance_m == pytest.approx(70.0)
+        assert record.quality.energy_j == pytest.approx(700.0)
+        assert record.quality.computer_energy_j == pytest.approx(14.0)
+    stage = run.stage
+    assert stage.requests(COMPANION, Abort) == []
+    assert [r.latency_seed for r in stage.requests(COMPANION, Fly)] == [5, 6]
+    assert [e.index for e in load(run.folder.path).episodes] == [0, 1]
+    assert not list(run.folder.path.glob(".*"))
+
+
+def test_goal_and_collision_in_one_sample_is_a_success(play: Callable[..., Run]) -> None:
+    (record,) = play(
+        [phase("navigating", 2.0), at(9.0, 8.0, collision="box 3"), ended()],
+    ).fly()
+    assert record.outcome == "success"
+
+
+def test_verdict_stands_whatever_comes_after(play: Callable[..., Run]) -> None:
+    after: Script = [
+        *FLOWN[:-1],
+        at(9.1, 9.0, collision="wall north"),
+        at(9.2, 9.0, battery=0.0),
+        ended("link lost", "it was windy"),
+    ]
+    run = play(after)
+    (record,) = run.fly()
+    assert record.outcome == "success"
+    assert record.ended_us == START_US + 9_000_000
+    assert record.notes == ("it was windy",)
+    assert run.stage.requests(COMPANION, Abort) == []
+
+
+@pytest.mark.parametrize(
+    ("sample", "outcome", "land"),
+    [
+        (at(5.0, 4.0, collision="box 3"), "collision", False),
+        (at(5.0, 4.0, battery=0.0), "battery", False),
+        (at(62.5, 4.0), "timeout", True),
+    ],
+)
+def test_the_companion_is_called_off(
+    play: Callable[..., Run], sample: Item, outcome: str, land: bool
+) -> None:
+    run = play([phase("navigating", 2.0), at(2.5), sample])
+    (record,) = run.fly()
+    assert record.outcome == outcome
+    assert run.stage.requests(COMPANION, Abort) == [Abort(land=land)]
+
+
+def test_collision_before_navigation(play: Callable[..., Run]) -> None:
+    (record,) = play([at(1.0, collision="wall east")]).fly()
+    assert (record.outcome, record.quality) == ("collision", None)
+    assert record.reason == "hit wall east during the take-off"
+
+
+def test_navigation_that_never_begins(play: Callable[..., Run]) -> None:
+    run = play([at(1.0), phase("arming", 1.0), at(91.0)])
+    (record,) = run.fly()
+    assert (record.outcome, record.reason) == ("aborted", "navigation never began")
+    assert record.navigation_us is None
+    assert run.stage.requests(COMPANION, Abort) == [Abort(land=True)]
+
+
+def test_mission_that_ends_early_is_aborted_with_its_reason(play: Callable[..., Run]) -> None:
+    early: Script = [at(1.0), ended("arming failed: command denied")]
+    first, second = play(early, FLOWN).fly()
+    assert (first.outcome, first.reason) == ("aborted", "arming failed: command denied")
+    assert second.outcome == "success"
+
+
+def test_success_that_nobody_notices_is_called_off(play: Callable[..., Run]) -> None:
+    """The companion still looks for the goal, or lies on its back under it."""
+    run = play([*FLOWN[:-1], at(18.9, 8.0), at(19.1, 8.0), at(19.2, 8.0)])
+    (record,) = run.fly()
+    assert record.outcome == "success"
+    assert run.stage.requests(COMPANION, Abort) == [Abort(land=True)]
+
+
+def test_success_then_crash_is_called_off_without_landing(play: Callable[..., Run]) -> None:
+    run = play([*FLOWN[:-1], at(19.1, 8.0, collision="floor")])
+    run.fly()
+    assert run.stage.requests(COMPANION, Abort) == [Abort(land=False)]
+
+
+def test_time_given_up_is_taken_off_the_companions_clock(play: Callable[..., Run]) -> None:
+    run = play(
+        [
+            at(0.5),
+            at(1.0, slipped_us=3_000_000),
+            # 5.1 s by the companion's clock is 2 s by the simulator's, which has given up another
+            # 0.1 s that no state has told yet.
+            phase("navigating", 5.1),
+            at(2.5, 1.0, slipped_us=3_100_000),
+            at(9.0, 8.0, slipped_us=3_500_000),
+            ended(),
+        ],
+    )
+    when = [(1.0, 3.0), (1.5, 0.1), (9.0, 0.4)]
+    run.stage.slips = [(START_US + int(at_s * 1e6), int(lost_s * 1e6)) for at_s, lost_s in when]
+    (record,) = run.fly()
+    assert record.navigation_us == START_US + 2_000_000
+    assert record.slipped_us == 3_500_000
+
+
+def test_decisions_are_joined_with_the_setpoints(play: Callable[..., Run]) -> None:
+    run = play([*FLOWN])
+
+    def leave_log() -> None:
+        log = DecisionLog()
+        second = START_US + 2_000_000
+        log.record(
+            second, second + 10, second + 20, second + 30, second + 40, second + 50, (1, 0, 0, 0)
+        )
+        np.savez(run.stage.children[COMPANION].decisions, **log.columns())
+
+    run.stage.scripts[0].insert(0, leave_log)
+    run.fly()
+    stamps = load(run.folder.path).latency[0]
+    assert stamps["accepted_us"].tolist() == [START_US + 2_100_000]
+    assert stamps["motor_us"].tolist() == [START_US + 2_103_000]
+    assert not list(run.folder.path.glob(".*"))
+
+
+def test_what_is_there_is_not_flown(play: Callable[..., Run]) -> None:
+    run = play(FLOWN)
+    (record,) = run.fly(3, done={0, 2})
+    assert (record.index, record.seed) == (1, 6)
+    assert [request.episode for request in run.stage.requests(FIRMWARE, LoadEpisode)] == [1]
+
+
+def test_nothing_is_started_when_there_is_nothing_to_fly(play: Callable[..., Run]) -> None:
+    run = play()
+    assert run.fly(2, done={0, 1}) == []
+    assert run.stage.all == []
+
+
+# --- somebody dies
+
+DIED: Item = (COMPANION, Exited(-9))
+
+
+def test_a_flight_that_lost_its_companion_is_flown_again(play: Callable[..., Run]) -> None:
+    """By two new processes, once the failsafe has been seen through."""
+    run = play(
+        FLOWN,
+        [
+            phase("navigating", 2.0),
+            at(3.0, 1.0),
+            DIED,
+            (FIRMWARE, Text(time_us=START_US + 4_100_000, severity=2, text="Failsafe activated")),
+            at(5.0, 1.0),
+            at(8.0, 1.0, armed=False),
+        ],
+        FLOWN,
+        FLOWN,
+    )
+    records = run.fly(3)
+    assert [(r.index, r.seed, r.outcome.value) for r in records] == [
+        (0, 5, "success"),
+        (1, 6, "success"),
+        (2, 7, "success"),
+    ]
+    told = "the companion died (SIGKILL); autopilot at 5.10 s: Failsafe activated"
+    assert [r.notes for r in records] == [(), (f"flown again: {told}",), ()]
+    (loss,) = run.observer.losses
+    assert loss.startswith(f"flight 001, seed 6 begins again: {told}; log: companion.log")
+    assert loss.endswith("last words")
+    assert run.observer.texts == ["Failsafe activated"]
+    # A line each, the same seed and files both times.
+    assert [e.index for e in load(run.folder.path).episodes] == [0, 1, 2]
+    loads = run.stage.requests(FIRMWARE, LoadEpisode)
+    assert [request.seed for request in loads] == [5, 6, 6, 7]
+    assert loads[1] == loads[2]
+    assert [child.name for child in run.stage.all] == 2 * [FIRMWARE, COMPANION]
+    assert not list(run.folder.path.glob(".*"))
+
+
+def test_companion_that_fails_and_then_exits_is_one_fault(play: Callable[..., Run]) -> None:
+    """Its exit is no news, and must not cut short the look at the failsafe."""
+    run = play(
+        [
+            at(1.0),
+            (COMPANION, Failed(message="no flight controller heard")),
+            (COMPANION, Exited(1)),
+            at(2.0),
+            (FIRMWARE, Text(time_us=START_US, severity=2, text="Failsafe activated")),
+            at(3.0, armed=False),
+        ],
+        FLOWN,
+    )
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    (note,) = record.notes
+    assert note.startswith("flown again: the companion gave up: no flight controller heard; auto")
+
+
+@pytest.mark.parametrize(
+    ("end", "told"),
+    [
+        (Exited(-11), "the firmware died (SIGSEGV)"),
+        (Exited(3), "the firmware died (exit status 3)"),
+        (Failed(message="no such thing"), "the firmware gave up: no such thing"),
+    ],
+)
+def test_a_lost_firmware_is_not_waited_for(
+    play: Callable[..., Run], end: Exited | Failed, told: str
+) -> None:
+    run = play([at(1.0), (FIRMWARE, end)], FLOWN)
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    assert record.notes == (f"flown again: {told}",)
+    assert len(run.stage.requests(FIRMWARE, FinishEpisode)) == 1
+
+
+def test_firmware_that_dies_under_the_failsafe(play: Callable[..., Run]) -> None:
+    run = play([at(1.0), (COMPANION, Exited(1)), at(2.0), (FIRMWARE, Exited(-9))], FLOWN)
+    (record,) = run.fly(1)
+    assert record.notes == (
+        "flown again: the companion died (exit status 1); the firmware died (SIGKILL)",
+    )
+
+
+def test_a_flight_without_its_decisions_is_none(play: Callable[..., Run]) -> None:
+    """At the goal, but the companion dies on the way down and its log with it."""
+    run = play([*FLOWN[:-1], DIED, at(12.0, 8.0, armed=False)], FLOWN)
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    assert record.notes == ("flown again: the companion died (SIGKILL)",)
+    assert len(load(run.folder.path).episodes) == 1
+
+
+@pytest.mark.parametrize("reason", ["link lost", "camera silent"])
+def test_processes_that_lost_each_other_fly_again(play: Callable[..., Run], reason: str) -> None:
+    run = play([phase("navigating", 2.0), at(3.0, 1.0), ended(reason, "watchdog at 3 s")], FLOWN)
+    (record,) = run.fly(1)
+    assert record.outcome == "success"
+    assert record.notes == (f"flown again: firmware and companion lost each other ({reason})",)
+    assert len(run.stage.all) == 4
+
+
+@pytest.mark.parametrize("reason", ["watchdog", "policy failed: RuntimeError: out of ideas"])
+def test_what_a_policy_does_is_not_flown_again(play: Callable[..., Run], reason: str) -> None:
+    (record,) = play([phase("navigating", 2.0), at(3.0, 1.0), ended(reason)]).fly(1)
+    assert (record.outcome, record.reason, record.notes) == ("aborted", reason, ())
+
+
+@pytest.mark.parametrize(
+    "script",
+    [
+        [at(1.0), DIED, at(2.0, armed=False)],
+        [at(1.0), (FIRMWARE, Exited(-9))],
+        [at(1.0), ended("link lost")],
+    ],
+)
+def test_a_flight_that_is_lost_every_time_ends_the_run(
+    play: Callable[..., Run], script: Script
+) -> None:
+    run = play(FLOWN, script, script, script, FLOWN)
+    with pytest.raises(RehearsalError, match="flight 001, seed 6: lost 3 times; at last "):
+        run.fly(3)
+    assert len(run.observer.losses) == 2
+    # What was flown before is kept, nothing of the lost ones.
+    assert [record.index for record in run.observer.records] == [0]
+    assert [e.index for e in load(run.folder.path).episodes] == [0]
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_losses_are_counted_by_flight(play: Callable[..., Run]) -> None:
+    lost: Script = [at(1.0), (FIRMWARE, Exited(-9))]
+    records = play(lost, lost, FLOWN, lost, lost, FLOWN).fly(2)
+    assert [len(record.notes) for record in records] == [2, 2]
+
+
+def test_ended_but_never_saved(play: Callable[..., Run]) -> None:
+    run = play(FLOWN, FLOWN, FLOWN)
+    run.stage.saves = False
+    with pytest.raises(RehearsalError, match="gave up waiting for the event 'Saved'"):
+        run.fly(1)
+    assert run.observer.records == []
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_companion_that_never_answers_is_ended(
+    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hung for good: its end is what makes the flight controller's failsafe act."""
+    for name in ("TAKEOFF_LIMIT_S", "WRAP_UP_S"):
+        monkeypatch.setattr(rehearsal, name, 0.1)
+    run = play([at(0.05), phase("navigating", 0.06), at(0.08)], FLOWN)
+    run.plan = replace(run.plan, time_limit_s=1.0)
+    (record,) = run.fly(1)
+    (note,) = record.notes
+    assert re.fullmatch(
+        "flown again: gave up waiting for the flight after 1 s; "
+        "gave up waiting for the vehicle to come down after 0 s",
+        note,
+    )
+
+
+@pytest.mark.parametrize("name", [FIRMWARE, COMPANION])
+def test_refusal_at_the_start_is_a_usage_error(play: Callable[..., Run], name: str) -> None:
+    run = play(FLOWN)
+    refused: Item = (name, Failed(message="port 1 is taken", usage=True))
+    run.stage.starts = [[(FIRMWARE, Ready()), refused]]
+    with pytest.raises(UsageError, match="port 1 is taken"):
+        run.fly()
+    assert len(run.stage.all) == 2
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_refusal_in_flight_is_a_usage_error_too(play: Callable[..., Run]) -> None:
+    """Not again: the same input is refused the same way."""
+    run = play(FLOWN, [(COMPANION, Failed(message="cannot use this camera", usage=True))])
+    with pytest.raises(UsageError, match="cannot use this camera"):
+        run.fly()
+    assert [record.index for record in run.observer.records] == [0]
+    assert len(run.stage.all) == 2
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_death_at_the_start(play: Callable[..., Run]) -> None:
+    run = play(FLOWN)
+    died: list[Item] = [(FIRMWARE, Ready()), (COMPANION, Exited(1))]
+    run.stage.starts = [died, died]
+    (record,) = run.fly()
+    assert record.notes == 2 * ("flown again: the companion died (exit status 1)",)
+    run = play(FLOWN, folder="again")
+    run.stage.starts = [died, died, died]
+    with pytest.raises(RehearsalError, match=r"companion died \(exit status 1\)(.|\n)*last words"):
+        run.fly()
+
+
+def test_interrupt_while_a_new_crew_starts(
+    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = play([at(1.0), (FIRMWARE, Exited(-9))])
+    real = FakeChild.__init__
+
+    def interrupted(child: FakeChild, name: str, *words: Any, **more: Any) -> None:
+        if len(run.stage.all) == 3:
+            raise KeyboardInterrupt
+        real(child, name, *words, **more)
+
+    monkeypatch.setattr(FakeChild, "__init__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.fly()
+    assert len(run.stage.all) == 3
+    assert all(child.stopped for child in run.stage.all)
+
+
+def test_second_interrupt_kills(play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch) -> None:
+    run = play(FLOWN)
+    killed: list[str] = []
+
+    def impatient(_child: FakeChild) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(FakeChild, "stop", impatient)
+    monkeypatch.setattr(FakeChild, "kill", lambda child: killed.append(child.name))
+    with pytest.raises(KeyboardInterrupt):
+        run.fly()
+    assert sorted(killed) == [COMPANION, FIRMWARE]

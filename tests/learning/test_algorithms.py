@@ -1,0 +1,98 @@
+"""From a specification to a learner: every known name learns, misuse gets one line."""
+
+from __future__ import annotations
+
+import pytest
+from stable_baselines3 import PPO
+
+from airl_mav.core.errors import UsageError
+from airl_mav.training.algorithms import CLASSES, CONTINUOUS_ONLY, ROLLOUT, make_model
+from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
+from tests.support.toy_fleet import ToyFleet
+
+SHORT = {
+    "ppo": {"options": {"n_steps": 16, "n_epochs": 1}, "batch_size": 32},
+    "trpo": {"options": {"n_steps": 8}, "batch_size": 16},
+    "a2c": {},
+}
+REPLAYING = {"buffer_size": 500, "learning_starts": 50, "batch_size": 8}
+
+
+def make(name: str, *, continuous: bool = False, **fields):
+    spec = AlgorithmSpec(name=name, **fields)
+    return make_model(spec, NetworkSpec(), ToyFleet(4, continuous=continuous), seed=0)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_every_known_algorithm_learns(name):
+    model = make(name, continuous=name in CONTINUOUS_ONLY, **SHORT.get(name, REPLAYING))
+    before = {k: v.clone() for k, v in model.policy.state_dict().items()}
+    model.learn(100)
+    after = model.policy.state_dict()
+    assert any(not before[key].equal(after[key]) for key in before)
+
+
+def test_dqn_takes_every_field():
+    model = make(
+        "dqn",
+        learning_rate=0.01,
+        gamma=0.9,
+        batch_size=7,
+        buffer_size=1000,
+        learning_starts=77,
+        n_step=5,
+        double=False,
+        env_steps_per_update=9,
+        target_interval=99,
+        exploration_initial=0.8,
+        exploration_final=0.1,
+        exploration_fraction=0.5,
+        precision="bfloat16",
+        options={"max_grad_norm": 3.0},
+    )
+    assert isinstance(model, DoubleDQN)
+    assert model.lr_schedule(1.0) == 0.01
+    assert (model.gamma, model.batch_size, model.learning_starts) == (0.9, 7, 77)
+    assert (model.n_step, model.double, model.env_steps_per_update) == (5, False, 9)
+    assert (model.target_update_interval, model.precision) == (99, "bfloat16")
+    assert (model.replay.n_step, model.replay.gamma, model.max_grad_norm) == (5, 0.9, 3.0)
+    assert model.replay.rows * model.n_envs == 1000 + 5 * 4
+    assert model.exploration_schedule(1.0) == 0.8
+    assert model.exploration_schedule(0.75) == pytest.approx(0.45)
+    assert model.exploration_schedule(0.4) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("vehicles", [1, 3, 32, 48])
+def test_whole_batches_fill_a_rollout(vehicles):
+    model = make_model(AlgorithmSpec(name="ppo"), NetworkSpec(), ToyFleet(vehicles), seed=0)
+    assert isinstance(model, PPO)
+    assert model.n_steps * vehicles % model.batch_size == 0
+    assert model.n_steps * vehicles >= ROLLOUT / 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "line"),
+    [
+        ({"name": "reinforce"}, "algorithm.name = 'reinforce': accepted: dqn, ppo, a2c"),
+        ({"name": "sac"}, "'sac': chooses continuous actions, the action set is discrete"),
+        ({"name": "ppo", "n_step": 3}, "algorithm.n_step: 'ppo' has no such field; fields: learn"),
+        ({"name": "a2c", "batch_size": 3}, "algorithm.batch_size: 'a2c' has no such field"),
+        ({"name": "ppo", "options": {"nsteps": 3}}, "did you mean 'n_steps'"),
+        ({"name": "dqn", "options": {"train_freq": 3}}, "options.train_freq: unknown to 'dqn'"),
+        ({"name": "ppo", "options": {"policy": "x"}}, "options.policy: unknown to 'ppo'"),
+        ({"name": "ppo", "options": {"gamma": 0.5}}, "options.gamma: unknown to 'ppo'"),
+        ({"name": "ppo", "options": {"clip_range": "x"}}, "algorithm.options of 'ppo': "),
+    ],
+)
+def test_misuse_gets_one_line(fields, line):
+    with pytest.raises(UsageError) as refusal:
+        make(**fields)
+    assert line in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["dqn", "qrdqn"])
+def test_discrete_learners_are_refused_on_continuous_actions(name):
+    with pytest.raises(UsageError, match="chooses discrete actions"):
+        make(name, continuous=True)

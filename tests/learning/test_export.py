@@ -1,0 +1,411 @@
+"""Export: what ONNX Runtime gives is what the trained model gives, whatever trained it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sb3_contrib", reason="needs the [train] extra")
+pytest.importorskip("onnxscript", reason="needs the [train] extra")
+
+import sb3_contrib
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.dqn.policies import MultiInputPolicy
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from airl_mav.cli import main
+from airl_mav.core.errors import UsageError
+from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.policy.card import load_card, open_model, read_card
+from airl_mav.policy.layouts import ObservationSpec, boxes
+from airl_mav.policy.learned import decide, load_learned
+from airl_mav.profiles.computer import load_computer
+from airl_mav.training import export
+from airl_mav.training.sb3_export import export_sb3, network_of
+from tests.support.policy_kit import SPEC, Eye, export_tiny, facts, make_model, noise
+from tests.support.processes import ROOT
+
+ONE = (
+    torch.zeros(1, 1, SPEC.height_px, SPEC.width_px, dtype=torch.uint8),
+    torch.zeros(1, 3),
+    torch.zeros(1, 3),
+)
+
+MODELS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "DQN": ("DQN", "arc-25", {}),
+    "QRDQN": ("QRDQN", "paper-25", {"policy_kwargs": {"n_quantiles": 7}}),
+    "PPO": ("PPO", "arc-25", {}),
+    "PPO, two extractors": (
+        "PPO",
+        "arc-25",
+        {"policy_kwargs": {"share_features_extractor": False}},
+    ),
+    "MaskablePPO": ("MaskablePPO", "arc-25", {}),
+    "A2C": ("A2C", "paper-25", {}),
+    "TRPO": ("TRPO", "arc-25", {}),
+    "PPO, continuous": ("PPO", "velocity", {}),
+    "PPO, squashed": (
+        "PPO",
+        "velocity",
+        {"use_sde": True, "policy_kwargs": {"squash_output": True}},
+    ),
+    "SAC": ("SAC", "velocity", {}),
+    "SAC, gSDE": ("SAC", "velocity", {"use_sde": True}),
+    "TQC": ("TQC", "velocity", {}),
+    "TD3": ("TD3", "velocity", {}),
+    "DDPG": ("DDPG", "velocity", {}),
+}
+
+
+def model_of(name: str) -> tuple[BaseAlgorithm, ActionSpec]:
+    algorithm, actions, options = MODELS[name]
+    return make_model(algorithm, actions, **options), ActionSpec.model_validate({"set": actions})
+
+
+def compare(found: np.ndarray, wanted: np.ndarray) -> None:
+    """Compare decisions, which must not all be the same."""
+    if found.ndim == 2:
+        assert np.ptp(found, axis=0).min() > 0.1
+        np.testing.assert_allclose(found, wanted, atol=1e-5)
+    else:
+        assert len(set(wanted.tolist())) > 2
+        np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_network_decides_as_the_model_predicts(name: str) -> None:
+    model, actions = model_of(name)
+    seen = noise(200)
+    wanted, _ = model.predict(seen, deterministic=True)
+    with torch.no_grad():
+        outputs = network_of(model)(*(torch.from_numpy(seen[key]) for key in boxes(SPEC)))
+    compare(decide(actions, outputs.numpy()), wanted)
+
+
+@pytest.mark.parametrize("name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3"])
+def test_onnx_decides_as_the_model_predicts(name: str, tmp_path: Path) -> None:
+    model, actions = model_of(name)
+    model.policy.set_training_mode(True)
+    drawn = torch.get_rng_state()
+    card = export_sb3(model, facts(actions=actions, algorithm=name), tmp_path)
+    assert torch.equal(torch.get_rng_state(), drawn), "an export in training must not change it"
+    assert model.policy.training
+    seen = noise(200)
+    wanted, _ = model.predict(seen, deterministic=True)
+    compare(load_learned(tmp_path).act_batch(seen), wanted)
+    assert card == load_card(tmp_path)
+
+
+def test_scores_are_those_of_torch_for_any_number_of_rows(tmp_path: Path) -> None:
+    model = make_model("DQN")
+    card = export_sb3(model, facts(), tmp_path)
+    runtime = open_model(tmp_path, card)
+    for n in (1, 2, 17):
+        seen = noise(n, seed=n)
+        with torch.no_grad():
+            wanted = model.policy.q_net({k: torch.from_numpy(v) for k, v in seen.items()}).numpy()
+        found = runtime.infer(seen)
+        assert found.shape == (n, 25)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+def test_the_graph_scales_the_image_as_sb3_does(scaled: bool, tmp_path: Path) -> None:
+    """uint8 goes in; the network behind must see grey / 255, or grey if it was trained so."""
+    model = make_model("DQN", policy_kwargs={"normalize_images": scaled})
+    runtime = open_model(tmp_path, export_sb3(model, facts(), tmp_path))
+    seen = noise(3)
+    net: Any = model.policy.q_net
+    floats = {k: torch.from_numpy(v.astype(np.float32)) for k, v in seen.items()}
+    if scaled:
+        floats["depth"] /= 255.0
+    with torch.no_grad():
+        wanted = net.q_net(net.features_extractor(floats)).numpy()
+    np.testing.assert_allclose(runtime.infer(seen), wanted, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["DQN", "PPO", "SAC", "PPO, two extractors"])
+def test_parameters_and_macs_are_those_of_the_inference(name: str) -> None:
+    algorithm, actions, options = MODELS[name]
+    network = network_of(make_model(algorithm, actions, **options))
+    with FlopCounterMode(display=False) as counter:
+        network(*ONE)
+    macs = export.count_macs(network, ONE)
+    assert macs == counter.get_total_flops() // 2
+    # By hand: two convolutions to 11x15 and 5x7, dense 16, 16 and the output; no value function.
+    outputs = 2 if actions == "velocity" else 25
+    dense = (280 + 6) * 16 + 16 * 16 + 16 * outputs
+    assert macs == 11 * 15 * 4 * 9 + 5 * 7 * 8 * 36 + dense
+    assert export.count_parameters(network, ONE) == (
+        (4 * 9 + 4) + (8 * 36 + 8) + dense + 16 + 16 + outputs
+    )
+    parts = [part.text for part in export.layers(network, ONE)]
+    assert parts == ["conv 4 3x3/2", "conv 8 3x3/2", "dense 16", "dense 16", f"dense {outputs}"]
+
+
+@pytest.mark.parametrize("workload", ["template-5x32", "template-4x48", "template-7x32"])
+def test_counts_of_the_papers_networks(workload: str) -> None:
+    """The computer profiles give them, counted in closed form."""
+    network = load_computer("ras-pi-4").workloads[workload].network
+    assert network.layers is not None
+    assert network.filters is not None
+    height, width, filters = network.image_height_px, network.image_width_px, network.filters
+
+    class Template(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            assert network.layers is not None
+            ins = [1] + [filters] * (network.layers - 1)
+            self.eye = nn.Sequential(*(nn.Conv2d(n, filters, 3, padding=1) for n in ins))
+            ins = [filters * height * width + 6] + [filters] * (network.layers - 1)
+            self.mind = nn.Sequential(*(nn.Linear(n, filters) for n in ins))
+            self.out = nn.Linear(filters, 25)
+
+        def forward(self, depth: Any, velocity: Any, goal: Any) -> Any:
+            flat = self.eye(depth / 255.0).flatten(1)
+            return self.out(self.mind(torch.cat([flat, velocity, goal], dim=1)))
+
+    with torch.device("meta"):
+        template = Template()
+        inputs = (torch.zeros(1, 1, height, width), torch.zeros(1, 3), torch.zeros(1, 3))
+        assert export.count_parameters(template, inputs) == network.parameters
+        assert export.count_macs(template, inputs) == network.macs
+
+
+def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
+    told = facts(hover_after_s=0.06, epsilon=0.05, goal_radius_m=3.5)
+    card = export_sb3(make_model("DQN"), told, tmp_path)
+    assert {name: getattr(card, name) for name in type(told).model_fields} == dict(told)
+    assert card.network == "conv 4 3x3/2, conv 8 3x3/2, dense 16, dense 16, dense 25"
+    assert card.parameters == sum(p.numel() for p in make_model("DQN").policy.q_net.parameters())
+    plain = json.loads((tmp_path / "card.json").read_text())
+    assert next(iter(plain.items())) == ("schema", 1)
+    assert plain["observation"] == {
+        "layout": "body",
+        "height_px": 24,
+        "width_px": 32,
+        "horizontal_fov_deg": 90.0,
+        "range_m": 20.0,
+    }
+
+
+def test_exports_are_equal_and_name_no_path_of_this_machine(tmp_path: Path) -> None:
+    first = export_tiny(tmp_path / "a", with_torch=True)
+    second = export_tiny(tmp_path / "b")
+    assert first.sha256 == second.sha256
+    with zipfile.ZipFile(tmp_path / "a" / "policy.pt2") as archive:
+        inside = [archive.read(name) for name in archive.namelist()]
+    for data in [*inside, *(path.read_bytes() for path in tmp_path.glob("*/*.*[nx]"))]:
+        for word in (b"site-packages", str(ROOT).encode(), str(tmp_path).encode(), b".py"):
+            assert word not in data
+
+
+def test_a_second_export_replaces_all_of_the_first(tmp_path: Path) -> None:
+    export_tiny(tmp_path, with_torch=True)
+    export_tiny(tmp_path, "PPO", name="other")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["card.json", "policy.onnx"]
+    assert load_card(tmp_path).name == "other"
+
+
+def test_nothing_is_written_when_the_export_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "new"
+    export_tiny(tmp_path / "wrong", "PPO")
+    wrong = (tmp_path / "wrong" / "policy.onnx").read_bytes()
+    monkeypatch.setattr(export, "_onnx", lambda program: wrong)
+    with pytest.raises(UsageError, match="ONNX Runtime is off by"):
+        export_tiny(out)
+    assert not out.exists()
+
+
+def test_a_network_without_finite_scores_is_refused(tmp_path: Path) -> None:
+    model = make_model("DQN")
+    with torch.no_grad():
+        next(model.policy.q_net.parameters()).fill_(torch.nan)
+    with pytest.raises(UsageError):
+        export_sb3(model, facts(), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_policy_that_decides_by_more_than_its_network_is_refused(tmp_path: Path) -> None:
+    class Contrary(MultiInputPolicy):
+        def _predict(self, obs: Any, deterministic: bool = True) -> torch.Tensor:
+            return self.q_net(obs).argmin(dim=1)  # type: ignore[no-any-return]
+
+    model = make_model("DQN")
+    model.policy.__class__ = Contrary
+    with pytest.raises(UsageError, match="decides by more than its network"):
+        export_sb3(model, facts(), tmp_path)
+
+
+def test_a_policy_with_a_memory_is_refused(tmp_path: Path) -> None:
+    learner: Any = sb3_contrib.RecurrentPPO
+    kwargs = {"lstm_hidden_size": 4, "features_extractor_class": Eye}
+    environment = make_model("PPO").get_env()
+    model = learner("MultiInputLstmPolicy", environment, n_steps=8, policy_kwargs=kwargs)
+    with pytest.raises(UsageError, match="recurrent"):
+        export_sb3(model, facts(), tmp_path)
+
+
+# --- the command
+
+
+Refuse = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def zips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Foreign models, as their `save` writes them."""
+    folder = tmp_path_factory.mktemp("zips")
+    make_model("DQN").save(folder / "dqn.zip")
+    make_model("SAC", "velocity").save(folder / "sac.zip")
+    make_model("A2C", space=spaces.Discrete(7)).save(folder / "seven.zip")
+    make_model("TD3", space=spaces.Box(-5.0, 5.0, (2,), np.float32)).save(folder / "five.zip")
+    (folder / "text.zip").write_text("not a zip")
+    with zipfile.ZipFile(folder / "empty.zip", "w") as archive:
+        archive.writestr("readme.txt", "nothing")
+    return folder
+
+
+def airl(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["airl", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    return int(end.value.code or 0)
+
+
+def test_a_foreign_zip_exports_with_one_command(
+    zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "mine"
+    code = airl(
+        monkeypatch,
+        *("export", zips / "dqn.zip", "--algorithm", "dqn", "--out", out),
+        *("--image", "32x24", "--fov", "90", "--range", "15", "--actions", "paper-25"),
+        *("--max-speed", "4", "--hold", "0.25", "--epsilon", "0.1", "--description", "a friend's"),
+    )
+    assert code == 0
+    card = read_card(out)
+    assert card.name == "mine"
+    assert card.description == "a friend's"
+    assert card.observation == SPEC.model_copy(update={"range_m": 15.0})
+    assert card.actions == ActionSpec(set="paper-25", max_speed_m_s=4.0)
+    assert (card.hold_s, card.epsilon) == (0.25, 0.1)
+    assert card.training.command is not None
+    assert card.training.command.startswith("airl export ")
+    assert card.training.versions["torch"] == torch.__version__
+    seen = noise(50)
+    wanted, _ = make_model("DQN").predict(seen, deterministic=True)
+    chosen = open_model(out, card).infer(seen).argmax(axis=1)
+    np.testing.assert_array_equal(chosen, wanted)
+    printed = capsys.readouterr()
+    assert "policy.onnx" in printed.out
+    assert printed.err == ""
+
+
+def test_a_foreign_continuous_model_and_the_paper_layout(
+    zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("--algorithm", "SAC", "--actions", "velocity", "--with-torch")
+    assert airl(monkeypatch, "export", zips / "sac.zip", "--out", tmp_path / "v", *words) == 0
+    assert (tmp_path / "v" / "policy.pt2").is_file()
+    assert load_learned(tmp_path / "v", runtime="torch").act_batch(noise(4)).shape == (4, 2)
+    paper = ObservationSpec(
+        layout="paper", height_px=34, width_px=32, horizontal_fov_deg=90.0, range_m=20.0
+    )
+    make_model("PPO", spec=paper).save(tmp_path / "paper.zip")
+    words = ("--algorithm", "PPO", "--layout", "paper", "--image", "32x34")
+    assert airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *words) == 0
+    assert load_card(tmp_path / "p").observation == paper
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "words"),
+    [
+        ("none.zip", ["--algorithm", "DQN"], ["none.zip: no such file"]),
+        ("text.zip", ["--algorithm", "DQN"], ["text.zip: not a .zip"]),
+        ("empty.zip", ["--algorithm", "DQN"], ["empty.zip: not a model of DQN"]),
+        ("sac.zip", ["--algorithm", "DQN"], ["sac.zip: not a model of DQN"]),
+        ("dqn.zip", ["--algorithm", "oracle"], ["--algorithm 'oracle'", "DQN", "PPO", "QRDQN"]),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--image", "64x48"],
+            ["observation space depth uint8 (1, 24, 32)", "depth uint8 (1, 48, 64)"],
+        ),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--actions", "velocity"],
+            ["action space Discrete(25)", "Box(-1.0, 1.0, (2,), float32)"],
+        ),
+        ("seven.zip", ["--algorithm", "A2C"], ["action space Discrete(7)", "Discrete(25)"]),
+        (
+            "five.zip",
+            ["--algorithm", "TD3", "--actions", "velocity"],
+            ["action space Box(-5.0, 5.0, (2,), float32)", "Box(-1.0, 1.0, (2,), float32)"],
+        ),
+        ("dqn.zip", ["--algorithm", "DQN", "--image", "32"], ["--image '32'", "WIDTHxHEIGHT"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--image", "2x2"], ["height_px = 2", "4 <= value"]),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--layout", "paper", "--image", "32x10"],
+            ["height_px = 10", "more than 10"],
+        ),
+        ("dqn.zip", ["--algorithm", "DQN", "--fov", "200"], ["horizontal_fov_deg = 200", "< 170"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--range", "100"], ["range_m = 100", "<= 65 m"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--max-speed", "0"], ["max_speed_m_s = 0", "m/s"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--hold", "-1"], ["hold_s = -1", "0 <= value <= 10 s"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["epsilon = 1.5", "value <= 1"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["name = 'a b'"]),
+        (
+            "sac.zip",
+            ["--algorithm", "SAC", "--actions", "velocity", "--epsilon", "0.1"],
+            ["epsilon = 0.1", "0 with the action set 'velocity'"],
+        ),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else value,
+)
+def test_what_cannot_be_exported_is_refused_in_one_line(
+    zips: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    options: list[str],
+    words: list[str],
+) -> None:
+    out = tmp_path / "out"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        code = airl(monkeypatch, "export", zips / model, "--out", out, *options)
+    printed = capsys.readouterr()
+    assert code == 2
+    assert printed.out == ""
+    (line,) = printed.err.splitlines()
+    assert line.startswith("error: ")
+    for word in words:
+        assert word in line
+    assert not out.exists()
+
+
+def test_out_that_is_a_file_is_refused(
+    zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.write_text("mine")
+    code = airl(monkeypatch, "export", zips / "dqn.zip", "--algorithm", "DQN", "--out", out)
+    assert code == 2
+    assert f"--out {out}: not a folder" in capsys.readouterr().err
+    assert out.read_text() == "mine"

@@ -1,0 +1,239 @@
+"""Real sweeps: workers, parents and Ctrl-C come and go, the results stay the same."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from airl_mav.cli.common import EXIT_INTERRUPTED
+from airl_mav.policy.card import read_card
+from airl_mav.policy.template import Size
+from airl_mav.sweep.config import load_sweep
+from airl_mav.sweep.store import SweepFolder
+from airl_mav.sweep.trial import size_of, trials
+from tests.support.processes import PATIENCE_S, Running, is_running, running, wait_until
+from tests.support.sweep_kit import TINY, write_sweep_file
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sweep"), pytest.mark.timeout(400)]
+
+SEED, TRIALS = 6, 2
+"""Of the trainings, and how many there are: one of each size."""
+
+SMALL = (
+    TINY.replace("seeds = [1, 2]", f"seeds = [{SEED}]")
+    .replace("steps = 1_000", "steps = 2_000")
+    .replace("every = 500", "every = 1_000")
+)
+"""Long enough to be killed in."""
+
+PLACE = "--out"
+
+NO_REPORT = """
+from airl_mav.cli import main, report
+report.run = lambda *_: 0  # figures take longer than flights
+main.main()
+"""
+
+
+def sweep(folder: Path, *options: str) -> list[str]:
+    """Return the words of a sweep of `SMALL` into `folder`/out."""
+    path = write_sweep_file(folder, SMALL)
+    return ["-m", "airl_mav.cli.main", "sweep", f"{path}", PLACE, "out", *options]
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """Return all results of a sweep, and digests of their policies, without wall times."""
+    data = json.loads((folder / "out" / "sweep.json").read_text(encoding="utf-8"))
+    found = {}
+    for cell in data["cells"]:
+        for result in cell["trials"]:
+            del result["trained"]["seconds"]
+            trial = result["trial"]
+            name = f"{trial['arena']}-{trial['layers']}x{trial['filters']}-seed{trial['seed']}"
+            policy = folder / "out" / "trials" / name / "policy"
+            # The weights, to the last bit: the card binds the file by its digest.
+            found[name] = result | {"sha256": read_card(policy).sha256}
+    return found
+
+
+def workers_of(parent: Running) -> list[int]:
+    """Return the processes that multiprocessing has started for a command."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdecimal():
+            continue
+        with suppress(OSError, IndexError, ValueError):
+            ppid = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if ppid == parent.pid and b"spawn_main" in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+    return found
+
+
+def checkpointed(folder: Path, before: frozenset[str] = frozenset()) -> frozenset[str]:
+    """Return the newest checkpoints of trainings that have not ended, less those of before."""
+    found = set()
+    for latest in folder.glob("out/trials/*/checkpoints/latest"):
+        # Gone meanwhile: that training has ended.
+        with suppress(OSError):
+            if not (latest.parents[1] / "result.json").exists():
+                found.add(f"{latest.parents[1].name} {latest.read_text(encoding='utf-8')}")
+    return frozenset(found) - before
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with running(sweep(folder, "--workers", "1"), folder) as process:
+        assert process.wait(PATIENCE_S * 2) == 0, process.text()
+        (folder / "said").write_text(process.text(), encoding="utf-8")
+        yield folder
+
+
+def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
+    config = load_sweep(f"{undisturbed / 'small.toml'}")
+    results = outcome(undisturbed)
+    assert list(results) == [t.name for t in sorted(trials(config))]
+    assert len(results) == TRIALS
+    said = (undisturbed / "said").read_text(encoding="utf-8")
+    assert f"seed {SEED}  success" in said
+    assert f"{TRIALS}/{TRIALS}  no-obstacles" in said and "Best: " in said
+    for trial in trials(config):
+        result = results[trial.name]
+        assert sum(result["outcomes"].values()) == result["episodes"] == 20
+        policy = undisturbed / "out" / "trials" / trial.name / "policy"
+        card = read_card(policy)
+        assert Size(card.parameters, card.macs) == size_of(config, trial)
+        assert card.training.seed == trial.seed
+        # What was only there to go on with has gone.
+        assert not (policy.parent / "checkpoints").exists()
+        assert not (policy.parent / "progress.json").exists()
+
+
+def test_a_network_is_judged_as_airl_evaluate_judges_it(undisturbed: Path) -> None:
+    name, result = max(outcome(undisturbed).items(), key=lambda item: item[1]["successes"])
+    words = ["-c", NO_REPORT, "evaluate", f"out/trials/{name}/policy"]
+    words += ["--arena", "no-obstacles", "--episodes", "20", "--seed", "1", "--out", "judged"]
+    with running(words, undisturbed) as process:
+        assert process.wait() == 0, process.text()
+    lines = (undisturbed / "judged" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+    flown = [json.loads(line) for line in lines]
+    good = [each["quality"] for each in flown if each["outcome"] == "success"]
+    assert len(good) == result["successes"]
+    for key in ("flight_time_s", "distance_m", "energy_j"):
+        if good:
+            mean = sum(each[key] for each in good) / len(good)
+            # Its own path and energy come from the recorded trajectory.
+            assert mean == pytest.approx(result[key], rel=0.02), key
+        else:
+            assert result[key] is None
+
+
+def test_started_again_it_shows_what_it_has_and_trains_nothing(undisturbed: Path) -> None:
+    before = outcome(undisturbed)
+    with running(sweep(undisturbed, "--computer", "ras-pi-4"), undisturbed) as process:
+        assert process.wait() == 0, process.text()
+        assert f"{TRIALS} of {TRIALS} ended" in process.text()
+        assert "t2, estimated" in process.text()
+        assert f"seed {SEED}  success" not in process.text()
+    assert outcome(undisturbed) == before
+
+
+def test_with_workers_killed_it_ends_as_if_nothing_had_happened(
+    tmp_path: Path, undisturbed: Path
+) -> None:
+    with running(sweep(tmp_path, "--workers", "2"), tmp_path) as process:
+        for _ in range(2):
+            wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
+            if workers := workers_of(process):
+                os.kill(workers[0], signal.SIGKILL)
+        assert process.wait(PATIENCE_S * 2) == 0, process.text()
+        assert "a worker was lost by SIGKILL" in process.text()
+    assert outcome(tmp_path) == outcome(undisturbed)
+
+
+def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
+    tmp_path: Path, undisturbed: Path
+) -> None:
+    words = sweep(tmp_path, "--workers", "2")
+    with running(words, tmp_path) as process:
+        wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
+        process.interrupt()
+        assert process.wait() == EXIT_INTERRUPTED, process.text()
+        assert f"the same command with --out {tmp_path / 'out'} goes on" in process.text()
+    before = checkpointed(tmp_path)
+    with running(words, tmp_path) as process:
+        wait_until(lambda: checkpointed(tmp_path, before), "another checkpoint")
+        workers = workers_of(process)
+        process.process.send_signal(signal.SIGKILL)
+        process.wait()
+        # What was written when it died is whole.
+        config = load_sweep(f"{tmp_path / 'small.toml'}")
+        held = SweepFolder(tmp_path / "out", config).results(trials(config))
+        assert len(held) < TRIALS
+        for pid in workers:
+            wait_until(lambda pid=pid: not is_running(pid), "an orphan to end", 30.0)
+    with running(sweep(tmp_path, "--workers", "1"), tmp_path) as process:
+        assert process.wait(PATIENCE_S * 2) == 0, process.text()
+    assert outcome(tmp_path) == outcome(undisturbed)
+
+
+def test_two_at_once_are_refused(tmp_path: Path) -> None:
+    with running(sweep(tmp_path, "--workers", "1"), tmp_path) as first:
+        wait_until(lambda: (tmp_path / "out" / "sweep.json").exists(), "the first")
+        with running(sweep(tmp_path), tmp_path) as second:
+            assert second.wait() == 2, second.text()
+            assert "another sweep is at work here" in second.text()
+        assert first.process.poll() is None
+
+
+def test_without_ray_it_says_what_to_install(tmp_path: Path) -> None:
+    if find_spec("ray") is not None:
+        pytest.skip("ray is installed")
+    with running(sweep(tmp_path, "--ray", "local"), tmp_path) as process:
+        assert process.wait() == 2
+        assert process.text().strip() == (
+            "error: --ray: not installed: ray; pip install 'airl-mav[ray]'"
+        )
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed: airl-mav[ray]")
+def test_ray_comes_to_the_same_results(tmp_path: Path, undisturbed: Path) -> None:
+    words = sweep(tmp_path, "--ray", "local", "--workers", "2")
+    with running(words, tmp_path) as process:
+        assert process.wait(PATIENCE_S * 2) == 0, process.text()
+    assert outcome(tmp_path) == outcome(undisturbed)
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed: airl-mav[ray]")
+def test_a_killed_task_of_ray_begins_again(
+    tmp_path: Path, undisturbed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Inherited by the workers of this very Ray, and by nobody else's.
+    mark = f"AIRL_SWEEP_TEST={tmp_path}"
+    monkeypatch.setenv(*mark.split("="))
+    with running(sweep(tmp_path, "--ray", "local", "--workers", "1"), tmp_path) as process:
+        wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
+        for entry in Path("/proc").iterdir():
+            with suppress(OSError):
+                if (entry / "cmdline").read_bytes().startswith(b"ray::_carry_out"):  # noqa: SIM102
+                    if mark.encode() in (entry / "environ").read_bytes():
+                        os.kill(int(entry.name), signal.SIGKILL)
+        assert process.wait(PATIENCE_S * 2) == 0, process.text()
+        assert "a worker was lost by" in process.text()
+    assert outcome(tmp_path) == outcome(undisturbed)
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="ray is not installed: airl-mav[ray]")
+def test_ray_where_there_is_none_is_told_in_one_line(tmp_path: Path) -> None:
+    with running(sweep(tmp_path, "--ray", "127.0.0.1:9"), tmp_path) as process:
+        assert process.wait() == 2, process.text()
+        assert "error: --ray 127.0.0.1:9: " in process.text()
+        assert "Traceback" not in process.text()

@@ -1,0 +1,248 @@
+"""Training from the command line: real learning, kill -9, resume, export, flight."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.evaluation import fly_episodes, success_rate
+from airl_mav.policy.card import load_card
+from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.learned import load_learned
+from airl_mav.profiles.loading import list_profiles, load_profile
+from airl_mav.training.config import TrainingConfig
+from airl_mav.training.run import nominal
+from airl_mav.training.store import TrainingFolder
+from tests.support.ports import choose_ports
+from tests.support.processes import ROOT
+
+SHORT = """
+description = "a short one"
+steps = 3_000
+vehicles = 16
+checkpoint_every = 500
+[environment]
+arena = "no-obstacles"
+image_width_px = 16
+image_height_px = 12
+[algorithm]
+learning_starts = 300
+[selection]
+every = 1_000
+episodes = 10
+"""
+
+NO_REPORT = """
+from airl_mav.cli import sitl
+sitl.conclude = lambda *_: None  # figures take longer than flights
+sitl.main()
+"""
+
+
+def words(config: Path, out: Path, *options: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "airl_mav.cli.main", "train", str(config), "--out", str(out)),
+        *options,
+    ]
+
+
+def train(config: Path, out: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        words(config, out, *options), capture_output=True, text=True, cwd=ROOT, check=False
+    )
+
+
+def evaluations(out: Path) -> list[dict[str, Any]]:
+    """Return the lines without what depends on the wall clock."""
+    lines = (out / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
+    plain = [json.loads(line) for line in lines]
+    for line in plain:
+        del line["seconds"]
+    return plain
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("config") / "short.toml"
+    path.write_text(SHORT, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def straight(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nobody disturbed."""
+    out = tmp_path_factory.mktemp("straight") / "run"
+    done = train(short, out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.mark.parametrize("name", list_profiles("training"))
+def test_shipped_configurations_are_sound(name: str) -> None:
+    config = load_profile("training", name, TrainingConfig)
+    assert config.selection.every <= config.steps
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(
+    short: Path, straight: Path, tmp_path: Path
+) -> None:
+    """kill -9 at two moments; the evaluations and the weights are those of the straight run."""
+    out = tmp_path / "run"
+    chance = random.Random(4)
+    # As soon as a checkpoint is there, and at a random moment between two of them.
+    for delay_s in (0.0, chance.uniform(0.0, 0.8)):
+        with subprocess.Popen(
+            words(short, out, "--resume"),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd=ROOT,
+        ) as process:
+            seen = len(list((out / "checkpoints").glob("checkpoint-*")))
+            there = (out / "checkpoints" / "latest").read_text() if seen else ""
+            deadline = time.monotonic() + 120.0
+            while process.poll() is None and time.monotonic() < deadline:
+                latest = out / "checkpoints" / "latest"
+                if latest.exists() and latest.read_text() != there:
+                    break
+                time.sleep(0.005)
+            time.sleep(delay_s)
+            if process.poll() is None:
+                os.kill(process.pid, signal.SIGKILL)
+    done = train(short, out, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert evaluations(out) == evaluations(straight)
+    assert (out / "policy" / "policy.onnx").read_bytes() == (
+        straight / "policy" / "policy.onnx"
+    ).read_bytes()
+
+
+@pytest.mark.slow
+def test_ctrl_c_says_how_to_go_on(short: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with subprocess.Popen(
+        words(short, out), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
+    ) as process:
+        deadline = time.monotonic() + 120.0
+        while not (out / "checkpoints" / "latest").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, output
+    assert "--resume" in output
+    assert "Traceback" not in output
+
+
+@pytest.mark.slow
+def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -> None:
+    again = train(short, straight)
+    assert again.returncode == 2
+    assert "--resume" in again.stderr
+    other = tmp_path / "other.toml"
+    other.write_text(SHORT.replace("vehicles = 16", "vehicles = 8"), encoding="utf-8")
+    mixed = train(other, straight, "--resume")
+    assert mixed.returncode == 2
+    assert "vehicles" in mixed.stderr
+    finished = train(short, straight, "--resume")
+    assert finished.returncode == 0, finished.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("[environment]\narena = 'nowhere'\n", ["nowhere", "static-obstacles"]),
+        ("[environment]\nhold = 1\n", ["environment.hold", "unknown field"]),
+        ("[environment.episode]\nhold_s = 0\n", ["hold_s", "0.02"]),
+        ("[algorithm]\nname = 'sac'\n", ["sac", "discrete"]),
+        ("[network]\nkind = 'template'\n", ["layers"]),
+        ("steps = -1\n", ["steps", "value"]),
+    ],
+)
+def test_a_wrong_configuration_gets_one_line(text: str, names: list[str], tmp_path: Path) -> None:
+    config = tmp_path / "bad.toml"
+    config.write_text('description = "bad"\n' + text, encoding="utf-8")
+    done = (
+        train(config, tmp_path / "run", "--steps", "100")
+        if "steps" not in text
+        else train(config, tmp_path / "run")
+    )
+    assert done.returncode == 2, done.stdout
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    for name in names:
+        assert name in done.stderr
+
+
+def test_a_folder_without_a_run_is_said_to_be_none(tmp_path: Path) -> None:
+    config = TrainingConfig(description="none")
+    with pytest.raises(UsageError, match="no training run here"):
+        TrainingFolder.open(tmp_path, config)
+
+
+def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
+    config = TrainingConfig(description="one")
+    one = TrainingFolder.create(tmp_path / "run", config, "airl train")
+    two = TrainingFolder.open(tmp_path / "run", config)
+    with one.locked(), pytest.raises(UsageError, match="another process"), two.locked():
+        pass
+    with two.locked():
+        pass
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_learns_exports_and_flies(tmp_path: Path) -> None:
+    """From nothing to a rehearsal: learns far beyond chance, then flies through MAVSDK."""
+    config = tmp_path / "tiny.toml"
+    # A small image and flights that soon time out: chance, and who knows nothing yet, fly long.
+    config.write_text(
+        'description = "tiny"\nsteps = 24_000\n'
+        '[environment]\narena = "no-obstacles"\nimage_width_px = 16\nimage_height_px = 12\n'
+        "[environment.episode]\ntime_limit_s = 40.0\n"
+        "[selection]\nevery = 6_000\nepisodes = 30\nstop_at = 0.95\n",
+        encoding="utf-8",
+    )
+    out = tmp_path / "run"
+    done = train(config, out)
+    assert done.returncode == 0, done.stderr
+    card = load_card(out / "policy")
+    spec = nominal(load_profile("training", str(config), TrainingConfig).environment)
+    policy = load_learned(out / "policy")
+    flown = list(fly_episodes(spec, policy.act_batch, range(1, 61)))
+    rng = np.random.default_rng(0)
+
+    def at_random(seen: Encoded) -> NDArray[np.int64]:
+        return rng.integers(0, 25, len(seen["goal"]))
+
+    chance = list(fly_episodes(spec, at_random, range(1, 61)))
+    assert success_rate(flown) > 0.7
+    assert success_rate(flown) > success_rate(chance) + 0.4
+    sitl = subprocess.run(
+        [
+            *(sys.executable, "-c", NO_REPORT, *choose_ports().options(), "--lockstep"),
+            *("--policy", str(out / "policy"), "--arena", "no-obstacles", "--episodes", "2"),
+            *("--out", str(tmp_path / "flight")),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert sitl.returncode == 0, sitl.stderr
+    lines = (tmp_path / "flight" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
+    outcomes = [json.loads(line)["outcome"] for line in lines]
+    known = {each.seed: each.verdict.name.lower() for each in flown}
+    assert outcomes == [known[1], known[2]]
+    assert card.name == "tiny"

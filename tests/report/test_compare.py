@@ -1,0 +1,291 @@
+"""`airl report RUN RUN`: what differs between runs, in figures, in words, on a page."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import prepare
+from airl_mav.cli.report import run
+from airl_mav.cli.report_command import ReportCommand
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.paired import tango
+from airl_mav.rehearsal.run_folder import RunFolder
+from airl_mav.report.compare.build import Compared, keyed, lettered, load_compared
+from airl_mav.report.compare.figures import _steps
+from airl_mav.report.compare.page import build_comparison, panel_of
+from airl_mav.report.compare.tables import (
+    flown_table,
+    latency_table,
+    pairing_tables,
+    pairs_in_words,
+    quality_table,
+)
+from airl_mav.report.fan import fan_pictures
+from airl_mav.report.palette import look
+from tests.report.test_report import Page
+from tests.support.run_demo import demo_setup, write_demo_run
+
+EPISODES = 24
+QUIET = Console(file=io.StringIO())
+
+
+def fly(out: Path, **options: Any) -> Path:
+    given: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "seed": 20}
+    command = EvaluateCommand(("greedy",), **(given | options))
+    return prepare(command, "greedy", command.arena[0]).fly(out, QUIET).path
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The same seeds fast and late, others of them, and the same in another arena."""
+    root = tmp_path_factory.mktemp("runs")
+    slow = {"computer": "ras-pi-4", "workload": "template-5x32"}
+    return {
+        "fast": fly(root / "fast"),
+        "slow": fly(root / "slow", **slow),
+        "later": fly(root / "later", seed=34, episodes=20),
+        "elsewhere": fly(root / "elsewhere", arena=("no-obstacles",), episodes=4),
+        "apart": fly(root / "apart", seed=500, episodes=3),
+    }
+
+
+@pytest.fixture(scope="module")
+def compared(runs: dict[str, Path]) -> Compared:
+    return load_compared(list(runs.values()), [f"the flights of {name}" for name in runs])
+
+
+@pytest.fixture(scope="module")
+def page(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_comparison(compared, tmp_path_factory.mktemp("page"))
+
+
+def lines(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the episodes of a run by seed, as a reader without this package sees them."""
+    episodes = map(json.loads, (path / "episodes.jsonl").read_text().splitlines())
+    return {episode["seed"]: episode for episode in episodes}
+
+
+def test_differences_are_those_of_the_files(runs: dict[str, Path], page: Path) -> None:
+    data = json.loads((page.parent / "compare.json").read_text())
+    assert data["schema"] == 1
+    first, second = lines(runs["fast"]), lines(runs["slow"])
+    found = data["comparisons"][0]
+    reached = [(first[s]["outcome"] == "success", second[s]["outcome"] == "success") for s in first]
+    assert found["pairs"] == len(reached) == EPISODES
+    assert found["agreement"]["only_reference"] == sum(a and not b for a, b in reached) > 0
+    rates = np.mean(reached, axis=0)
+    difference = found["success_rate"]["difference"]
+    assert difference["value"] == pytest.approx(100.0 * (rates[1] - rates[0]))
+    gained, lost = (
+        sum(x and not y for x, y in each) for each in ([r[::-1] for r in reached], reached)
+    )
+    assert difference["low"] == pytest.approx(100.0 * (tango(gained, lost, EPISODES).low or 0.0))
+    common = [s for s, ends in zip(first, reached, strict=True) if all(ends)]
+    for key in ("flight_time_s", "distance_m", "energy_j"):
+        a, b = (np.mean([e[s]["quality"][key] for s in common]) for e in (first, second))
+        assert found[key]["difference"]["value"] == pytest.approx(100.0 * (b / a - 1.0))
+        assert found[key]["difference"]["n"] == len(common)
+
+
+def test_only_the_same_episode_makes_a_pair(compared: Compared) -> None:
+    slow, later, elsewhere, apart = compared.pairings
+    assert (slow.pairs, slow.strangers) == (EPISODES, 0)
+    # Seeds 34 to 43 of 20 to 43.
+    assert (later.pairs, later.strangers) == (10, 0)
+    # The same seeds, other arenas and goals.
+    assert (elsewhere.pairs, elsewhere.strangers) == (0, 4)
+    assert (apart.pairs, apart.strangers) == (0, 0)
+    said = pairs_in_words(compared)
+    assert "24 pairs" in said[0]
+    assert "share no episode" in said[2]
+    assert "4 flights" in said[2]
+    assert "share no episode" in said[3]
+    assert len(pairing_tables(compared)) == 2
+
+
+def test_only_what_differs_is_told_side_by_side(runs: dict[str, Path]) -> None:
+    compared = load_compared([runs["fast"], runs["slow"]])
+    assert set(compared.different) >= {"computer", "decision latency t2"}
+    assert not {"policy", "arena", "seeds", "level", "goal radius"} & set(compared.different)
+    assert compared.same["seeds"] == "20 to 43"
+    assert compared.same["hold t3"] == "0.5 s"
+    view = flown_table(compared)
+    assert [column.title for column in view.columns] == ["", *(s.name for s in compared.sides)]
+    for row in view.rows:
+        assert len(set(row[1:])) > 1, row[0]
+    many = load_compared(list(runs.values()))
+    assert flown_table(many).columns[0].title == "run"
+
+
+def test_names_tell_runs_apart(runs: dict[str, Path], tmp_path: Path) -> None:
+    names = [s.name for s in load_compared([runs["fast"], runs["slow"]]).sides]
+    assert names == ["workstation", "ras-pi-4, 396 ms"]
+    # Nothing but the seeds differs: folders.
+    assert [s.name for s in load_compared([runs["fast"], runs["later"]]).sides] == ["fast", "later"]
+    given = load_compared([runs["fast"], runs["slow"]], ("desk", "drone"))
+    assert [p.name for p in given.pairings] == ["drone"]
+    assert lettered(given) == given == keyed(given)
+
+
+def test_long_names_get_letters(compared: Compared) -> None:
+    assert [side.name for side in lettered(compared).sides] == list("ABCDE")
+    assert [p.name for p in lettered(compared).pairings] == list("BCDE")
+    assert keyed(compared).sides[1].name == f"B  {compared.sides[1].name}"
+
+
+def test_latency_cells_are_what_numpy_says(runs: dict[str, Path], compared: Compared) -> None:
+    view = latency_table(compared)
+    (start,) = [i for i, row in enumerate(view.rows) if row[0] == "t2 infer"]
+    row = dict(zip([c.title for c in view.columns], view.rows[start + 1], strict=True))
+    with np.load(runs["slow"] / "latency.npz") as stamps:
+        groups = sorted({name.partition("/")[0] for name in stamps.files})
+        pairs = [(stamps[f"{g}/action_ready_us"], stamps[f"{g}/infer_start_us"]) for g in groups]
+    raw = np.concatenate([(end - begin)[(end >= 0) & (begin >= 0)] for end, begin in pairs]) / 1e3
+    assert row["run"] == compared.sides[1].name
+    assert row["n"] == f"{len(raw):,}"
+    assert row["mean"] == f"{raw.mean():.2f}"
+    assert row["p90"] == f"{np.percentile(raw, 90, method='inverted_cdf'):.2f}"
+    # What a twin has in one is shown in one.
+    titles = {row[0] for row in view.rows}
+    assert "setpoint → motor" in titles
+    assert not {"link", "control", "send"} & titles
+
+
+def test_stages_of_a_rehearsal_and_of_the_twin_stand_together(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    write_demo_run(tmp_path / "sitl", episodes=2)
+    view = latency_table(load_compared([runs["fast"], tmp_path / "sitl"]))
+    counts: dict[str, int] = {}
+    stage = ""
+    for row in view.rows:
+        stage = row[0] or stage
+        counts[stage] = counts.get(stage, 0) + 1
+    assert counts["link"] == counts["control"] == 1
+    assert counts["t2 infer"] == counts["setpoint → motor"] == counts["end to end"] == 2
+
+
+def test_quality_of_each_run(runs: dict[str, Path], compared: Compared) -> None:
+    for row, path in zip(quality_table(compared).rows, runs.values(), strict=True):
+        flown = lines(path).values()
+        good = [e["quality"] for e in flown if e["outcome"] == "success"]
+        assert row[1] == f"{len(flown)}"
+        assert row[2].startswith(f"{100.0 * len(good) / len(flown):.1f} [")
+        assert row[6].startswith(f"{np.mean([q['computer_energy_j'] for q in good]) / 1e3:.2f}")
+
+
+@pytest.mark.parametrize("n", [1, 7, 4000])
+def test_a_drawn_distribution_passes_through_its_samples(n: int) -> None:
+    samples = np.random.default_rng(n).integers(1, 10**6, n)
+    at_ms, share = _steps(samples)
+    assert len(at_ms) <= 401
+    assert share[0] == 0.0
+    assert share[-1] == 100.0
+    assert at_ms[-1] == samples.max() / 1e3
+    for x, y in zip(at_ms[1:], share[1:], strict=True):
+        assert 100.0 * np.mean(samples / 1e3 <= x) >= y - 1e-9
+
+
+def test_looks_differ() -> None:
+    assert len({look(i) for i in range(32)}) == 32
+
+
+def test_panels_share_their_axes(compared: Compared) -> None:
+    pictures = fan_pictures("fan", [panel_of(side) for side in compared.sides[:3]])
+    ticks = [set(re.findall(r">(−?\d+)</text>", picture.svg)) for picture in pictures]
+    assert ticks[0] == ticks[1] == ticks[2]
+    assert {len(base64.b64decode(p.data_uri().partition(",")[2])) > 0 for p in pictures} == {True}
+
+
+def test_the_page_is_whole_and_reaches_nothing_else(page: Path, compared: Compared) -> None:
+    text = page.read_text(encoding="utf-8")
+    parsed = Page(text)
+    assert all(ref.startswith("data:image/svg+xml;base64,") for ref in parsed.references)
+    assert not parsed.tags & {"script", "link", "iframe", "object"}
+    assert all(image["alt"] for image in parsed.images)
+    # Four measures, two distributions, a fan each, energy.
+    assert len(parsed.images) == 4 + 2 + len(compared.sides) + 1
+    words = " ".join(parsed.words)
+    for side in compared.sides:
+        assert side.name in words
+    for name in ("differences", "latency", "trajectories", "energy"):
+        with Image.open(page.parent / f"compare-{name}.png") as image:
+            assert min(image.size) > 200
+    assert not list(page.parent.glob("*.partial"))
+
+
+def test_it_is_the_same_when_it_is_made_again(compared: Compared, page: Path) -> None:
+    before = {p.name: p.read_bytes() for p in page.parent.iterdir()}
+    build_comparison(compared, page.parent)
+    assert {p.name: p.read_bytes() for p in page.parent.iterdir()} == before
+
+
+# --- the command
+
+
+def ask(*paths: Path, **options: Any) -> str:
+    console = Console(record=True, width=100, file=io.StringIO())
+    assert run(ReportCommand(paths[0], tuple(paths[1:]), **options), console) == 0
+    return console.export_text()
+
+
+def test_the_command_prints_and_writes(runs: dict[str, Path], tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    text = ask(runs["fast"], runs["slow"], out=out, names=("desk", "drone"))
+    assert "drone against desk" in text
+    assert "drone and desk: 24 pairs." in text
+    assert (out / "compare.html").exists()
+    # Once more into the same folder.
+    ask(runs["fast"], runs["slow"], out=out, names=("desk", "drone"))
+
+
+def test_a_table_of_policies_and_arenas_stands_for_its_runs(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    cells = [{"folder": "fast"}, {"folder": "slow"}]
+    root = tmp_path / "matrix"
+    root.mkdir()
+    (root / "matrix.json").write_text(json.dumps({"cells": cells}))
+    for cell in cells:
+        (root / cell["folder"]).symlink_to(runs[cell["folder"]])
+    assert "workstation" in ask(root, out=tmp_path / "out")
+    (root / "matrix.json").write_text('{"cells": 3}')
+    with pytest.raises(UsageError, match=r"matrix\.json: cannot be read"):
+        ask(root, runs["fast"], out=tmp_path / "other")
+
+
+def test_what_cannot_be_compared_is_refused(runs: dict[str, Path], tmp_path: Path) -> None:
+    fast, slow = runs["fast"], runs["slow"]
+    with pytest.raises(UsageError, match="accepted: each run once"):
+        ask(fast, fast, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="no run here"):
+        ask(fast, tmp_path, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="--names: 1 for 2 runs"):
+        ask(fast, slow, names=("one",), out=tmp_path / "out")
+    with pytest.raises(UsageError, match="--names 'a': accepted"):
+        ask(fast, slow, names=("a", "a"), out=tmp_path / "out")
+    with pytest.raises(UsageError, match="holds a run"):
+        ask(fast, slow, out=fast)
+    with pytest.raises(UsageError, match="accepted: with two runs or more"):
+        ask(fast, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="accepted: with two runs or more"):
+        ask(fast, names=("a",))
+    RunFolder.create(tmp_path / "empty", "empty", {}, setup=demo_setup(), seeds=(1,))
+    with pytest.raises(UsageError, match="no flight was finished"):
+        ask(fast, tmp_path / "empty", out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(UsageError, match="holds something else"):
+        ask(fast, slow, out=tmp_path / "full")

@@ -1,0 +1,643 @@
+"""`airl gap`: what it flies, what it says, what it leaves behind, what it goes on with."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import nullcontext
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from airl_mav.cli import gap_plan, report
+from airl_mav.cli.gap import run
+from airl_mav.cli.gap_command import DEFAULT_MITIGATED, GapCommand
+from airl_mav.cli.gap_plan import TRAINING_LATENCY_SEED, plan_gap
+from airl_mav.cli.report_command import ReportCommand
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.paired import tango
+from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo
+from airl_mav.profiles.loading import profiles_dir
+from airl_mav.report.gap import terminal as gap_terminal
+from airl_mav.report.gap.build import GapStudy, worst_seeds
+from airl_mav.report.gap.file import GAP_FILE, read_gap, write_gap
+from airl_mav.report.gap.tables import columns_table, detail_table, gaps_table
+from airl_mav.report.gap.words import answers
+
+EPISODES = 24
+ROLES = ("reference", "target", "mitigated", "training", "mitigated-reference")
+
+
+def make_policy(
+    folder: Path, delay: dict[str, Any] | None, extra: tuple[float, float] = (0.0, 0.0)
+) -> Path:
+    """Make a policy that says it was trained that late: the default one under another name."""
+    shutil.copytree(profiles_dir() / "policies" / DEFAULT_POLICY, folder)
+    card = json.loads((folder / "card.json").read_text())
+    card["name"] = "mitigated"
+    environment = card["training"]["config"]["environment"]
+    environment["delay"] = delay
+    environment["randomisation"]["extra_delay_ms"] = extra
+    if delay is None:
+        card["training"]["config"] = {}
+    (folder / "card.json").write_text(json.dumps(card))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mitigated(tmp_path_factory: pytest.TempPathFactory) -> str:
+    delay = {"computer": "ras-pi-4", "workload": "template-5x32"}
+    return str(make_policy(tmp_path_factory.mktemp("policies") / "m", delay))
+
+
+def measure(mitigated: str, *, page: bool = False, **options: Any) -> tuple[int, str]:
+    """Run the command in this process; return exit status and output.
+
+    Pages take longer than flights: without `page` none is made.
+    """
+    console = Console(record=True, width=80, file=io.StringIO())
+    words: dict[str, Any] = {"mitigated": mitigated, "episodes": EPISODES}
+    with nullcontext() if page else patch.object(gap_terminal, "build_page", lambda s, _: s.path):
+        code = run(GapCommand(**(words | options)), console)
+    return code, console.export_text()
+
+
+@pytest.fixture(scope="module")
+def whole(mitigated: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A gap without any trouble: its folder, and what was printed."""
+    out = tmp_path_factory.mktemp("whole") / "gap"
+    code, text = measure(mitigated, out=out, page=True)
+    assert code == 0
+    return out, text
+
+
+def data_of(path: Path) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads((path / GAP_FILE).read_text())
+    return data
+
+
+def lines(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the episodes of a run by seed, as a reader without this package sees them."""
+    episodes = map(json.loads, (path / "episodes.jsonl").read_text().splitlines())
+    return {episode["seed"]: episode for episode in episodes}
+
+
+def gap_of(data: dict[str, Any], key: str) -> dict[str, Any]:
+    (found,) = [gap for gap in data["arenas"][0]["gaps"] if gap["key"] == key]
+    return dict(found)
+
+
+# --- what it flies
+
+
+def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    (arena,) = data_of(out)["arenas"]
+    assert [column["role"] for column in arena["columns"]] == list(ROLES)
+    assert [column["letter"] for column in arena["columns"]] == list("abcde")
+    runs = {
+        c["role"]: json.loads((out / c["folder"] / "run.json").read_text())
+        for c in arena["columns"]
+    }
+    policies = {role: info["setup"]["policy"]["name"] for role, info in runs.items()}
+    assert policies == dict.fromkeys(ROLES, "mitigated") | {
+        "reference": DEFAULT_POLICY,
+        "target": DEFAULT_POLICY,
+    }
+    means = {role: info["setup"]["injection"]["latency"]["mean_ms"] for role, info in runs.items()}
+    assert means == dict.fromkeys(ROLES, 396.0) | {"reference": 11.0, "mitigated-reference": 11.0}
+    watts = {role: info["setup"]["computer_watts"] for role, info in runs.items()}
+    # Energy of the computer is that of the target in the training's conditions, too.
+    assert watts == dict.fromkeys(ROLES, 1.7) | {"reference": 350.0, "mitigated-reference": 350.0}
+    assert {tuple(info["seeds"]) for info in runs.values()} == {tuple(range(1, EPISODES + 1))}
+    assert runs["training"]["config"]["latency_seed"] == TRAINING_LATENCY_SEED != 0
+
+
+def drawn(folder: Path) -> dict[str, np.ndarray]:
+    """Return the t2 of every decision [µs] by episode."""
+    found = {}
+    with np.load(folder / "latency.npz") as stamps:
+        for index in sorted({name.partition("/")[0] for name in stamps.files}):
+            start, end = stamps[f"{index}/infer_start_us"], stamps[f"{index}/action_ready_us"]
+            ended = (start >= 0) & (end >= 0)
+            found[index] = (end - start)[ended]
+    return found
+
+
+def test_the_training_conditions_are_other_draws_of_the_same_latency(
+    whole: tuple[Path, str],
+) -> None:
+    out, _ = whole
+    there, trained = (drawn(out / f"static-obstacles-{role}") for role in ("mitigated", "training"))
+    same = [there[index][0] == trained[index][0] for index in there]
+    assert np.mean(same) < 0.1
+    pooled = [np.concatenate(list(part.values())) for part in (there, trained)]
+    for values in pooled:
+        assert values.mean() == pytest.approx(396e3, rel=0.02)
+        assert values.std() == pytest.approx(19.8e3, rel=0.25)
+
+
+def test_t2_is_that_of_the_flights(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    for column in data_of(out)["arenas"][0]["columns"]:
+        pooled = np.concatenate(list(drawn(out / column["folder"]).values()))
+        assert column["t2"]["n"] == len(pooled)
+        assert column["t2"]["mean_us"] == pytest.approx(pooled.mean())
+        assert column["t2"]["p50_us"] == np.sort(pooled)[(len(pooled) - 1) // 2]
+
+
+# --- what it says
+
+
+@pytest.mark.parametrize(
+    ("key", "target", "reference"),
+    [
+        ("without-mitigation", "target", "reference"),
+        ("with-mitigation", "mitigated", "reference"),
+        ("without-mitigation-trained", "target", "training"),
+        ("with-mitigation-trained", "mitigated", "training"),
+        ("mitigation-on-target", "mitigated", "target"),
+        ("cost-on-reference", "mitigated-reference", "reference"),
+    ],
+)
+def test_gaps_are_those_of_the_files(
+    whole: tuple[Path, str], key: str, target: str, reference: str
+) -> None:
+    out, _ = whole
+    found = gap_of(data_of(out), key)
+    first, second = (lines(out / f"static-obstacles-{role}") for role in (reference, target))
+    reached = [(first[s]["outcome"] == "success", second[s]["outcome"] == "success") for s in first]
+    gained = sum(b and not a for a, b in reached)
+    lost = sum(a and not b for a, b in reached)
+    success = found["success_rate"]["difference"]
+    expected = tango(gained, lost, EPISODES)
+    assert success["value"] == pytest.approx(100.0 * (gained - lost) / EPISODES)
+    assert expected.low is not None
+    assert success["low"] == pytest.approx(100.0 * expected.low)
+    common = [s for s, ends in zip(first, reached, strict=True) if all(ends)]
+    assert len(common) > EPISODES // 3
+    for metric in ("flight_time_s", "distance_m", "energy_j", "computer_energy_j"):
+        values = np.array(
+            [(first[s]["quality"][metric], second[s]["quality"][metric]) for s in common]
+        )
+        means = values.mean(axis=0)
+        change = found[metric]["change"]
+        assert [change["reference"], change["other"]] == pytest.approx(list(means))
+        assert change["difference"]["value"] == pytest.approx(100.0 * (means[1] / means[0] - 1.0))
+        assert change["difference"]["n"] == len(common)
+        median = 100.0 * np.median(values[:, 1] / values[:, 0] - 1.0)
+        assert found[metric]["median"]["value"] == pytest.approx(median, abs=1e-9)
+    both = found["energy_j"]["change"]["other"] + found["computer_energy_j"]["change"]["other"]
+    assert found["total_energy_j"]["change"]["other"] == pytest.approx(both)
+
+
+def test_the_gap_appears(whole: tuple[Path, str]) -> None:
+    """Otherwise nothing of this file shows anything."""
+    gap = gap_of(data_of(whole[0]), "without-mitigation")
+    for metric, least in (("flight_time_s", 10.0), ("distance_m", 5.0), ("energy_j", 10.0)):
+        assert gap[metric]["change"]["difference"]["low"] > least
+    assert gap["t2_percent"] == pytest.approx(3500.0, rel=0.02)
+
+
+def test_the_same_policy_has_the_same_gap_and_none_where_it_was_trained(
+    whole: tuple[Path, str],
+) -> None:
+    """The stand-in for the mitigated policy is the default one: what is known of it is exact."""
+    data = data_of(whole[0])
+    without, with_ = (gap_of(data, key) for key in ("without-mitigation", "with-mitigation"))
+    for metric in ("success_rate", "flight_time_s", "energy_j"):
+        assert with_[metric] == without[metric]
+    nothing = gap_of(data, "mitigation-on-target")
+    assert nothing["flight_time_s"]["change"]["difference"]["value"] == 0.0
+    assert gap_of(data, "cost-on-reference")["distance_m"]["median"]["value"] == 0.0
+    trained = gap_of(data, "with-mitigation-trained")["flight_time_s"]["change"]["difference"]
+    assert trained["value"] != 0.0
+    assert trained["low"] < 0.0 < trained["high"]
+
+
+def test_the_paper_stands_beside_it(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    (arena,) = data_of(out)["arenas"]
+    assert arena["paper_table"] == "mitigation, Static Obstacles (VII.B)"
+    labels = {c["role"]: c["paper"] and c["paper"]["label"] for c in arena["columns"]}
+    assert labels["target"] == "Ras-Pi 4, without mitigation"
+    assert labels["mitigated-reference"] is None
+    assert gap_of(data_of(out), "without-mitigation")["paper"]["flight_time_percent"] == (
+        pytest.approx(86.6, abs=0.05)
+    )
+    trained = gap_of(data_of(out), "without-mitigation-trained")["paper"]
+    assert trained["flight_time_percent"] == pytest.approx(37.73, abs=0.02)
+    flat = " ".join(text.split())
+    assert "paper paper paper paper" in flat
+    assert "(85 - 73) / 73" in flat
+    assert "against the delay-trained policy" in flat
+
+
+def test_the_answer_is_one_of_the_numbers(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    data = data_of(out)
+    (answer,) = data["answers"]
+    assert " ".join(answer.split()) in " ".join(text.split())
+    change = gap_of(data_of(out), "without-mitigation")["flight_time_s"]["change"]["difference"]
+    assert f"On ras-pi-4 (t2 39{6}" in answer or "On ras-pi-4 (t2 39" in answer
+    assert (
+        f"{change['value']:.1f} % longer ({change['low']:+.1f} … {change['high']:+.1f})" in answer
+    )
+    rates = {
+        c["role"]: 100.0 * c["success_rate"]["value"] for c in data_of(out)["arenas"][0]["columns"]
+    }
+    assert f"reaches {rates['target']:.1f} % of its goals, not {rates['reference']:.1f} %" in answer
+    assert "mitigated there flies" in answer
+    assert "against the conditions of its own training" in answer
+
+
+def test_everything_fits_into_80_columns(whole: tuple[Path, str]) -> None:
+    tables = whole[1].partition("What flew")[2].partition("tables  ")[0]
+    assert max(len(line.rstrip()) for line in tables.splitlines()) <= 80
+    assert "…" not in tables.partition("Each by itself")[0]  # No cell is cut.
+
+
+def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
+    study = read_gap(whole[0])
+    (arena,) = study.arenas
+    rows = {row[0]: row for row in columns_table(arena, intervals="none").rows}
+    quality = arena.columns[1].quality
+    assert quality.flight_time_s.value is not None
+    assert float(rows["flight time [s]"][2]) == pytest.approx(quality.flight_time_s.value, abs=5e-3)
+    assert rows["flight time [s]"][6:] == ("24.08", "44.93", "32.44", "32.62")
+    first = gaps_table(arena).rows[0]
+    assert first[0] == "b against a: without mitigation, reference undelayed"
+    gap = arena.gaps[0].gap.flight_time_s.change.difference
+    assert gap.value is not None
+    assert first[2].startswith(f"{gap.value:+.1f} [")
+    assert "+86.6" in gaps_table(arena).rows[1]
+    detail = detail_table(arena, arena.gaps[0])
+    assert len(detail.columns) == 10
+    assert {len(row) for row in detail.rows} == {10}
+
+
+class Page(HTMLParser):
+    """What a page shows, and what it asks for."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.asks: list[str] = []
+        self.open: list[str] = []
+        self.text = ""
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.asks += [value for key, value in attrs if key in ("src", "href") and value]
+        if tag not in ("meta", "img", "link", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    page = Page(out / "gap.html")
+    assert page.open == []
+    assert page.asks
+    assert all(ask.startswith("data:image/svg+xml;base64,") for ask in page.asks)
+    for words in ("Hardware gap", "Seeds that lost most", "86.6", "(85 - 73) / 73", "350 W"):
+        assert words in page.text
+    for name in ("gap", "flights", "worst"):
+        with Image.open(out / f"{name}-static-obstacles.png") as picture:
+            picture.load()
+            assert min(picture.size) > 400
+            assert len(picture.convert("RGB").getcolors(1 << 24) or []) > 20
+
+
+def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
+    text = (whole[0] / "gap.md").read_text()
+    assert text.count("\n| --- |") == 8  # What flew, the gaps, six in detail.
+    for block in re.findall(r"(?:^\|.*\|\n)+", text, re.M):
+        rows = [re.findall(r"(?<!\\)\|", line) for line in block.splitlines()]
+        assert len({len(row) for row in rows}) == 1
+    assert "TODO" not in text
+
+
+def test_the_worst_seeds_failed_or_took_longest(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    worst = data_of(out)["arenas"][0]["worst_seeds"]
+    assert len(worst) == len(set(worst)) == 6
+    first, second = (lines(out / f"static-obstacles-{role}") for role in ("reference", "target"))
+    assert all(first[seed]["outcome"] == "success" for seed in worst)
+    ratio = {
+        s: second[s]["quality"]["flight_time_s"] / first[s]["quality"]["flight_time_s"]
+        for s in first
+        if first[s]["outcome"] == second[s]["outcome"] == "success"
+    }
+    slow = [seed for seed in worst if seed in ratio]
+    assert slow == sorted(ratio, key=lambda s: -ratio[s])[: len(slow)]
+    failed = [seed for seed in worst if seed not in ratio]
+    lost = sorted(s for s in second if second[s]["outcome"] != "success" == first[s]["outcome"])
+    assert failed == [s for s in lost if first[s]["outcome"] == "success"][: len(failed)]
+
+
+def test_worst_seeds_of_nothing() -> None:
+    assert worst_seeds([], []) == ()
+
+
+# --- what it goes on with
+
+
+def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) -> None:
+    out, text = whole
+    before = data_of(out)
+    code, again = measure(mitigated, out=out)
+    assert code == 0
+    assert again.count("(flown before)") == 5
+    assert data_of(out) == before
+    assert (
+        again.partition("What flew")[2].partition("tables  ")[0]
+        == (text.partition("What flew")[2].partition("tables  ")[0])
+    )
+
+
+def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    before = (out / GAP_FILE).read_bytes()
+    console = Console(record=True, width=80, file=io.StringIO())
+    with patch.object(gap_terminal, "build_page", lambda s, _: s.path / "gap.html"):
+        assert report.run(ReportCommand(out), console) == 0
+    assert (out / GAP_FILE).read_bytes() == before
+    assert console.export_text().strip() in text
+
+
+def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigated: str) -> None:
+    """A gap that was stopped after its second column has one gap already."""
+    for role in ("reference", "target"):
+        name = f"static-obstacles-{role}"
+        shutil.copytree(whole[0] / name, tmp_path / "root" / name)
+    from airl_mav.cli import cells
+
+    real = cells._fly
+
+    def stopped(root: Path, cell: Any, *rest: Any) -> Any:
+        if cell.key.endswith("-mitigated"):
+            raise KeyboardInterrupt
+        return real(root, cell, *rest)
+
+    with patch.object(cells, "_fly", stopped):
+        code, text = measure(mitigated, out=tmp_path / "root")
+    assert code == 130
+    assert "goes on" in text
+    data = data_of(tmp_path / "root")
+    assert [gap["key"] for gap in data["arenas"][0]["gaps"]] == ["without-mitigation"]
+    assert gap_of(data, "without-mitigation") == gap_of(data_of(whole[0]), "without-mitigation")
+    code, _ = measure(mitigated, out=tmp_path / "root")
+    assert code == 0
+    assert data_of(tmp_path / "root") == data_of(whole[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[", "not JSON"),
+        ('{"schema": 9}', "schema = 9"),
+        ('{"schema": 1, "facts": {}}', "arenas: Field required"),
+        ('{"schema": 1, "facts": {}, "arenas": []}', "no run here"),
+    ],
+)
+def test_a_damaged_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / GAP_FILE).write_text(text)
+    with pytest.raises(UsageError, match=re.escape(words)) as caught:
+        read_gap(tmp_path)
+    assert "\n" not in f"{caught.value}"
+
+
+def test_no_gap_here(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no hardware gap here"):
+        read_gap(tmp_path)
+
+
+# --- what it can be asked for
+
+
+def test_without_mitigation_and_in_two_arenas(tmp_path: Path) -> None:
+    code, text = measure(
+        "none", out=tmp_path, arena=("no-obstacles", "static-obstacles"), episodes=3
+    )
+    assert code == 0
+    data = data_of(tmp_path)
+    for arena, paper in zip(
+        data["arenas"],
+        ("system evaluation, No Obstacles (VI.B)", "mitigation, Static Obstacles (VII.B)"),
+        strict=True,
+    ):
+        assert [column["role"] for column in arena["columns"]] == ["reference", "target"]
+        assert arena["paper_table"] == paper
+    assert len(data["answers"]) == 2
+    assert " in no-obstacles " in data["answers"][0]
+    assert "no-obstacles ─" in text
+    assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == [
+        f"{arena}-{role}"
+        for arena in ("no-obstacles", "static-obstacles")
+        for role in ("reference", "target")
+    ]
+
+
+@pytest.mark.parametrize("latency", ["150ms", "file"])
+def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
+    if latency == "file":
+        path = tmp_path / "measured.txt"
+        path.write_text("140\n160\n150\n")
+        latency = str(path)
+    code, _ = measure("none", out=tmp_path / "out", latency=latency, episodes=3)
+    assert code == 0
+    data = data_of(tmp_path / "out")
+    (arena,) = data["arenas"]
+    a, b = arena["columns"]
+    # The reference is undelayed: no workload of it is as late as a measured latency says.
+    assert a["t2"]["mean_us"] == 1e3
+    assert b["t2"]["mean_us"] == pytest.approx(150e3, rel=0.02)
+    assert arena["paper_table"] is None
+    assert a["paper"] is b["paper"] is None
+    assert data["facts"]["latency"] == latency
+
+
+def test_defaults_are_those_of_the_package() -> None:
+    command = GapCommand()
+    assert command.policy == DEFAULT_POLICY
+    assert command.mitigated == DEFAULT_MITIGATED
+
+
+def test_a_missing_mitigated_policy_is_one_clear_line() -> None:
+    with (
+        patch.object(gap_plan, "find_policy", side_effect=_unknown),
+        pytest.raises(UsageError, match="not among the shipped policies; accepted: the folder"),
+    ):
+        gap_plan._mitigated(DEFAULT_MITIGATED)
+    with pytest.raises(UsageError, match="no such policy"):
+        gap_plan._mitigated("somebody")
+    assert gap_plan._mitigated("none") is None
+
+
+def _unknown(name: str) -> PolicyInfo:
+    raise UsageError(f"--policy {name!r}: no such policy; known: greedy")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"episodes": 0}, "--episodes 0"),
+        ({"seed": -1}, "--seed -1"),
+        ({"workers": 2}, "--workers 2 with --level gym"),
+        ({"latency": "150ms", "workload": "template-5x32"}, "accepted: one of them"),
+        ({"latency": "late"}, "--latency late"),
+        ({"workload": "template-1x1"}, "template-1x1"),
+        ({"reference_workload": "template-1x1"}, "template-1x1"),
+        ({"computer": "abacus"}, "abacus"),
+        ({"reference": "abacus"}, "abacus"),
+        ({"policy": "nobody"}, "nobody"),
+        ({"mitigated": DEFAULT_POLICY}, "the same name as --policy"),
+        ({"arena": ("no-obstacles", "no-obstacles")}, "each once"),
+        ({"arena": ()}, "one or more"),
+        ({"arena": ("nowhere",)}, "nowhere"),
+    ],
+)
+def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str) -> None:
+    out = tmp_path / "out"
+    asked: dict[str, Any] = {"mitigated": "none", "out": out} | options
+    with pytest.raises(UsageError, match=re.escape(words)) as caught:
+        measure(**asked)
+    assert "\n" not in f"{caught.value}"
+    assert not out.exists()
+
+
+# --- how the conditions of a training are read
+
+
+def training_of(folder: Path, **options: Any) -> tuple[list[Any], tuple[str, ...]]:
+    plan = plan_gap(GapCommand(mitigated=str(folder), **options))
+    return [p.cell for p in plan.cells if p.role == "training"], plan.remarks
+
+
+def test_training_without_delay_is_flown_without(tmp_path: Path) -> None:
+    folder = make_policy(tmp_path / "m", {"computer": "workstation", "native_ms": 2.0})
+    (cell,), _ = training_of(folder)
+    assert cell.command.latency == "2ms"
+    assert cell.command.workload is None
+    assert cell.command.computer == "ras-pi-4"
+
+
+def test_training_on_several_latencies_gives_a_column_for_each(tmp_path: Path) -> None:
+    sources = ["lognormal:396ms,20ms", "150ms"]
+    folder = make_policy(tmp_path / "m", {"latency": sources})
+    cells, _ = training_of(folder)
+    assert [cell.command.latency for cell in cells] == sources
+    assert [cell.key for cell in cells] == [
+        "static-obstacles-training",
+        "static-obstacles-training-2",
+    ]
+    assert {cell.command.latency_seed for cell in cells} == {TRAINING_LATENCY_SEED}
+    assert "150ms" in cells[1].title
+
+
+def test_an_estimate_stays_one(tmp_path: Path) -> None:
+    folder = make_policy(tmp_path / "m", {"computer": "ras-pi-4", "workload": "estimate"})
+    (cell,), _ = training_of(folder)
+    assert (cell.command.computer, cell.command.workload) == ("ras-pi-4", "estimate")
+
+
+def test_what_the_column_lacks_is_said(tmp_path: Path) -> None:
+    delay = {"computer": "ras-pi-4", "workload": "template-5x32"}
+    folder = make_policy(tmp_path / "m", delay, extra=(0.0, 50.0))
+    cells, remarks = training_of(folder)
+    assert len(cells) == 1
+    assert "0 to 50 ms" in remarks[0]
+
+
+def test_a_card_that_does_not_say_has_no_such_column(tmp_path: Path) -> None:
+    cells, remarks = training_of(make_policy(tmp_path / "m", None))
+    assert cells == []
+    assert "does not say" in remarks[0]
+
+
+def test_a_card_with_a_wrong_delay_is_one_line(tmp_path: Path) -> None:
+    folder = make_policy(tmp_path / "m", {"computer": "ras-pi-4", "lateness": 3})
+    with pytest.raises(UsageError, match=r"mitigated: environment\.delay: lateness"):
+        training_of(folder)
+
+
+# --- the words
+
+
+def test_a_study_without_a_gap_says_nothing(whole: tuple[Path, str], tmp_path: Path) -> None:
+    data = data_of(whole[0])
+    arena = data["arenas"][0]
+    arena["columns"] = arena["columns"][:1]
+    for path in whole[0].iterdir():
+        if path.is_dir():
+            (tmp_path / path.name).symlink_to(path)
+    (tmp_path / GAP_FILE).write_text(json.dumps(data))
+    study: GapStudy = read_gap(tmp_path)
+    assert study.arenas[0].gaps == ()
+    assert answers(study) == []
+    write_gap(study, [])
+    assert data_of(tmp_path)["arenas"][0]["gaps"] == []
+
+
+# --- as a person uses it
+
+
+@pytest.mark.slow
+def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Path) -> None:
+    """Stopped in the middle by a real signal, the same command ends with the same figures."""
+    out = tmp_path / "gap"
+    command = [
+        sys.executable,
+        "-m",
+        "airl_mav.cli.main",
+        "gap",
+        *("--mitigated", mitigated, "--episodes", f"{EPISODES}", "--out", str(out)),
+    ]
+    root = Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "COLUMNS": "100"}
+    process = subprocess.Popen(
+        command,
+        cwd=root,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+        # A shell that runs the tests in the background has them, and so this, ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        # Early: the whole of it takes but seconds, and this test may be starved meanwhile.
+        first = out / "static-obstacles-reference"
+        deadline = time.monotonic() + 120.0
+        while not first.exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        text, _ = process.communicate(timeout=120.0)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert f"the same command with --out {out} goes on" in " ".join(text.split())
+    done = subprocess.run(
+        command, cwd=root, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert data_of(out) == data_of(whole[0])
+    assert (out / "gap.html").exists()

@@ -1,0 +1,627 @@
+"""`airl ladder`: what it flies, what it says, what it leaves behind, what it survives."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from airl_mav.cli import evaluate_task, ladder_levels, main, report
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import Result, Task
+from airl_mav.cli.ladder import run
+from airl_mav.cli.ladder_command import LadderCommand
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import tango
+from airl_mav.rehearsal import evaluation_gym
+from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.report import html
+from airl_mav.report.ladder import page as ladder_page
+from airl_mav.report.ladder.build import LADDER_FILE, Held, Ladder, build_ladder, read_ladder
+from airl_mav.report.ladder.page import build_page, differences_figure
+from airl_mav.report.ladder.tables import (
+    MEASURES,
+    comparison_tables,
+    levels_table,
+    split_table,
+)
+from airl_mav.report.ladder.words import differences_in_words
+from tests.support.run_demo import demo_arena, demo_episode, demo_setup
+
+EPISODES, SITL_EPISODES = 24, 6
+WORDS: dict[str, Any] = {"arena": "dense-obstacles", "episodes": EPISODES, "seed": 20}
+"""Where some flights reach the goal and some do not."""
+
+SLOW: dict[str, Any] = {"computer": "ras-pi-4", "workload": "template-5x32"}
+"""Decides some 400 ms later."""
+
+
+class StandIns:
+    """Levels lockstep and sitl flown by the twin on a slow computer: the command is under test.
+
+    Level sitl is cut short where `cut` says after how many episodes.
+    """
+
+    def __init__(self) -> None:
+        self.cut: list[int] = []
+        self.flown: list[tuple[str, int]] = []
+        """Level, and number of new episodes."""
+
+    def prepare(self, command: EvaluateCommand, policy: str, arena: str) -> Task:
+        twin = replace(command, level="gym", speed=None, workers=None)
+        if command.level != "gym":
+            twin = replace(twin, **SLOW)
+        task = evaluate_task.prepare(twin, policy, arena)
+        return replace(task, fly=partial(self._fly, command, task))
+
+    def _fly(
+        self, command: EvaluateCommand, task: Task, out: Path | None, console: Console
+    ) -> Result:
+        result = task.fly(out, console)
+        if command.level == "sitl" and self.cut:
+            result = cut_short(result, self.cut.pop(0))
+        self.flown.append((command.level, result.new))
+        return result
+
+
+def cut_short(result: Result, keep: int) -> Result:
+    """Return a run as Ctrl-C would have left it after some new episodes."""
+    path = result.path / "episodes.jsonl"
+    there = path.read_text().splitlines(keepends=True)
+    there = there[: len(there) - result.new + keep]
+    path.write_text("".join(there))
+    return Result(result.path, 130, load(result.path).episodes, keep)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_pictures() -> Iterator[None]:
+    """Pictures take longer than flights."""
+    with patch.object(html, "MAX_PICTURED", 1), patch.object(ladder_levels, "rebuild"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def stand_ins() -> Iterator[StandIns]:
+    stand_ins = StandIns()
+    with patch.object(ladder_levels, "prepare", stand_ins.prepare):
+        yield stand_ins
+
+
+def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
+    """Run the command in this process; return exit status and output.
+
+    Pages take longer than flights: without `page` none is made.
+    """
+    console = Console(record=True, width=100, file=io.StringIO())
+    command = LadderCommand("greedy", **(WORDS | {"sitl_episodes": SITL_EPISODES} | options))
+    with nullcontext() if page else patch.object(ladder_page, "build_page"):
+        code = run(command, console)
+    return code, console.export_text()
+
+
+@pytest.fixture(scope="module")
+def whole(stand_ins: StandIns, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A ladder without any trouble: its folder, and what was printed."""
+    out = tmp_path_factory.mktemp("whole") / "ladder"
+    code, text = climb(out=out, page=True)
+    assert code == 0
+    return out, text
+
+
+def lines(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the episodes of a run by seed, as a reader without this package sees them."""
+    episodes = map(json.loads, (path / "episodes.jsonl").read_text().splitlines())
+    return {episode["seed"]: episode for episode in episodes}
+
+
+def data_of(path: Path) -> dict[str, Any]:
+    data: dict[str, Any] = json.loads((path / LADDER_FILE).read_text())
+    return data
+
+
+# --- what it flies
+
+
+def test_every_level_flies_the_same_seeds(whole: tuple[Path, str], stand_ins: StandIns) -> None:
+    out, _ = whole
+    assert stand_ins.flown[:3] == [("gym", 24), ("lockstep", 24), ("sitl", 6)]
+    flights = {level: lines(out / level) for level in ("gym", "lockstep", "sitl")}
+    assert list(flights["gym"]) != list(flights["sitl"])
+    assert sorted(flights["gym"]) == sorted(flights["lockstep"]) == list(range(20, 44))
+    assert sorted(flights["sitl"]) == list(range(20, 26))
+    for seed, episode in flights["sitl"].items():
+        assert episode["goal"] == flights["gym"][seed]["goal"] == flights["lockstep"][seed]["goal"]
+
+
+def test_level_sitl_flies_fewer_unless_asked() -> None:
+    assert LadderCommand("greedy").episodes_at("sitl") == 10
+    assert LadderCommand("greedy", episodes=4).episodes_at("sitl") == 4
+    assert LadderCommand("greedy", sitl_episodes=30).episodes_at("sitl") == 30
+    assert LadderCommand("greedy", sitl_episodes=30).episodes_at("gym") == 100
+
+
+@pytest.mark.slow
+def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        "arena": "no-obstacles",
+        "episodes": 2,
+        "sitl_episodes": 1,
+        "workers": 1,
+    }
+    levels = ("gym", "lockstep")
+    with patch.object(ladder_levels, "prepare", evaluate_task.prepare):
+        assert climb(out=tmp_path / "one", levels=levels, page=True, **options)[0] == 0
+        # The other way round it is flown again, and flies the same.
+        assert climb(out=tmp_path / "two", levels=levels[::-1], **options)[0] == 0
+    gym, lockstep = (lines(tmp_path / "one" / level) for level in levels)
+    assert sorted(gym) == sorted(lockstep) == [20, 21]
+    one, two = data_of(tmp_path / "one"), data_of(tmp_path / "two")
+    assert one["levels"][0] == two["levels"][1]
+    assert one["levels"][1] == two["levels"][0]
+    assert re.fullmatch("[0-9a-f]{64}", one["levels"][1]["sha256"])
+    (found,) = one["comparisons"]
+    assert found["agreement"]["both"] == 2
+    # In the open both fly to the goal, from nearly the same place.
+    assert abs(found["distance_m"]["difference"]["value"]) < 5.0
+    assert one["levels"][0]["start"]["takeoff_s"] == 0.0
+    assert one["levels"][1]["start"]["takeoff_s"] > 4.0
+    assert 0.0 < one["levels"][1]["position_error_m"] < 1.0
+    assert (tmp_path / "one" / "ladder.html").exists()
+
+
+# --- what it says
+
+
+@pytest.mark.parametrize("level", ["lockstep", "sitl"])
+def test_differences_are_those_of_the_files(whole: tuple[Path, str], level: str) -> None:
+    out, _ = whole
+    gym, other = lines(out / "gym"), lines(out / level)
+    (found,) = [c for c in data_of(out)["comparisons"] if c["level"] == level]
+    seeds = sorted(other)
+    reached = [(gym[s]["outcome"] == "success", other[s]["outcome"] == "success") for s in seeds]
+    agreement = found["agreement"]
+    assert agreement["both"] == sum(a and b for a, b in reached)
+    assert agreement["only_reference"] == sum(a and not b for a, b in reached)
+    assert agreement["only_other"] == sum(b and not a for a, b in reached)
+    assert sum(agreement.values()) == len(seeds)
+    rates = np.mean(reached, axis=0)
+    success = found["success_rate"]
+    assert [success["reference"], success["other"]] == pytest.approx(rates)
+    difference = success["difference"]
+    assert difference["value"] == pytest.approx(100.0 * (rates[1] - rates[0]))
+    expected = tango(agreement["only_other"], agreement["only_reference"], len(seeds))
+    assert difference["low"] == pytest.approx(100.0 * (expected.low or 0.0))
+    assert difference["n"] == len(seeds)
+    common = [s for s, ends in zip(seeds, reached, strict=True) if all(ends)]
+    for key in ("flight_time_s", "distance_m", "energy_j"):
+        first = np.mean([gym[s]["quality"][key] for s in common])
+        second = np.mean([other[s]["quality"][key] for s in common])
+        assert found[key]["reference"] == pytest.approx(first)
+        assert found[key]["other"] == pytest.approx(second)
+        difference = found[key]["difference"]
+        assert difference["value"] == pytest.approx(100.0 * (second / first - 1.0))
+        assert difference["low"] < difference["value"] < difference["high"]
+        assert difference["n"] == len(common)
+
+
+def test_the_levels_differ_and_the_seeds_that_split_are_named(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    data = data_of(out)
+    # Otherwise nothing of this file shows anything: a late policy flies worse.
+    lockstep = data["comparisons"][0]
+    assert lockstep["agreement"]["only_reference"] > 0
+    assert lockstep["agreement"]["both"] >= 3
+    flights = {level: lines(out / level) for level in ("gym", "lockstep", "sitl")}
+    named = {item["seed"]: item["outcomes"] for item in data["split"]}
+    for seed in flights["gym"]:
+        ends = {level: e[seed]["outcome"] for level, e in flights.items() if seed in e}
+        split = len({outcome == "success" for outcome in ends.values()}) > 1
+        assert (seed in named) == split
+        assert not split or named[seed] == ends
+    rows = split_table(read_ladder(out)).rows
+    assert [int(row[0]) for row in rows] == sorted(named)
+    assert {"goal reached", "collision"} <= {cell for row in rows for cell in row[1:]}
+
+
+def test_what_a_decision_takes(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    for level in data_of(out)["levels"]:
+        t2, period = [], []
+        with np.load(out / level["name"] / "latency.npz") as stamps:
+            for index in sorted({name.partition("/")[0] for name in stamps.files}):
+                start, end, sent = (
+                    stamps[f"{index}/{key}"]
+                    for key in ("infer_start_us", "action_ready_us", "sent_us")
+                )
+                ended = (start >= 0) & (end >= 0)
+                t2.append((end - start)[ended])
+                period.append(np.diff(sent[sent >= 0]))
+        for key, values in (("t2", t2), ("period", period)):
+            pooled = np.concatenate(values)
+            stage = level["stages"][key]
+            assert stage["n"] == len(pooled)
+            assert stage["mean_us"] == pytest.approx(pooled.mean())
+    times = {
+        level["name"]: level["stages"]["period"]["mean_us"] / 1e3
+        for level in data_of(out)["levels"]
+    }
+    told = "; ".join(f"{value:.1f} ms at {name}" for name, value in times.items())
+    assert f"Decision period: {told}." in " ".join(text.split())
+    assert times["lockstep"] > times["gym"] + 300.0
+    assert "as if Raspberry Pi 4" in data_of(out)["levels"][1]["t2"]
+
+
+def test_seeds_that_make_the_difference_are_named(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    gym, other = lines(out / "gym"), lines(out / "lockstep")
+    times = {
+        seed: [run[seed]["quality"]["flight_time_s"] for run in (gym, other)]
+        for seed in gym
+        if gym[seed]["outcome"] == other[seed]["outcome"] == "success"
+    }
+    percent = {seed: 100.0 * (late / early - 1.0) for seed, (early, late) in times.items()}
+    first, second, third = sorted(percent, key=lambda seed: abs(percent[seed]))[:-4:-1]
+    assert (
+        f"Flight time at lockstep by pairs: median {np.median(list(percent.values())):+.1f} %; "
+        f"widest {percent[first]:+.1f} % with seed {first}, {percent[second]:+.1f} % with seed "
+        f"{second}, {percent[third]:+.1f} % with seed {third}."
+    ) in " ".join(text.split())
+
+
+def test_no_difference_is_printed_without_its_pairs(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    ladder = read_ladder(out)
+    for view, comparison in zip(comparison_tables(ladder), ladder.comparisons, strict=True):
+        titles = [column.title for column in view.columns]
+        assert titles[-3:] == ["difference", "95 % interval", "pairs"]
+        pairs = [comparison.agreement.n] + 3 * [comparison.agreement.both]
+        assert [int(row[-1]) for row in view.rows] == pairs
+        for row in view.rows:
+            assert re.search(r"\s+".join(map(re.escape, row)), text), row
+        assert f"only gym in {comparison.agreement.only_reference}" in view.notes[0]
+    few = "Bootstrap intervals of fewer than 10 pairs are too narrow."
+    lockstep, sitl = comparison_tables(ladder)
+    assert ladder.comparisons[0].agreement.both >= 10
+    assert few not in lockstep.notes
+    assert few in sitl.notes
+    assert any("Not the same number" in note for note in levels_table(ladder).notes)
+
+
+def test_the_first_level_is_the_reference(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    names = ("lockstep", "gym")
+    turned = build_ladder(out, {}, [Held(name, (name,), EPISODES) for name in names])
+    there, back = read_ladder(out).comparisons[0], turned.comparisons[0]
+    assert back.agreement.only_reference == there.agreement.only_other
+    assert back.flight_time_s.reference == there.flight_time_s.other
+    high = there.success_rate.difference.high
+    assert high is not None
+    assert back.success_rate.difference.low == pytest.approx(-high)
+    assert comparison_tables(turned)[0].title == "gym against lockstep"
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Ladder:
+    """Flights that begin with a take-off, at two levels that are 0.3 m apart."""
+    root = tmp_path_factory.mktemp("rehearsed")
+    for level, aside in (("lockstep", 0.0), ("sitl", 0.3)):
+        setup = replace(demo_setup(), level=level)  # type: ignore[arg-type]
+        folder = RunFolder.create(root / level, "demo", {}, setup=setup)
+        for index in range(3):
+            record, path, latency = demo_episode(index, demo_arena(index + 1))
+            if index == 2:
+                record = replace(record, outcome=Outcome.ABORTED)
+            path = replace(path, position=path.position + np.array([0.0, aside, 0.0]))
+            estimate = {
+                # Between the samples of the path, and on after the verdict.
+                "estimate/time_us": path.time_us[:-1] + 10_000,
+                "estimate/position": 0.5 * (path.position[:-1] + path.position[1:])
+                + [0.6 + aside, 0.8, 5.0],
+            }
+            estimate["estimate/position"][path.time_us[:-1] > record.ended_us] += 50.0
+            folder.save_episode(record, path, latency | estimate)
+    held = [Held(level, (level,), 3) for level in ("lockstep", "sitl")]
+    return build_ladder(root, {"policy": "scout", "arena": "static-obstacles"}, held)
+
+
+def test_where_navigation_begins_and_what_is_believed(rehearsed: Ladder) -> None:
+    lockstep, sitl = rehearsed.levels
+    assert lockstep.start is not None
+    assert sitl.start is not None
+    assert lockstep.start.n == 2  # The third one was aborted.
+    assert lockstep.start.takeoff_s == pytest.approx(5.0, abs=0.02)
+    paths = load(rehearsed.path / "lockstep")
+    at = [
+        p.position[np.searchsorted(p.time_us, e.navigation_us)]
+        for e, p in zip(paths.episodes, paths.trajectories.values(), strict=True)
+    ][:2]
+    assert lockstep.start.aside_m == pytest.approx(np.mean([np.hypot(*p[:2]) for p in at]))
+    assert lockstep.start.height_m == pytest.approx(np.mean([-p[2] for p in at]))
+    assert sitl.start.aside_m != pytest.approx(lockstep.start.aside_m)
+    assert lockstep.position_error_m == pytest.approx(1.0, abs=1e-6)
+    assert sitl.position_error_m == pytest.approx(np.hypot(0.9, 0.8), abs=1e-6)
+    words = " ".join(differences_in_words(rehearsed))
+    assert "Error of the estimated position: 1.00 m at lockstep; 1.20 m at sitl." in words
+    assert "after 5.0 s of take-off" in words
+    # The first flight of each gave up 8 ms.
+    assert "could not keep pace at sitl: 8 ms" in words
+    # An aborted flight makes no pair.
+    assert rehearsed.comparisons[0].agreement.n == 2
+
+
+# --- what it leaves behind
+
+
+class Page(HTMLParser):
+    """Checks that tags nest, and collects what reaches outside the file."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: set[str] = set()
+        self.sources: list[str] = []
+        self.links: list[str] = []
+        self.alts: list[str | None] = []
+        self.text = ""
+        self.feed(text)
+        self.close()
+        assert not self.open, f"left open: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        if tag not in {"meta", "img"}:
+            self.open.append(tag)
+        found = dict(attrs)
+        if tag == "img":
+            self.alts.append(found.get("alt"))
+        self.sources += [value or "" for key, value in attrs if key == "src"]
+        self.links += [value or "" for key, value in attrs if key == "href"]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += f" {data}"
+
+
+def test_the_page_is_one_file(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    text = (out / "ladder.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    assert "url(" not in text
+    assert "@import" not in text
+    assert len(page.sources) == len(MEASURES)
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in page.sources)
+    assert all(page.alts)
+    # To the reports of the levels, where there are any.
+    assert all((out / link).exists() for link in page.links)
+    words = " ".join(page.text.split())
+    for fact in ("greedy in dense-obstacles", "sitl against gym", "Decision period:"):
+        assert fact in words
+    for view in comparison_tables(read_ladder(out)):
+        for row in view.rows:
+            assert " ".join(row) in words
+
+
+def test_figures_say_what_the_tables_say(whole: tuple[Path, str]) -> None:
+    out, _ = whole
+    ladder = read_ladder(out)
+    sources = Page((out / "ladder.html").read_text(encoding="utf-8")).sources
+    for source, measure in zip(sources, MEASURES, strict=True):
+        svg = base64.b64decode(source.partition(",")[2]).decode()
+        assert "prefers-color-scheme:dark" in svg
+        for comparison in ladder.comparisons:
+            difference = getattr(comparison, measure.key).difference
+            assert f">{difference.value:+.2f}, n = {difference.n}<" in svg
+    with Image.open(out / "ladder.png") as image:
+        image.load()
+        assert min(image.size) > 300
+        assert len(np.unique(np.asarray(image.convert("L")))) > 20
+
+
+def test_a_bar_lies_where_its_interval_is(whole: tuple[Path, str]) -> None:
+    """The bar of the figure, in pixels, against the numbers on its axis."""
+    ladder = read_ladder(whole[0])
+    picture = differences_figure(ladder, MEASURES[1])
+    with Image.open(io.BytesIO(picture.png)) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    blue = np.abs(pixels - (0x28, 0x68, 0xA8)).sum(axis=2) < 30
+    grey = np.abs(pixels - (0x68, 0x70, 0x7A)).sum(axis=2) < 30
+    rows = np.flatnonzero(blue.sum(axis=1) > 20)
+    lockstep_row, sitl_row = rows[0], rows[-1]
+    assert lockstep_row < sitl_row - 20
+    zero = np.flatnonzero(grey.sum(axis=0) > 60)
+    assert len(zero)
+    ends = [np.flatnonzero(blue[row])[[0, -1]] - zero.mean() for row in (lockstep_row, sitl_row)]
+    limits = [
+        (c.flight_time_s.difference.low or 0.0, c.flight_time_s.difference.high or 0.0)
+        for c in ladder.comparisons
+    ]
+    # One scale for all of it: pixels a percent.
+    scale = np.ptp(ends[0]) / np.ptp(limits[0])
+    assert np.ravel(ends) == pytest.approx(scale * np.ravel(limits), abs=4.0)
+
+
+def test_foreign_text_is_escaped(rehearsed: Ladder, tmp_path: Path) -> None:
+    evil = "<script>alert(1)</script>&\"'"
+    levels = tuple(replace(level, t2=f"{evil} {level.name}") for level in rehearsed.levels)
+    spoiled = replace(
+        rehearsed, path=tmp_path, facts={"policy": evil, "arena": evil, evil: evil}, levels=levels
+    )
+    text = build_page(spoiled).read_text(encoding="utf-8")
+    page = Page(text)
+    assert "script" not in page.tags
+    assert "<script" not in text
+    assert page.text.count(evil) >= 6
+
+
+def test_a_level_without_any_success_still_has_a_page(rehearsed: Ladder, tmp_path: Path) -> None:
+    lockstep, _ = rehearsed.levels
+    runs = load(rehearsed.path / "sitl")
+    folder = RunFolder.create(tmp_path / "sitl", "demo", {}, setup=runs.info.setup)
+    failed = replace(runs.episodes[0], outcome=Outcome.COLLISION, quality=None, navigation_us=None)
+    folder.save_episode(failed, runs.trajectories[0], {})
+    folder = RunFolder.create(tmp_path / "lockstep", "demo", {}, setup=runs.info.setup)
+    folder.save_episode(lockstep.episodes[0], runs.trajectories[0], runs.latency[0])
+    ladder = build_ladder(tmp_path, {}, [Held(n, (n,), 1) for n in ("lockstep", "sitl")])
+    assert [row[3:] for row in comparison_tables(ladder)[0].rows[1:]] == [("–", "–", "0")] * 3
+    assert "n = 0" in Page(build_page(ladder).read_text(encoding="utf-8")).text
+
+
+def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
+    out, text = whole
+    before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    console = Console(record=True, width=100, file=io.StringIO())
+    assert report.run(report.ReportCommand(out), console) == 0
+    assert text.endswith(console.export_text())
+    assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ("{", "not JSON"),
+        ('{"schema": 99}', "schema = 99: accepted: 1"),
+        ('{"schema": 1, "facts": {}, "levels": [{"name": "gym"}]}', "levels.0.folders"),
+        (
+            '{"schema": 1, "facts": {}, "levels": [{"name": "g", "folders": ["g"], "planned": 1}]}',
+            "no run here",
+        ),
+    ],
+)
+def test_a_broken_ladder_gets_one_line(content: str, named: str, tmp_path: Path) -> None:
+    (tmp_path / LADDER_FILE).write_text(content)
+    with pytest.raises(UsageError, match=re.escape(named)) as error:
+        report.run(report.ReportCommand(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+# --- what it survives
+
+
+def test_an_interrupted_ladder_goes_on(
+    whole: tuple[Path, str], stand_ins: StandIns, tmp_path: Path
+) -> None:
+    out = tmp_path / "ladder"
+    stand_ins.cut[:] = [2, 0]
+    stand_ins.flown.clear()
+    code, text = climb(out=out)
+    assert code == 130
+    assert f"the same command with --out {out} goes on" in text
+    assert "2 of 6 at sitl" in text
+    assert data_of(out)["comparisons"][1]["success_rate"]["difference"]["n"] == 2
+    # Cut again before anything was flown, then to the end.
+    assert climb(out=out)[0] == 130
+    code, text = climb(out=out)
+    assert code == 0
+    assert "2 of 6 episodes are there" in text
+    assert [part for part in stand_ins.flown if part[1]] == [
+        ("gym", 24),
+        ("lockstep", 24),
+        ("sitl", 2),
+        ("sitl", 4),
+    ]
+    assert data_of(out) == data_of(whole[0])
+
+
+def test_an_interrupted_first_level(stand_ins: StandIns, tmp_path: Path) -> None:
+    def stopped(*_: Any, **__: Any) -> Result:
+        return Result(tmp_path / "ladder" / "gym", 130, (), 0)
+
+    (tmp_path / "ladder" / "gym").mkdir(parents=True)
+    RunFolder.create(tmp_path / "ladder" / "gym", "x", {}, setup=demo_setup())
+    with patch.object(StandIns, "_fly", stopped):
+        code, text = climb(out=tmp_path / "ladder", levels=("gym", "lockstep"))
+    assert code == 130
+    assert "goes on" in text
+    assert not (tmp_path / "ladder" / LADDER_FILE).exists()
+
+
+def test_what_is_finished_is_shown_again_and_not_flown(
+    whole: tuple[Path, str], stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, text = whole
+    monkeypatch.setattr(evaluation_gym, "fly_seeds", None)
+    stand_ins.flown.clear()
+    code, again = climb(out=out)
+    assert code == 0
+    assert not [part for part in stand_ins.flown if part[1]]
+    tables = [shown.partition("policy ")[2].partition("ladder  ")[0] for shown in (text, again)]
+    assert tables[0] == tables[1] != ""
+
+
+# --- what it refuses
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"levels": ("gym",)}, "--levels gym: accepted: two or more"),
+        ({"levels": ()}, "--levels nothing"),
+        ({"levels": ("gym", "sitl", "gym")}, "--levels gym sitl gym"),
+        ({"episodes": 0}, "--episodes 0"),
+        ({"seed": -1}, "--seed -1"),
+        ({"sitl_episodes": 25}, "--sitl-episodes 25: accepted: 1 <= value <= 24"),
+        ({"sitl_episodes": 0}, "--sitl-episodes 0"),
+        ({"workers": 0}, "--workers 0"),
+        ({"speed": 100.0}, "--speed 100"),
+        ({"arena": "moon"}, "'moon'"),
+        ({"computer": "abacus"}, "'abacus'"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_anything_flies(
+    options: dict[str, Any], named: str, tmp_path: Path
+) -> None:
+    with (
+        patch.object(ladder_levels, "prepare", evaluate_task.prepare),
+        pytest.raises(UsageError, match=re.escape(named)) as error,
+    ):
+        climb(out=tmp_path / "ladder", **{"levels": ("gym", "sitl")} | options)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "ladder").exists()
+
+
+def test_another_run_is_not_mixed_in(whole: tuple[Path, str], stand_ins: StandIns) -> None:
+    out, _ = whole
+    before = data_of(out)
+    with pytest.raises(UsageError, match=r"gym: holds a run with .*seed = 20, not 21"):
+        climb(out=out, seed=21)
+    with pytest.raises(UsageError, match=r"sitl: holds a run with .*seed = 20, not 21"):
+        climb(out=out, seed=21, levels=("sitl", "gym"))
+    with pytest.raises(UsageError, match="holds a single run"):
+        climb(out=out / "gym")
+    assert data_of(out) == before
+
+
+def test_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["ladder", "telepathy", "--arena", "no-obstacles", "--levels", "gym", "sitl"]
+    monkeypatch.setattr(sys, "argv", ["airl", *words])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert "'telepathy'" in err
+    assert len(err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())

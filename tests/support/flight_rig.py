@@ -1,0 +1,150 @@
+"""Flights in simulated time for the tests: plant and autopilot, no MAVLink, no wall clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.autopilot.state import Mode, Result, Setpoint
+from firmware_sim.interfaces import Truth
+from firmware_sim.plant.wind import WindSettings
+from firmware_sim.simulation import EpisodeSetup, Simulation
+
+SETPOINT_US = 50_000
+"""MAVSDK repeats its setpoint at 20 Hz."""
+
+CALM = WindSettings()
+NAN = math.nan
+
+
+def quad(**changes: Any) -> VehicleProfile:
+    """Return the shipped vehicle, parts of it replaced: `quad(battery={"capacity_mah": 50.0})`."""
+    profile = load_profile("vehicles", "quad", VehicleProfile)
+    data = profile.model_dump()
+    for part, values in changes.items():
+        data[part] = {**data[part], **values}
+    return VehicleProfile.model_validate(data)
+
+
+def velocity_setpoint(
+    north: float, east: float, down: float, *, yaw: float = 0.0, yaw_rate: float = NAN
+) -> Setpoint:
+    """Return what MAVSDK's set_velocity_ned sends; with a yaw rate pass yaw=NaN."""
+    return Setpoint(np.full(3, NAN), np.array([north, east, down]), yaw, yaw_rate)
+
+
+class Rig:
+    """One simulated flight under test."""
+
+    def __init__(
+        self,
+        seed: int = 0,
+        *,
+        arena: Arena | None = None,
+        wind: WindSettings = CALM,
+        vehicle: VehicleProfile | None = None,
+        parameters: dict[str, float] | None = None,
+    ) -> None:
+        vehicle = vehicle or quad()
+        merged = {**vehicle.parameters, **(parameters or {})}
+        vehicle = vehicle.model_copy(update={"parameters": merged})
+        self.sim = Simulation(
+            EpisodeSetup(vehicle, arena, seed, wind), start_us=0, clock=SimClock()
+        )
+        self.texts: list[tuple[int, str]] = []
+        """Time [µs] and text of everything said so far."""
+        self.ap = self.sim.autopilot
+        self.ap.on_message = lambda m: self.texts.append((self.sim.time_us, m.text))
+        self._setpoint: Setpoint | None = None
+        self._next_us = 0
+
+    @property
+    def time_s(self) -> float:
+        return self.sim.time_us / US_PER_S
+
+    @property
+    def truth(self) -> Truth:
+        return self.sim.truth
+
+    @property
+    def height(self) -> float:
+        """True height of the body's underside above the floor [m]."""
+        return -float(self.truth.position[2]) - 0.5 * quad().body.height_m
+
+    @property
+    def mode(self) -> Mode:
+        return self.ap.flight.mode
+
+    def stream(self, setpoint: Setpoint | None) -> None:
+        """Offer a setpoint now and at 20 Hz from now on; None = fall silent."""
+        self._setpoint, self._next_us = setpoint, self.sim.time_us
+
+    def tick(self) -> None:
+        if self._setpoint is not None and self.sim.time_us >= self._next_us:
+            self.ap.offer_setpoint(self._setpoint, self.sim.time_us)
+            self._next_us += SETPOINT_US
+        self.sim.tick()
+
+    def run(self, seconds: float, each: Callable[[], None] | None = None) -> None:
+        """Fly on for some time, calling `each` after every tick."""
+        for _ in range(round(seconds * US_PER_S / TICK_US)):
+            self.tick()
+            if each is not None:
+                each()
+
+    def until(self, reached: Callable[[], bool], limit_s: float) -> float:
+        """Fly until something is so; return the time [s] it took. Fails after `limit_s`."""
+        began = self.sim.time_us
+        while not reached():
+            if self.sim.time_us - began > limit_s * US_PER_S:
+                raise AssertionError(f"not within {limit_s} s; said: {self.texts}")
+            self.tick()
+        return (self.sim.time_us - began) / US_PER_S
+
+    def said(self, text: str) -> float:
+        """Return when [s] a text was last said; NaN when never."""
+        return max((t / US_PER_S for t, said in self.texts if text in said), default=NAN)
+
+    def boot(self) -> None:
+        """Wait until the vehicle may be armed."""
+        self.until(lambda: self.ap.flight.phase > 0, 30.0)
+
+    def arm(self) -> None:
+        self.boot()
+        assert self.ap.arm(force=False) is Result.ACCEPTED
+
+    def take_off(self, altitude_m: float = 5.0, settle_s: float = 4.0) -> None:
+        """Arm, climb and come to rest in hold."""
+        self.arm()
+        assert self.ap.takeoff(altitude_m) is Result.ACCEPTED
+        self.until(lambda: self.mode is Mode.HOLD, 60.0)
+        # Hold climbs the rest: PX4's take-off is over within NAV_MC_ALT_RAD of its altitude.
+        self.until(lambda: self.height > altitude_m - 0.35, 20.0)
+        self.run(settle_s)
+
+    def go_offboard(self, setpoint: Setpoint) -> None:
+        self.stream(setpoint)
+        self.tick()
+        assert self.ap.set_mode(Mode.OFFBOARD) is Result.ACCEPTED
+
+    def close(self) -> None:
+        self.sim.close()
+
+
+@contextmanager
+def flight(seed: int = 0, **settings: Any):
+    """Make a Rig and release it afterwards."""
+    rig = Rig(seed, **settings)
+    try:
+        yield rig
+    finally:
+        rig.close()

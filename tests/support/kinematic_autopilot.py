@@ -1,0 +1,285 @@
+"""An autopilot for wire-level tests: perfect knowledge, no dynamics worth the name.
+
+It implements `AutopilotPort` with PX4's refusals and texts, so that MAVLink services can be
+tested without an estimator, a controller or a plant.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
+from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
+from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.state import (
+    Arming,
+    AutopilotState,
+    CommanderStatus,
+    Estimate,
+    Landed,
+    Message,
+    Mode,
+    Result,
+    Setpoint,
+    Severity,
+    Vector,
+)
+from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
+
+ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
+READY_US = 100_000
+VELOCITY_GAIN = 5.0
+LAND_SPEED_M_S = 4.0
+FALLBACK_SPEED_M_S = 0.75
+NOTHING = np.full(3, math.nan)
+
+DEFAULT_PARAMETERS: dict[str, int | float] = {
+    "COM_OBL_RC_ACT": 0,
+    "COM_OF_LOSS_T": 1.0,
+    "MIS_TAKEOFF_ALT": 2.5,
+    "MPC_XY_VEL_MAX": 12.0,
+    "NAV_DLL_ACT": 0,
+    "SYS_AUTOSTART": 4001,
+    "TEST_NEGATIVE": -1,
+    "TEST_SIGNALLING": -5_000_000,  # as a float: a signalling NaN
+}
+LIMITS = {"MIS_TAKEOFF_ALT": (0.0, 80.0)}
+
+
+class Parameters:
+    """A parameter store: names sorted, values clamped."""
+
+    def __init__(self, values: dict[str, int | float] | None = None) -> None:
+        self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
+
+    @property
+    def _names(self) -> list[str]:
+        return sorted(self.values)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def by_name(self, name: str) -> ParameterValue | None:
+        if name not in self.values:
+            return None
+        return ParameterValue(name, self.values[name], self._names.index(name))
+
+    def by_index(self, index: int) -> ParameterValue | None:
+        if not 0 <= index < len(self._names):
+            return None
+        return self.by_name(self._names[index])
+
+    def set(self, name: str, value: int | float) -> ParameterValue | None:
+        if name not in self.values:
+            return None
+        low, high = LIMITS.get(name, (-math.inf, math.inf))
+        kind = type(self.values[name])
+        self.values[name] = kind(min(max(value, low), high))
+        return self.by_name(name)
+
+
+class KinematicAutopilot:
+    """Velocity follows the setpoint with a first-order lag; attitude is level."""
+
+    def __init__(self, parameters: Parameters | None = None, start_us: int = 0) -> None:
+        self.parameters = parameters or Parameters()
+        self.time_us = start_us
+        self.ready_us = start_us + READY_US
+        self.position = np.zeros(3)
+        self.velocity = np.zeros(3)
+        self.acceleration = np.zeros(3)
+        self.roll = self.pitch = self.yaw = 0.0
+        self.yaw_rate = 0.0
+        self.arming = Arming.BOOT
+        self.mode = Mode.HOLD
+        self.landed = Landed.ON_GROUND
+        self.failsafe = False
+        self.home: Geodetic | None = None
+        self.origin: Geodetic | None = None
+        self.battery = BatterySample(15.8, 12.34, 456.0, 0.83)
+        self.mag = np.array([0.21, 0.01, 0.43])
+        self.accel = np.array([0.1, -0.2, -GRAVITY_M_S2])
+        self.gyro = np.zeros(3)
+        self.setpoints: list[tuple[Setpoint, int]] = []
+        self.gcs_heartbeats: list[int] = []
+        self.takeoffs: list[float | None] = []
+        self.commands: list[str] = []
+        self.messages: list[Message] = []
+        self.offboard_loss_us = US_PER_S
+        self.frozen = False
+        """Only time passes: lets a test read what it has set."""
+        self._target_height = 0.0
+
+    # --- the port ---
+
+    @property
+    def sample(self) -> SensorSample:
+        return SensorSample(self.time_us, self.accel, self.gyro, 25.31, self.battery)
+
+    def take_messages(self) -> list[Message]:
+        taken, self.messages = self.messages, []
+        return taken
+
+    def arm(self, *, force: bool) -> Result:
+        self.commands.append(f"arm force={force}")
+        if self.arming is Arming.BOOT or (self.mode is Mode.OFFBOARD and not self._fresh()):
+            self._say(Severity.CRITICAL, "Arming denied: Resolve system health failures first")
+            return Result.TEMPORARILY_REJECTED
+        if self.arming is not Arming.ARMED:
+            self.arming = Arming.ARMED
+            self._say(Severity.INFO, "Armed by external command")
+        return Result.ACCEPTED
+
+    def disarm(self, *, force: bool) -> Result:
+        self.commands.append(f"disarm force={force}")
+        if self.landed is not Landed.ON_GROUND and not force:
+            self._say(Severity.CRITICAL, "Disarming denied: not landed")
+            return Result.TEMPORARILY_REJECTED
+        if self.arming is Arming.ARMED:
+            self.arming = Arming.STANDBY
+        return Result.ACCEPTED
+
+    def takeoff(self, altitude_m: float | None) -> Result:
+        self.takeoffs.append(altitude_m)
+        default = float(self.parameters.values["MIS_TAKEOFF_ALT"])
+        self._target_height = default if altitude_m is None else altitude_m
+        self.mode = Mode.TAKEOFF
+        return Result.ACCEPTED
+
+    def set_mode(self, mode: Mode) -> Result:
+        self.commands.append(f"mode {mode.name}")
+        in_air = self.landed is not Landed.ON_GROUND
+        if mode is Mode.POSITION or (mode is Mode.OFFBOARD and in_air and not self._fresh()):
+            name = "Offboard" if mode is Mode.OFFBOARD else "Position"
+            self._say(Severity.CRITICAL, f"Switching to {name} is currently not available")
+            return Result.TEMPORARILY_REJECTED
+        self.mode = mode
+        self.failsafe = False
+        return Result.ACCEPTED
+
+    def set_home_here(self) -> Result:
+        if self.origin is None:
+            return Result.TEMPORARILY_REJECTED
+        self.home = local_to_geodetic(self.position, self.origin)
+        return Result.ACCEPTED
+
+    def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
+        self.setpoints.append((setpoint, time_us))
+
+    def gcs_heartbeat(self, time_us: int) -> None:
+        self.gcs_heartbeats.append(time_us)
+
+    def state(self) -> AutopilotState:
+        zero = np.zeros(3)
+        estimate = Estimate(
+            time_us=self.time_us,
+            position=self.position,
+            velocity=self.velocity,
+            acceleration=self.acceleration,
+            quaternion=quat_from_euler(self.roll, self.pitch, self.yaw),
+            angular_velocity=np.array([0.0, 0.0, self.yaw_rate]),
+            gyro_bias=np.array([0.001, 0.002, 0.003]),
+            accel_bias=np.array([0.01, 0.02, 0.03]),
+            sigma=np.arange(1.0, 16.0) / 100.0,
+            innovation_ratio=np.array([0.1, 0.2, 0.3, 0.4]),
+            healthy=self.arming is not Arming.BOOT,
+        )
+        fix = None
+        if self.origin is not None:
+            here = local_to_geodetic(self.position, self.origin)
+            fix = GpsFix(here, self.velocity, eph_m=0.9, epv_m=1.8, satellites=10)
+        return AutopilotState(
+            time_us=self.time_us,
+            estimate=estimate,
+            status=CommanderStatus(
+                self.arming, self.mode, self.mode, self.landed, failsafe=self.failsafe
+            ),
+            setpoint=self._tracked(),
+            attitude_setpoint=estimate.quaternion,
+            rate_setpoint=zero,
+            thrust_setpoint=0.5,
+            motors=(0.0, 0.25, 0.5, 1.0),
+            accel=self.accel,
+            gyro=self.gyro,
+            mag=self.mag,
+            pressure_hpa=954.61,
+            temperature_c=25.31,
+            battery=self.battery,
+            gps=fix,
+            home=self.home,
+            origin=self.origin,
+            load=0.123,
+        )
+
+    # --- flying ---
+
+    def step(self) -> None:
+        """Advance by one tick."""
+        self.time_us += TICK_US
+        if self.frozen:
+            return
+        if self.arming is Arming.BOOT and self.time_us >= self.ready_us:
+            self.arming = Arming.STANDBY
+            self.origin = self.home = ORIGIN
+        if self.mode is Mode.OFFBOARD and self.arming is Arming.ARMED and not self._fresh():
+            self.mode, self.failsafe = Mode.POSITION, True
+            self._say(Severity.CRITICAL, "Failsafe activated")
+        elif self.failsafe and self._fresh():
+            self.mode, self.failsafe = Mode.OFFBOARD, False
+        wanted = self._velocity() if self.arming is Arming.ARMED else np.zeros(3)
+        self.acceleration = VELOCITY_GAIN * (wanted - self.velocity)
+        self.velocity = self.velocity + self.acceleration * TICK_S
+        self.position = self.position + self.velocity * TICK_S
+        self.yaw = wrap_pi(self.yaw + self.yaw_rate * TICK_S)
+        self._update_landed()
+
+    def _velocity(self) -> Vector:
+        height = -float(self.position[2])
+        self.yaw_rate = 0.0
+        if self.mode is Mode.TAKEOFF:
+            if height > self._target_height - 0.1:
+                self.mode = Mode.HOLD
+            return np.array([0.0, 0.0, -3.0 * min(1.0, self._target_height - height + 0.1)])
+        if self.mode in (Mode.LAND, Mode.RETURN):
+            return np.array([0.0, 0.0, LAND_SPEED_M_S])
+        if self.mode is Mode.POSITION:
+            return np.array([0.0, 0.0, FALLBACK_SPEED_M_S])
+        if self.mode is Mode.OFFBOARD:
+            setpoint = self.setpoints[-1][0]
+            if math.isfinite(setpoint.yaw_rate):
+                self.yaw_rate = setpoint.yaw_rate
+            if math.isfinite(setpoint.yaw):
+                self.yaw = setpoint.yaw
+            error = np.nan_to_num(setpoint.position - self.position)
+            return np.asarray(np.nan_to_num(setpoint.velocity) + np.clip(error, -5.0, 5.0))
+        return np.zeros(3)
+
+    def _update_landed(self) -> None:
+        if self.position[2] >= 0.0 and self.velocity[2] >= 0.0:
+            self.position[2], self.velocity[2] = 0.0, 0.0
+            if self.landed is not Landed.ON_GROUND:
+                self.landed = Landed.ON_GROUND
+                self.arming = Arming.STANDBY
+                self._say(Severity.INFO, "Disarmed by landing")
+        elif self.mode is Mode.TAKEOFF:
+            self.landed = Landed.TAKEOFF
+        elif self.mode is Mode.LAND:
+            self.landed = Landed.LANDING
+        else:
+            self.landed = Landed.IN_AIR
+
+    def _tracked(self) -> Setpoint:
+        if self.mode is Mode.OFFBOARD and self.setpoints:
+            return self.setpoints[-1][0]
+        return Setpoint(NOTHING, np.zeros(3), math.nan, math.nan)
+
+    def _fresh(self) -> bool:
+        return bool(self.setpoints) and self._setpoint_age_us() < self.offboard_loss_us
+
+    def _setpoint_age_us(self) -> int:
+        return self.time_us - self.setpoints[-1][1]
+
+    def _say(self, severity: Severity, text: str) -> None:
+        self.messages.append(Message(severity, text))

@@ -1,0 +1,92 @@
+"""The companion needs nothing that a Raspberry Pi has no use for."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.processes import ROOT
+
+HEAVY = (
+    "airl_mav.arena",
+    "airl_mav.core.kernels",
+    "filterpy",
+    "firmware_sim",
+    "gymnasium",
+    "jinja2",
+    "matplotlib",
+    "numba",
+    "onnx",
+    "onnxruntime",  # only with a learned policy
+    "pybullet",
+    "pymavlink",
+    "scipy",
+    "stable_baselines3",
+    "torch",
+)
+
+BLOCK = f"""
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if any(name == heavy or name.startswith(heavy + ".") for heavy in {HEAVY}):
+            raise ImportError(f"{{name}} is not for the companion")
+
+sys.meta_path.insert(0, Absent())
+"""
+
+EVERY_MODULE = """
+import importlib, pkgutil
+import companion
+names = [m.name for m in pkgutil.walk_packages(companion.__path__, "companion.")]
+assert len(names) >= 5, names
+for name in names:
+    importlib.import_module(name)
+"""
+
+COMMAND = """
+import companion.mission, airl_mav.cli.companion as cli
+command = cli.CompanionCommand(policy="greedy", computer="ras-pi-4", workload="template-5x32")
+cli.check(command)
+assert cli.sampler(command, 1).sample_us() > 300_000
+from airl_mav.policy.registry import load_policy
+load_policy(command.policy, 0.5)
+"""
+
+REPORT = f"""
+import sys
+found = sorted(set({HEAVY}) & set(sys.modules))
+assert not found, found
+"""
+
+
+@pytest.mark.parametrize("block", ["", BLOCK], ids=["looked for", "blocked"])
+@pytest.mark.parametrize("work", ["import companion\n", EVERY_MODULE, COMMAND])
+def test_imports_nothing_heavy(tmp_path: Path, work: str, block: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", block + work + REPORT],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_check_itself_can_fail(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", BLOCK + "import airl_mav.arena.generate\n"],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert "is not for the companion" in done.stderr

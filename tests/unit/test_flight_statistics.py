@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import aggregate, bootstrap_mean, wilson
+from tests.support.run_demo import demo_arena, demo_episode
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 5), (5, 5), (3, 10), (91, 100)])
+def test_wilson_is_the_closed_form(k: int, n: int) -> None:
+    """Roots of (p - k/n)² = z² p (1 - p) / n."""
+    z = 1.959963984540054
+    centre = (k / n + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(k / n * (1 - k / n) / n + z * z / (4 * n * n))
+    estimate = wilson(k, n)
+    assert (estimate.value, estimate.n) == (k / n, n)
+    assert estimate.low == pytest.approx(centre - half, abs=1e-12)
+    assert estimate.high == pytest.approx(centre + half, abs=1e-12)
+
+
+def test_the_bootstrap_of_many_values_is_the_normal_interval() -> None:
+    values = np.random.default_rng(2).normal(25.0, 4.0, 400)
+    estimate = bootstrap_mean(values)
+    half = 1.96 * values.std(ddof=1) / math.sqrt(400)
+    assert estimate.value == pytest.approx(values.mean())
+    assert estimate.low == pytest.approx(values.mean() - half, abs=0.1 * half)
+    assert estimate.high == pytest.approx(values.mean() + half, abs=0.1 * half)
+    assert bootstrap_mean(values) == estimate
+
+
+def test_too_few_values_to_resample() -> None:
+    assert bootstrap_mean([]).value is None
+    one = bootstrap_mean([3.0])
+    assert (one.value, one.low, one.high, one.n) == (3.0, None, None, 1)
+    same = bootstrap_mean([2.0, 2.0, 2.0])
+    assert (same.value, same.low, same.high) == (2.0, 2.0, 2.0)
+    two = bootstrap_mean([1.0, 3.0])
+    assert two.low is not None
+    assert two.high is not None
+    assert 1.0 <= two.low < two.high <= 3.0
+    assert wilson(0, 0).value is None
+
+
+@pytest.fixture(scope="module")
+def episode() -> EpisodeRecord:
+    record, _, _ = demo_episode(1, demo_arena(2))
+    assert record.outcome is Outcome.SUCCESS
+    return record
+
+
+def test_only_successes_enter_the_means_and_aborts_enter_nothing(episode: EpisodeRecord) -> None:
+    assert episode.quality is not None
+    longer = replace(episode.quality, flight_time_s=episode.quality.flight_time_s + 2.0)
+    absurd = replace(episode.quality, flight_time_s=1e6, distance_m=1e6, energy_j=1e9)
+    figures = aggregate(
+        [
+            episode,
+            replace(episode, quality=longer),
+            replace(episode, outcome=Outcome.COLLISION, quality=absurd),
+            replace(episode, outcome=Outcome.ABORTED, quality=absurd),
+            replace(episode, outcome=Outcome.TIMEOUT, quality=None),
+        ]
+    )
+    assert figures.success_rate.value == 0.5
+    assert figures.success_rate.n == 4
+    assert figures.flight_time_s.value == pytest.approx(episode.quality.flight_time_s + 1.0)
+    assert figures.flight_time_s.n == 2
+    assert figures.distance_m.value == pytest.approx(episode.quality.distance_m)
+    assert figures.outcomes == {
+        Outcome.SUCCESS: 2,
+        Outcome.COLLISION: 1,
+        Outcome.TIMEOUT: 1,
+        Outcome.BATTERY: 0,
+        Outcome.ABORTED: 1,
+    }
+
+
+def test_no_flight_at_all_has_no_figures() -> None:
+    figures = aggregate([])
+    assert figures.success_rate.value is None
+    assert figures.energy_j.value is None
