@@ -41,7 +41,6 @@ from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.plant import Plant
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -169,7 +168,7 @@ def flight(
         child = FirmwareChild("PX4", start, folder, folder / "px4.txt")
         try:
             bridge.wait_connected(60.0, child.check)
-            setup = EpisodeSetup(vehicle, None, 1, WindSettings())
+            setup = EpisodeSetup(vehicle, None, 1)
             simulation = Simulation(setup, start_us=4000, clock=SimClock(), autopilot=Flown(bridge))
 
             def tick() -> None:

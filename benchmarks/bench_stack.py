@@ -40,7 +40,6 @@ from firmware_sim.mavlink.link import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 FLIGHT_S = 30.0
@@ -146,7 +145,7 @@ def hover(
     begins: Callable[[], None] = lambda: None,
 ) -> Timed:
     """Fly slowly by setpoints; the links' frames are packed and thrown away."""
-    setup = EpisodeSetup(vehicle, None, 1, WindSettings())
+    setup = EpisodeSetup(vehicle, None, 1)
     simulation = Simulation(setup, start_us=0, clock=SimClock())
     pilot = simulation.autopilot
     for _ in range(round(2.0 / TICK_S)):

@@ -10,6 +10,8 @@ import zmq
 
 from airl_mav.camera.frame import Frame, FrameError
 from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.errors import FieldError
+from airl_mav.scenario.model import GREATEST_PORT
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,7 @@ class ZmqFrameSource:
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
-            raise ValueError(
-                f"camera endpoint {endpoint!r}: {error}; accepted: tcp://HOST:PORT, ipc://PATH"
-            ) from error
+            raise ValueError(f"{error}; accepted: tcp://HOST:PORT, ipc://PATH") from error
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame so far, without waiting; None before the first."""
@@ -111,3 +111,15 @@ class ZmqFrameSource:
         self._socket.close(linger=0)
         if self._owns_context:
             self._context.term()
+
+
+def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
+    """Connect to the camera at a ZeroMQ address. Raises FieldError for an unusable address."""
+    port = endpoint.rpartition(":")[2]
+    # libzmq would cut the number to 16 bits without a word.
+    if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
+        raise FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
+    try:
+        return ZmqFrameSource(endpoint, clock)
+    except ValueError as error:
+        raise FieldError("camera", endpoint, f"{error}") from None

@@ -6,7 +6,6 @@ Sequential, as in the paper: while the next decision is computed, the last comma
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action, Policy, limited, vertical_speed
 from airl_mav.policy.observation import Kinematics, encode
+from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource
 from companion.interfaces import BodyVelocity, Link
 from companion.watchdog import Watchdog
@@ -26,20 +26,6 @@ FRAME_WAIT_S = 0.1
 
 WAITING = "waiting for a frame"
 """What the pilot tells the watchdog that it is at."""
-
-
-@dataclass(frozen=True)
-class PilotSettings:
-    """How a policy is flown."""
-
-    hold_s: float = 0.5
-    """t3: how long an action is held before the next observation [s]."""
-    goal_radius_m: float = 2.0
-    """The goal is reached closer than this, seen from above [m]."""
-    altitude_m: float = 2.5
-    """Height above the start that is held [m]."""
-    max_speed_m_s: float = 5.0
-    """Horizontal speed limit of all actions [m/s]."""
 
 
 class Pilot:

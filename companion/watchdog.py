@@ -14,24 +14,11 @@ defence, each for the case that the one before cannot see:
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.scenario.model import WatchdogSettings
 from companion.interfaces import STOP, BodyVelocity, Link, LinkError
-
-
-@dataclass(frozen=True)
-class WatchdogSettings:
-    """Bounds, in seconds of simulated time."""
-
-    decision_timeout_s: float = 2.0
-    """Time since the last action after which the velocity is zeroed."""
-    leave_after_s: float = 2.0
-    """Further time after which offboard is left."""
-    hover_after_s: float | None = None
-    """Zero the velocity so long after an action's hold time has run out, decision or not: AirSim's
-    semantics (0.06 s there). None = the last setpoint persists, PX4's and MAVSDK's semantics."""
 
 
 class Watchdog:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,9 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.files import save_arrays
 from airl_mav.flight.trajectory import TrajectoryRecorder
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.filters import FilterName, filter_named
+from firmware_sim.autopilot.filters import filter_named
 from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.autopilot.state import Estimate, Setpoint
 from firmware_sim.flight_controller import FlightController
@@ -26,7 +27,6 @@ from firmware_sim.interfaces import SensorSample, Truth
 from firmware_sim.plant.camera_server import DepthCamera
 from firmware_sim.plant.kinematics import POSE, POSITION, QUATERNION
 from firmware_sim.plant.plant import Plant
-from firmware_sim.plant.wind import WindSettings
 
 NEVER_US = sys.maxsize
 """Later than any simulated time [µs]."""
@@ -41,9 +41,8 @@ class EpisodeSetup:
     """None = an endless floor."""
     seed: int
     """Of sensors and wind."""
-    wind: WindSettings
-    filter: FilterName = "kernel"
-    """What carries the estimator's covariance."""
+    aircraft: Aircraft = field(default_factory=Aircraft)
+    """What was asked of it: wind, estimator."""
 
 
 class SetpointLog:
@@ -96,7 +95,7 @@ class SetpointLog:
 def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
     """Boot the built-in autopilot. Raises UsageError for a wrong parameter of the vehicle's."""
     parameters = Parameters(setup.vehicle.autopilot_parameters())
-    return BuiltinAutopilot(parameters, filter_named(setup.filter))
+    return BuiltinAutopilot(parameters, filter_named(setup.aircraft.estimator))
 
 
 class Simulation:
@@ -113,7 +112,7 @@ class Simulation:
         """Put the vehicle at the start.
 
         Args:
-            setup: Vehicle, arena, seed, wind.
+            setup: Vehicle, arena, seed, and what was asked of the aircraft.
             start_us: Simulated time of the first sample [µs], a multiple of the tick.
             clock: Read for stamps only; time moves by `tick`.
             autopilot: Who flies, just booted; None = the built-in autopilot, booted here.
@@ -128,7 +127,7 @@ class Simulation:
             setup.arena,
             rng,
             start_us=start_us,
-            wind=setup.wind,
+            aircraft=setup.aircraft,
             rate_hz=self.autopilot.rate_hz,
         )
         self.autopilot.see(self.plant.truth)

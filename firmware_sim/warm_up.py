@@ -14,7 +14,6 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 TICKS = 400
@@ -25,7 +24,7 @@ def warm_up(vehicle: VehicleProfile) -> None:
     """Fly a moment in simulated time, through everything a real flight uses."""
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
-    setup = EpisodeSetup(vehicle, arena, 0, WindSettings())
+    setup = EpisodeSetup(vehicle, arena, 0)
     autopilot = builtin_autopilot(setup)
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]

@@ -16,12 +16,12 @@ from rich.console import Console
 from airl_mav.cli.common import EXIT_INTERRUPTED
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.report.matrix import MATRIX_FILE
 from airl_mav.report.tables import OUTCOME_WORDS
+from airl_mav.scenario.model import Ports
 
 if TYPE_CHECKING:
     from airl_mav.cli.evaluate_task import Task

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
+from airl_mav.scenario.model import Ports
 
 if TYPE_CHECKING:  # The companion shares this module, and not the simulator.
-    from firmware_sim.plant.wind import WindSettings
+    from airl_mav.scenario.model import WindSettings
 
 EXIT_BROKEN = 1
 """The run could not be finished: a flight lost its processes, or its worker, too often."""

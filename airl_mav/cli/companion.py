@@ -28,11 +28,11 @@ from airl_mav.cli.companion_service import serve
 from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.files import save_arrays
+from airl_mav.scenario.model import PilotSettings
 from companion.conducted import Abandoned
 from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.pilot import PilotSettings
 
 
 def main() -> None:

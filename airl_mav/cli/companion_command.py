@@ -27,10 +27,9 @@ from airl_mav.latency.source import select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
 from companion.link import MavsdkLink
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
 
 GREATEST_THREADS = 64
 

@@ -17,7 +17,7 @@ from airl_mav.rehearsal.evaluation import Evaluation, Job
 from airl_mav.rehearsal.evaluation_lockstep import Fly, LockstepRun
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.rehearsal.workers import GREATEST_WORKERS
-from companion.pilot import PilotSettings
+from airl_mav.scenario.model import PilotSettings
 from firmware_sim.warm_up import warm_up
 
 OF_THE_COMMAND = ("vehicle", "arena", "computer", "workload")

@@ -28,7 +28,7 @@ from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.rehearsal.workers import WorkerError
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
-from companion.watchdog import WatchdogSettings
+from airl_mav.scenario.model import WatchdogSettings
 
 FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]
 """Flies what is left into a folder that holds some episodes already."""

@@ -11,7 +11,7 @@ import tyro
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName
 from airl_mav.policy.layouts import LayoutName
-from companion.pilot import PilotSettings
+from airl_mav.scenario.model import PilotSettings
 
 
 @dataclass(frozen=True)

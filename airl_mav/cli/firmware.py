@@ -39,12 +39,13 @@ from airl_mav.cli.firmware_service import Bench, Service, WallBench, unix_us
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK, Ports
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.lockstep.errors import LockstepError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.rehearsal.channel import ChildChannel, Failed, LoadEpisode, Ready, Shutdown
+from airl_mav.scenario.model import Ports, WindSettings
 from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware
@@ -52,7 +53,6 @@ from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.mavlink.px4_links import Px4Ends, px4_ends, px4_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
 

@@ -9,9 +9,9 @@ from typing import Literal, Protocol
 
 from airl_mav.cli.common import check_range
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.flight.setup import BUILT_IN
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Ports
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.px4 import program as px4_program
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import tyro
 
-from airl_mav.core.ports import Ports
+from airl_mav.scenario.model import Ports
 
 DEFAULT_MITIGATED = "static-obstacles-ras-pi-4"
 """The shipped policy that was trained as late as the paper's Raspberry Pi decides."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from airl_mav.core.ports import Ports
+from airl_mav.scenario.model import Ports
 
 LevelName = Literal["gym", "lockstep", "sitl"]
 

@@ -17,7 +17,7 @@ from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.pilot import PilotSettings
+from airl_mav.scenario.model import PilotSettings
 
 
 def lockstep_plan(command: SitlCommand, setup: Setup, pilot: PilotSettings) -> LockstepPlan:

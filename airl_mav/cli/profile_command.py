@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from airl_mav.core.ports import Ports
 from airl_mav.policy.runtime import RuntimeName
+from airl_mav.scenario.model import Ports
 
 ProfileLevel = Literal["bare", "sitl", "hil"]
 

@@ -29,7 +29,7 @@ from airl_mav.profiles.computer import ComputerProfile, Network
 from airl_mav.profiles.computer_file import existing_profile
 from airl_mav.profiles.loading import explain, list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from companion.pilot import PilotSettings
+from airl_mav.scenario.model import PilotSettings
 
 FLOWN_HOLD_S = 0.05
 """t3 while stages are measured in flight [s]: 1,000 decisions are over in less than two minutes."""

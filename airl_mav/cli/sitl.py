@@ -38,7 +38,7 @@ from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import RichObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RUN_FILE, RunFolder
-from companion.pilot import PilotSettings
+from airl_mav.scenario.model import PilotSettings
 
 LEAVES_RESULTS_ALONE = ("ports",)
 """Settings that may change when a run is taken up again."""

@@ -31,7 +31,6 @@ from airl_mav.cli.firmware_options import (
     check_program,
 )
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.envs.spec import Delay
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Level, Part, Setup
@@ -44,10 +43,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
+from airl_mav.scenario.model import PilotSettings, Ports, WatchdogSettings, WindSettings
 from firmware_sim.autopilot.filters import FilterName
-from firmware_sim.plant.wind import WindSettings
 
 ARRIVAL_SHARE = 0.8
 """The companion flies to this share of the goal radius: it knows its place only by estimate, while

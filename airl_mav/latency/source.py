@@ -15,7 +15,13 @@ from pydantic import ValidationError
 
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.injection import Injection, choose_injection, moments
-from airl_mav.profiles.computer import LONGEST_MS, Latency, load_computer, read_samples
+from airl_mav.profiles.computer import (
+    LONGEST_MS,
+    ComputerProfile,
+    Latency,
+    load_computer,
+    read_samples,
+)
 from airl_mav.profiles.loading import explain, list_profiles
 
 ACCEPTED = (
@@ -33,7 +39,7 @@ _MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3}
 
 def select_injection(
     source: str | None,
-    computer: str,
+    computer: ComputerProfile,
     workload: str | None,
     *,
     policy_sha256: str | None = None,
@@ -44,7 +50,7 @@ def select_injection(
 
     Args:
         source: See above; None: as `choose_injection` has it.
-        computer: Computer profile to fly as: a name, or a path.
+        computer: Computer profile to fly as.
         workload: See `choose_injection`.
         policy_sha256: See `choose_injection`.
         macs: See `choose_injection`.
@@ -54,9 +60,7 @@ def select_injection(
         UsageError: There is no such source, computer or workload, or both are given.
     """
     if source is None:
-        return choose_injection(
-            load_computer(computer), workload, policy_sha256=policy_sha256, macs=macs
-        )
+        return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
     if workload is not None:
         raise UsageError(f"{option} {source} with --workload {workload}: accepted: one of them")
     return parse_latency(source, option)

@@ -10,55 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from airl_mav.arena.generate import generate
-from airl_mav.flight.judge import Referee, Task, Verdict
+from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.injection import Injection
-from airl_mav.latency.samplers import FixedSampler, latency_generator
 from airl_mav.lockstep.digest import FlightDigest, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.stage import Stage
 from airl_mav.policy.actions import Policy
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.episode import join_stamps, judged_record
-from airl_mav.rehearsal.following import Follower, Order
 from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.rehearsal.supervisor import Order, Supervisor
+from airl_mav.scenario.resolved import TRANSPORT_US, ResolvedScenario
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
-from firmware_sim.autopilot.filters import FilterName
 from firmware_sim.autopilot.state import Message
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
-
-
-@dataclass(frozen=True)
-class LockstepPlan:
-    """What is flown on what; plain data, for worker processes too."""
-
-    vehicle: VehicleProfile
-    arena_name: str
-    arena: ArenaSpec
-    wind: WindSettings
-    pilot: PilotSettings
-    watchdog: WatchdogSettings
-    injection: Injection
-    native_t2_us: int
-    """t2 where nothing is injected: here no machine's own time counts [µs]."""
-    transport_us: int
-    """t1 without the wait for the frame: exposure to decoded [µs]."""
-    goal_radius_m: float
-    """The referee's."""
-    time_limit_s: float
-    computer_watts: float
-    speed: float | None = None
-    """Greatest number of simulated seconds per wall second; None: as fast as it goes."""
-    estimator: FilterName = "kernel"
-    """What carries the estimator's covariance."""
-    latency_draw: int = 0
-    """See `samplers.latency_generator`."""
-    arena_seed: int | None = None
-    """Of the arena of all episodes; None: each one's own seed."""
 
 
 @dataclass
@@ -76,7 +40,7 @@ class Watching:
 
 
 def fly(
-    plan: LockstepPlan,
+    resolved: ResolvedScenario,
     policy: Policy,
     index: int,
     seed: int,
@@ -84,10 +48,10 @@ def fly(
     tlog: Path | None = None,
     watching: Watching | None = None,
 ) -> FlownEpisode:
-    """Fly one episode; the same plan, policy and seed give the same flight, bit by bit.
+    """Fly one episode; the same scenario, policy and seed give the same flight, bit by bit.
 
     Args:
-        plan: What is flown on what.
+        resolved: The scenario.
         policy: What decides, as it begins a flight.
         index: Number of the episode in its run.
         seed: Of arena, sensors, wind and latency.
@@ -98,36 +62,36 @@ def fly(
         UsageError: The policy cannot use the camera; no arena can be made of the seed.
         LockstepError: The companion hangs, or broke.
     """
-    return _Flight(plan, policy, seed, watching or Watching()).fly(index, tlog)
+    return _Flight(resolved, policy, seed, watching or Watching()).fly(index, tlog)
 
 
 class _Flight:
     """The parts of one flight."""
 
-    def __init__(self, plan: LockstepPlan, policy: Policy, seed: int, watching: Watching) -> None:
-        self._plan, self._policy, self._seed = plan, policy, seed
+    def __init__(
+        self, resolved: ResolvedScenario, policy: Policy, seed: int, watching: Watching
+    ) -> None:
+        self._resolved, self._policy, self._seed = resolved, policy, seed
         self._watching = watching
-        self._arena_seed = seed if plan.arena_seed is None else plan.arena_seed
+        self._arena_seed = resolved.scenario.arena_seed_of(seed)
         self._arena = generate(
-            plan.arena,
+            resolved.arena,
             self._arena_seed,
-            name=plan.arena_name,
-            vehicle_width_m=plan.vehicle.body.width_m,
+            name=resolved.scenario.arena,
+            vehicle_width_m=resolved.vehicle.body.width_m,
         )
         self._goal = (float(self._arena.goal[0]), float(self._arena.goal[1]))
         self._digest = FlightDigest()
         self._stop = threading.Event()
-        self._follower = Follower(
-            Referee(Task(self._goal, plan.goal_radius_m, plan.time_limit_s)), 0
-        )
-        self._judge = Judge(self._follower, self._digest, order=self._order, judged=self._decided)
+        self._supervisor = Supervisor(Referee(resolved.task(self._goal)), 0)
+        self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
     def fly(self, index: int, tlog: Path | None) -> FlownEpisode:
-        plan = self._plan
-        setup = EpisodeSetup(plan.vehicle, self._arena, self._seed, plan.wind, plan.estimator)
+        resolved = self._resolved
+        setup = EpisodeSetup(resolved.vehicle, self._arena, self._seed, resolved.scenario)
         with Stage(
-            transport_us=plan.transport_us, digest=self._digest, speed=plan.speed
+            transport_us=TRANSPORT_US, digest=self._digest, speed=resolved.speed
         ) as self._stage:
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
@@ -135,15 +99,14 @@ class _Flight:
             return self._flown(index, simulation)
 
     def _begun(self, started_us: int) -> None:
-        self._follower.started_us = started_us
+        self._supervisor.started_us = started_us
         self._watching.begin(self._goal)
 
     # --- the companion's thread
 
     def _program(self) -> None:
-        plan, stage = self._plan, self._stage
+        resolved, stage = self._resolved, self._stage
         check_camera(self._policy, stage.camera, self._stop)
-        latency = plan.injection.sampler(latency_generator(self._seed, plan.latency_draw))
         self._result = fly_mission(
             stage.link,
             stage.camera,
@@ -153,10 +116,10 @@ class _Flight:
             self._stop,
             stage.abandon,
             self._announce,
-            pilot_settings=plan.pilot,
-            watchdog_settings=plan.watchdog,
+            pilot_settings=resolved.companion_pilot,
+            watchdog_settings=resolved.watchdog,
             guard=stage.clock,
-            latency=latency or FixedSampler(plan.native_t2_us),
+            latency=resolved.latency_sampler(self._seed, native=False),
         )
 
     def _announce(self, phase: str) -> None:
@@ -185,7 +148,7 @@ class _Flight:
     def _flown(self, index: int, simulation: Simulation) -> FlownEpisode:
         result = self._result
         assert result is not None  # noqa: S101 (nothing broke)
-        referee = self._follower.referee
+        referee = self._supervisor.referee
         battery = self._judge.battery
         if referee.verdict is None:
             battery = simulation.plant.battery_remaining
@@ -206,11 +169,11 @@ class _Flight:
             referee.navigation_us,
             index=index,
             seed=self._seed,
-            arena=self._plan.arena_name,
+            arena=self._resolved.scenario.arena,
             arena_seed=self._arena_seed,
             goal=self._goal,
-            started_us=self._follower.started_us,
-            computer_watts=self._plan.computer_watts,
+            started_us=self._supervisor.started_us,
+            computer_watts=self._resolved.computer.watts,
             wall_s=None,
             slipped_us=0,
             battery_remaining=battery,

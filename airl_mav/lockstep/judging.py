@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from airl_mav.flight.judge import TruthSample, Verdict
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.rehearsal.following import Follower, Order
+from airl_mav.rehearsal.supervisor import Order, Supervisor
 from firmware_sim.crash import CrashWatch
 from firmware_sim.simulation import Simulation
 
@@ -16,7 +16,7 @@ class Judge:
 
     def __init__(
         self,
-        follower: Follower | None,
+        supervisor: Supervisor | None,
         digest: FlightDigest,
         *,
         order: Callable[[Order], None],
@@ -25,14 +25,14 @@ class Judge:
         """Nothing has been flown yet.
 
         Args:
-            follower: Knows when the flight is decided; None: nobody judges.
+            supervisor: Knows when the flight is decided; None: nobody judges.
             digest: Takes the fingerprint.
             order: Called with what the companion must be told.
             judged: Called with the verdict.
         """
         self.battery: float | None = None
         """What was left of the battery at the verdict."""
-        self._follower = follower
+        self._supervisor = supervisor
         self._digest = digest
         self._order = order
         self._judged = judged
@@ -45,14 +45,14 @@ class Judge:
 
     def begin(self, started_us: int) -> None:
         """The episode begins, at a simulated time [µs]."""
-        if self._follower is not None:
-            self._follower.started_us = started_us
+        if self._supervisor is not None:
+            self._supervisor.started_us = started_us
 
     def enter(self, phase: str, time_us: int) -> None:
         """The companion has entered a phase, at a simulated time [µs]."""
-        if self._follower is None or phase != "navigating":
+        if self._supervisor is None or phase != "navigating":
             return
-        referee = self._follower.referee
+        referee = self._supervisor.referee
         if referee.navigation_us is None:
             referee.start_navigation(time_us)
 
@@ -61,16 +61,16 @@ class Judge:
         plant = simulation.plant
         self._crash.look(simulation)
         self._digest.add("trajectory", simulation.time_us, plant.motion.tobytes())
-        follower = self._follower
-        if follower is None:
+        supervisor = self._supervisor
+        if supervisor is None:
             return
         sample = TruthSample(
             simulation.time_us, plant.position, self._crash.hit, plant.battery_remaining
         )
-        before = follower.verdict
-        order = follower.see(sample)
-        if before is None and follower.verdict is not None:
+        before = supervisor.verdict
+        order = supervisor.see(sample)
+        if before is None and supervisor.verdict is not None:
             self.battery = sample.battery_remaining
-            self._judged(follower.verdict)
+            self._judged(supervisor.verdict)
         if order is not None:
             self._order(order)

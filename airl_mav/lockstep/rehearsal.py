@@ -10,7 +10,7 @@ from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.evaluation import Job
 from airl_mav.rehearsal.rehearsal import Observer
 from airl_mav.rehearsal.run_folder import RunFolder
-from airl_mav.rehearsal.state import state_of
+from airl_mav.rehearsal.true_state import state_of
 from firmware_sim.autopilot.state import Message
 from firmware_sim.simulation import Simulation
 

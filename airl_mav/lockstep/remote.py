@@ -14,7 +14,7 @@ from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
-from airl_mav.rehearsal.following import Follower
+from airl_mav.rehearsal.supervisor import Supervisor
 from firmware_sim.firmware import BuiltinAvionics, Firmware, FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
@@ -98,12 +98,14 @@ class RemoteStage:
         """
         plan = self._plan
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
-        follower = None
+        supervisor = None
         if plan.goal_radius_m is not None and setup.arena is not None:
             goal = (float(setup.arena.goal[0]), float(setup.arena.goal[1]))
             task = Task(goal, plan.goal_radius_m, plan.time_limit_s)
-            follower = Follower(Referee(task), loaded.time_us)
-        self._judge = Judge(follower, self._digest, order=self._partner.order, judged=self._decide)
+            supervisor = Supervisor(Referee(task), loaded.time_us)
+        self._judge = Judge(
+            supervisor, self._digest, order=self._partner.order, judged=self._decide
+        )
         self._conductor.begin(loaded.time_us + COMPANION_STARTS_US)
         return loaded
 

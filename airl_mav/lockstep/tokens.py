@@ -19,7 +19,7 @@ from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.frames import datagrams, newest_heartbeat
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.turns import Turn
-from airl_mav.rehearsal.following import Order
+from airl_mav.rehearsal.supervisor import Order
 from companion.tokens import Order as Word
 from companion.tokens import Phase, TurnBack, TurnGiven
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect

@@ -15,6 +15,9 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from airl_mav.core.errors import UsageError
+from airl_mav.scenario.resolved import ResolvedScenario
+
 
 class _Line(BaseModel):
     """One message."""
@@ -26,7 +29,19 @@ class _Line(BaseModel):
         return self.model_dump_json().encode() + b"\n"
 
 
-# --- harness -> firmware
+# --- rehearsal -> both
+
+
+class Begin(_Line):
+    """What the process is to be: its first line."""
+
+    type: Literal["begin"] = "begin"
+    scenario: ResolvedScenario
+    log: str | None = None
+    """What real firmware prints goes to this file."""
+
+
+# --- rehearsal -> firmware
 
 
 class LoadEpisode(_Line):
@@ -34,10 +49,8 @@ class LoadEpisode(_Line):
 
     type: Literal["load"] = "load"
     episode: int
-    arena: str
-    arena_seed: int
     seed: int
-    """Of sensors and wind."""
+    """Of arena, sensors and wind."""
     tlog: str | None
     """Write the MAVLink log here."""
     record: str
@@ -50,7 +63,7 @@ class FinishEpisode(_Line):
     type: Literal["finish"] = "finish"
 
 
-# --- harness -> companion
+# --- rehearsal -> companion
 
 
 class Fly(_Line):
@@ -62,8 +75,8 @@ class Fly(_Line):
     """North, east [m] from the start."""
     epoch_ns: int | None
     """Host monotonic time of simulated time 0 when both share a host; None = start a clock."""
-    latency_seed: int
-    """Of the injected latency."""
+    seed: int
+    """Of the injected latency, and of random actions."""
     record: str
     """Write the decision log (.npz) here."""
 
@@ -173,7 +186,7 @@ class Failed(_Line):
 
 
 Request = Annotated[
-    LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
+    Begin | LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
     Ready | Loaded | State | Text | Saved | Progress | Ended | Failed,
@@ -216,6 +229,22 @@ class ChildChannel:
                 self._outgoing.write(event.to_line())
         except BrokenPipeError:
             return
+
+    def begin(self) -> Begin | None:
+        """Wait for what this process is to be; None when the rehearsal is gone before it said so.
+
+        Raises:
+            UsageError: The first line is something else.
+        """
+        line = self._incoming.readline()
+        if not line:
+            return None
+        try:
+            return Begin.model_validate_json(line)
+        except ValidationError as error:
+            raise UsageError(
+                f"not a scenario: {error.error_count()} errors: {line[:200]!r}"
+            ) from None
 
     def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
         """Call `handle` for every request, on a thread; `gone` when the harness is gone.

@@ -18,45 +18,14 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.following import Follower
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, RunFolder
+from airl_mav.rehearsal.supervisor import Supervisor
+from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import CAMERA_SILENT, LINK_LOST
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT)
 """Why a mission ends when both processes live but no longer hear each other: one of them stood
 still for seconds, or the host has too much to do."""
-
-
-@dataclass(frozen=True)
-class ProcessPlan:
-    """How to start one process: module and arguments."""
-
-    module: str
-    arguments: list[str]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything a rehearsal needs to know."""
-
-    firmware: ProcessPlan
-    companion: ProcessPlan
-    arena: str
-    seed: int
-    episodes: int
-    goal_radius_m: float
-    time_limit_s: float
-    speed: float
-    computer_watts: float
-    load_timeout_s: float | None = None
-    """Longest wait for the vehicle to stand ready at the start [wall s]; None: as for any answer.
-    Real firmware must be started, or is waited for."""
-    arena_seed: int | None = None
-    """Of the arena of all episodes; None: each one's own seed."""
-
-    def arena_seed_of(self, seed: int) -> int:
-        """Return the seed of the arena of an episode."""
-        return seed if self.arena_seed is None else self.arena_seed
 
 
 @dataclass
@@ -66,7 +35,7 @@ class Episode:
     index: int
     seed: int
     loaded: Loaded
-    follower: Follower
+    supervisor: Supervisor
     stopwatch: WallClock
     wall_us: int | None = None
     """Wall time from the reset to the verdict."""
@@ -80,7 +49,7 @@ class Episode:
     @property
     def referee(self) -> Referee:
         """The referee."""
-        return self.follower.referee
+        return self.supervisor.referee
 
     @property
     def separated(self) -> str | None:
@@ -97,13 +66,17 @@ class Episode:
 
 
 def save_episode(
-    episode: Episode, plan: Plan, folder: RunFolder, record_path: Path, decisions_path: Path
+    episode: Episode,
+    scenario: ResolvedScenario,
+    folder: RunFolder,
+    record_path: Path,
+    decisions_path: Path,
 ) -> EpisodeRecord:
     """Join what both processes left of an episode and save it in the run folder.
 
     Args:
         episode: The episode, judged.
-        plan: What was planned.
+        scenario: What was flown.
         folder: The run.
         record_path: The firmware's arrays; removed afterwards.
         decisions_path: The companion's decision log; may be missing; removed afterwards.
@@ -116,7 +89,7 @@ def save_episode(
         latency |= join_stamps(
             _read(decisions_path), _part(arrays, "setpoints"), arrays["tick/slips_us"]
         )
-    record = _record(episode, plan, trajectory, arrays["tick/slips_us"])
+    record = _record(episode, scenario, trajectory, arrays["tick/slips_us"])
     folder.save_episode(record, trajectory, latency)
     record_path.unlink()
     decisions_path.unlink(missing_ok=True)
@@ -124,7 +97,7 @@ def save_episode(
 
 
 def _record(
-    episode: Episode, plan: Plan, trajectory: Trajectory, slips: NDArray[np.int64]
+    episode: Episode, scenario: ResolvedScenario, trajectory: Trajectory, slips: NDArray[np.int64]
 ) -> EpisodeRecord:
     state, loaded, began_us = episode.verdict_state, episode.loaded, episode.navigating_us
     return judged_record(
@@ -134,11 +107,11 @@ def _record(
         None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
         index=episode.index,
         seed=episode.seed,
-        arena=plan.arena,
-        arena_seed=plan.arena_seed_of(episode.seed),
+        arena=scenario.scenario.arena,
+        arena_seed=scenario.scenario.arena_seed_of(episode.seed),
         goal=loaded.goal,
         started_us=loaded.time_us,
-        computer_watts=plan.computer_watts,
+        computer_watts=scenario.computer.watts,
         wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,

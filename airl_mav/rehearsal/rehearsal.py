@@ -11,10 +11,11 @@ from typing import Protocol
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.flight.judge import Referee, Task, TruthSample, Verdict
+from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import (
     Abort,
+    Begin,
     Ended,
     Event,
     FinishEpisode,
@@ -26,11 +27,13 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
-from airl_mav.rehearsal.crew import COMPANION, FIRMWARE, Crew, LostError
-from airl_mav.rehearsal.episode import Episode, Plan, save_episode
-from airl_mav.rehearsal.following import TAKEOFF_LIMIT_S, Follower, Order
-from airl_mav.rehearsal.run_folder import RunFolder
+from airl_mav.rehearsal.episode import Episode, save_episode
+from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, ProcessPair
+from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RunFolder
+from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.rehearsal.workers import TRIES
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.external.compose import load_timeout_s
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""
@@ -73,24 +76,29 @@ class Observer(Protocol):
 
 
 class Rehearsal:
-    """Runs a plan. Use as a context manager: whatever happens, both processes end."""
+    """Flies a scenario. Use as a context manager: whatever happens, both processes end."""
 
     def __init__(
-        self, plan: Plan, folder: RunFolder, observer: Observer, keeps: Sequence[int] = ()
+        self,
+        scenario: ResolvedScenario,
+        folder: RunFolder,
+        observer: Observer,
+        keeps: Sequence[int] = (),
     ) -> None:
-        """Take the plan; nothing is started yet.
+        """Take the scenario; nothing is started yet.
 
         Args:
-            plan: What is flown.
+            scenario: What is flown.
             folder: Where everything goes.
             observer: Who looks on.
             keeps: File descriptors that the processes inherit: locks.
         """
-        self._plan = plan
+        self._scenario = scenario
+        self._speed = scenario.speed or 1.0
         self._folder = folder
         self._observer = observer
         self._keeps = keeps
-        self._crew: Crew | None = None
+        self._pair: ProcessPair | None = None
 
     def __enter__(self) -> Rehearsal:
         """Return the rehearsal."""
@@ -110,17 +118,17 @@ class Rehearsal:
             UsageError: A process says that its input cannot be used.
             RehearsalError: An episode was lost too often.
         """
-        for index in range(self._plan.episodes):
+        for index, seed in enumerate(self._scenario.scenario.seeds):
             if index not in done:
-                self._fly_surely(index)
+                self._fly_surely(index, seed)
 
-    def _fly_surely(self, index: int) -> None:
+    def _fly_surely(self, index: int, seed: int) -> None:
         """Fly an episode; when it is lost, again with two new processes."""
-        flight = f"flight {index:03d}, seed {self._plan.seed + index}"
+        flight = f"flight {index:03d}, seed {seed}"
         notes: list[str] = []
         while True:
             try:
-                self._fly(index, notes)
+                self._fly(index, seed, notes)
             except LostError as error:
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
@@ -130,79 +138,78 @@ class Rehearsal:
             else:
                 return
 
-    def _present(self) -> Crew:
+    def _present(self) -> ProcessPair:
         """Return the two processes; started when there are none."""
-        if self._crew is None:
+        if self._pair is None:
             # Known before it is started: who is interrupted meanwhile still ends it.
-            self._crew = crew = Crew()
+            self._pair = pair = ProcessPair()
             self._observer.waiting("starting firmware and companion")
-            plan = self._plan
-            crew.start(plan.firmware, plan.companion, self._folder.path, self._keeps)
-        return self._crew
+            log = (self._folder.path / FIRMWARE_PRINTS).absolute()
+            begin = Begin(scenario=self._scenario, log=str(log))
+            pair.start(begin, self._folder.path, self._keeps)
+        return self._pair
 
     def _dismiss(self) -> None:
-        crew, self._crew = self._crew, None
-        if crew is not None:
-            crew.stop()
+        pair, self._pair = self._pair, None
+        if pair is not None:
+            pair.stop()
 
     # --- one episode
 
-    def _fly(self, index: int, notes: Sequence[str]) -> None:
+    def _fly(self, index: int, seed: int, notes: Sequence[str]) -> None:
         """Fly an episode and save it. Raises LostError when it is none."""
-        crew, plan, folder = self._present(), self._plan, self._folder
-        seed = plan.seed + index
+        pair, scenario, folder = self._present(), self._scenario, self._folder
         record_path = folder.path / f".episode-{index:03d}.npz"
         decisions_path = folder.path / f".decisions-{index:03d}.npz"
         for path in (record_path, decisions_path):
             path.unlink(missing_ok=True)
-        crew.send(
+        pair.send(
             FIRMWARE,
             LoadEpisode(
                 episode=index,
-                arena=plan.arena,
-                arena_seed=plan.arena_seed_of(seed),
                 seed=seed,
                 tlog=str(folder.tlog_path(index).absolute()),
                 record=str(record_path.absolute()),
             ),
         )
-        loaded = crew.wait_for(Loaded, self._look, plan.load_timeout_s)
-        task = Task(loaded.goal, plan.goal_radius_m, plan.time_limit_s)
-        follower = Follower(Referee(task), loaded.time_us)
-        episode = Episode(index, seed, loaded, follower, WallClock(), notes=list(notes))
+        loaded = pair.wait_for(Loaded, self._look, load_timeout_s(scenario.scenario))
+        supervisor = Supervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
+        episode = Episode(index, seed, loaded, supervisor, WallClock(), notes=list(notes))
         self._observer.episode(index, seed, loaded.goal)
-        crew.send(
+        pair.send(
             COMPANION,
             Fly(
                 episode=index,
                 goal=loaded.goal,
                 epoch_ns=loaded.epoch_ns,
-                latency_seed=seed,
+                seed=seed,
                 record=str(decisions_path.absolute()),
             ),
         )
-        limit_s = (TAKEOFF_LIMIT_S + plan.time_limit_s + WRAP_UP_S) / plan.speed
+        limit_s = (TAKEOFF_LIMIT_S + scenario.scenario.time_limit_s + WRAP_UP_S) / self._speed
         try:
-            crew.pump(lambda _, event: self._follow(crew, episode, event), limit_s, "the flight")
+            pair.pump(lambda _, event: self._follow(pair, episode, event), limit_s, "the flight")
         except LostError as error:
-            if not crew.lives(FIRMWARE):
+            if not pair.lives(FIRMWARE):
                 raise
             # The firmware still flies. Whatever is wrong with the companion, its setpoints end
             # here; see the failsafe through.
-            crew.stop_one(COMPANION)
-            seen = self._watch_failsafe(crew, episode)
+            pair.stop_one(COMPANION)
+            seen = self._watch_failsafe(pair, episode)
             raise LostError("; ".join((error.what, *seen)), error.detail) from None
         if (reason := episode.separated) is not None:
             raise LostError(f"firmware and companion lost each other ({reason})")
-        crew.send(FIRMWARE, FinishEpisode())
-        crew.wait_for(Saved, self._look)
-        self._observer.finished(save_episode(episode, plan, folder, record_path, decisions_path))
+        pair.send(FIRMWARE, FinishEpisode())
+        pair.wait_for(Saved, self._look)
+        self._observer.finished(
+            save_episode(episode, scenario, folder, record_path, decisions_path)
+        )
 
-    def _follow(self, crew: Crew, episode: Episode, event: Event) -> bool:
+    def _follow(self, pair: ProcessPair, episode: Episode, event: Event) -> bool:
         """Take one event of a flight; True when it is over."""
         referee = episode.referee
         if isinstance(event, State):
-            self._see(crew, episode, event)
+            self._see(pair, episode, event)
         elif isinstance(event, Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
@@ -219,18 +226,18 @@ class Rehearsal:
             return True
         return False
 
-    def _see(self, crew: Crew, episode: Episode, state: State) -> None:
+    def _see(self, pair: ProcessPair, episode: Episode, state: State) -> None:
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         judged = episode.referee.verdict is not None
-        order = episode.follower.see(
+        order = episode.supervisor.see(
             TruthSample(state.time_us, state.position, state.collision, state.battery)
         )
         verdict = episode.referee.verdict
         if verdict is not None and not judged:
             self._judge(episode, verdict)
         if order is not None:
-            crew.send(COMPANION, Abort(land=order is Order.LAND))
+            pair.send(COMPANION, Abort(land=order is Order.LAND))
 
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
@@ -238,7 +245,7 @@ class Rehearsal:
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
-    def _watch_failsafe(self, crew: Crew, episode: Episode) -> list[str]:
+    def _watch_failsafe(self, pair: ProcessPair, episode: Episode) -> list[str]:
         """The companion is gone: watch what the flight controller does, until it is down.
 
         Returns:
@@ -257,7 +264,7 @@ class Rehearsal:
             return False
 
         try:
-            crew.pump(down, WRAP_UP_S / self._plan.speed, "the vehicle to come down")
+            pair.pump(down, WRAP_UP_S / self._speed, "the vehicle to come down")
         except LostError as error:
             said.append(error.what)
         return said

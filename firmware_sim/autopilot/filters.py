@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
+from airl_mav.scenario.model import EstimatorName
 from firmware_sim.autopilot.estimator import NewFilter
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 
-FilterName = Literal["kernel", "filterpy"]
 
-
-def filter_named(name: FilterName) -> NewFilter:
+def filter_named(name: EstimatorName) -> NewFilter:
     """Return the filter of a name: `kernel` is compiled, `filterpy` is the library's.
 
     Both give the same estimates to rounding.

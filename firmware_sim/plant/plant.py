@@ -11,6 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotor import lag
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
@@ -33,7 +34,7 @@ from firmware_sim.plant.kinematics import (
     from_bullet,
 )
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.plant.wind import Wind, WindSettings
+from firmware_sim.plant.wind import Wind
 from firmware_sim.plant.world import FLOOR, World
 
 REST_SPEED_M_S = 0.1
@@ -64,7 +65,7 @@ class Plant:
         rng: np.random.Generator,
         *,
         start_us: int = 0,
-        wind: WindSettings | None = None,
+        aircraft: Aircraft | None = None,
         rate_hz: int = TICK_HZ,
     ) -> None:
         """Put the vehicle at rest on the floor at the start, facing north.
@@ -74,7 +75,7 @@ class Plant:
             arena: Where; None = an endless floor.
             rng: All randomness of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            wind: None = calm.
+            aircraft: What was asked of it, as the wind; None = the defaults: calm.
             rate_hz: Ticks a second.
         """
         tick_s = 1.0 / rate_hz
@@ -86,7 +87,7 @@ class Plant:
         airframe = Airframe.from_profile(profile)
         sensor_rng, wind_rng = rng.spawn(2)
         self._sensors = SensorSuite(profile.sensors, sensor_rng, tick_s)
-        self._wind = Wind(wind or WindSettings(), wind_rng, tick_s)
+        self._wind = Wind((aircraft or Aircraft()).wind, wind_rng, tick_s)
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""

@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
+from airl_mav.scenario.model import WindSettings
 
 BLOCK = 256
 """Gusts are drawn for so many ticks at once; how many changes no value."""
-
-
-@dataclass(frozen=True)
-class WindSettings:
-    """What blows."""
-
-    north_m_s: float = 0.0
-    """Steady wind towards the north [m/s]."""
-    east_m_s: float = 0.0
-    """Steady wind towards the east [m/s]."""
-    gust_m_s: float = 0.0
-    """Standard deviation of the gusts on each horizontal axis; half of it on the vertical [m/s]."""
-    gust_time_s: float = 2.0
-    """Correlation time of the gusts [s]."""
 
 
 @kernel

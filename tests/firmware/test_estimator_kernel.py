@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import quat_xyzw_to_wxyz
+from airl_mav.scenario.model import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
@@ -25,7 +26,6 @@ from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.parameters import Parameters
 from firmware_sim.autopilot.state import Mode, Result
 from firmware_sim.interfaces import SensorSample
-from firmware_sim.plant.wind import WindSettings
 from tests.support.flight_rig import flight, quad, velocity_setpoint
 
 TOLERANCE = 1e-9

@@ -26,13 +26,13 @@ from firmware_sim.external.transport.router import Router, RouterEnd
 from firmware_sim.flight_controller import FirmwareMissingError
 from firmware_sim.mavlink.px4_links import px4_ends
 from firmware_sim.simulation import EpisodeSetup, Simulation
-from tests.support.flight_rig import CALM, quad
+from tests.support.flight_rig import quad
 from tests.support.hitl_peer import HitlPeer
 from tests.support.mavlink_clients import Companion
 from tests.support.ports import LOOPBACK, free_ports
 
 PATIENCE_S = 60.0
-SETUP = EpisodeSetup(quad(), None, 1, CALM)
+SETUP = EpisodeSetup(quad(), None, 1)
 
 
 @pytest.fixture

@@ -20,7 +20,6 @@ from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.simulator import EPOCH_US, Px4Bridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 from tests.support.flight_rig import quad
@@ -59,7 +58,7 @@ class Scene:
     def __init__(self, bridge: Px4Bridge, peer: Px4Peer | None, start_us: int) -> None:
         self.bridge, self.peer = bridge, peer
         self.controller = Flown(bridge)
-        setup = EpisodeSetup(quad(), None, 1, WindSettings())
+        setup = EpisodeSetup(quad(), None, 1)
         self.sim = Simulation(setup, start_us=start_us, clock=SimClock(), autopilot=self.controller)
 
     def fly(self, seconds: float) -> None:

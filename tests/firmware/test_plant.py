@@ -19,13 +19,14 @@ from airl_mav.core.frames import Vector, ned_to_enu, quat_ned_frd_to_enu_flu, qu
 from airl_mav.core.location import HOME
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
+from airl_mav.scenario.model import WindSettings
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
 from firmware_sim.plant import wind as wind_module
 from firmware_sim.plant.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.plant.sensors import Rate, SensorSuite
-from firmware_sim.plant.wind import Wind, WindSettings
+from firmware_sim.plant.wind import Wind
 
 G = 9.80665
 QUAD = load_profile("vehicles", "quad", VehicleProfile)

@@ -31,8 +31,8 @@ from airl_mav.cli.parameters import run as write_parameters
 from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
+from airl_mav.scenario.model import Ports
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.state import Mode
 from firmware_sim.external.airframe import (

@@ -21,9 +21,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from firmware_sim.plant.wind import WindSettings
+from airl_mav.scenario.model import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
-from tests.support.flight_rig import CALM, Rig, flight, quad, velocity_setpoint
+from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 GUSTY = WindSettings(north_m_s=1.0, gust_m_s=1.0)
 
@@ -109,9 +109,7 @@ def test_thirty_episodes_leave_nothing_behind() -> None:
     place = arena("crowded")
 
     def episode(seed: int) -> None:
-        simulation = Simulation(
-            EpisodeSetup(quad(), place, seed, CALM), start_us=0, clock=SimClock()
-        )
+        simulation = Simulation(EpisodeSetup(quad(), place, seed), start_us=0, clock=SimClock())
         for _ in range(100):
             simulation.tick()
             simulation.capture_due(lambda _: None)
@@ -203,7 +201,7 @@ def test_what_is_recorded_is_what_was() -> None:
 
 def test_on_the_ground_a_setpoint_is_taken_in_the_tick_after_it() -> None:
     clock = SimClock()
-    simulation = Simulation(EpisodeSetup(quad(), None, 1, CALM), start_us=0, clock=clock)
+    simulation = Simulation(EpisodeSetup(quad(), None, 1), start_us=0, clock=clock)
     for i in range(6):
         if i in (1, 3):
             setpoint = velocity_setpoint(float(i), 0.0, 0.0)._replace(wire=(i, 0.0, 0.0, 0.0))
@@ -253,9 +251,7 @@ def test_frames_are_taken_at_the_camera_s_rate(start_us: int) -> None:
     place = arena("static-obstacles")
     vehicle = quad()
     rate_hz = vehicle.camera.rate_hz
-    simulation = Simulation(
-        EpisodeSetup(vehicle, place, 1, CALM), start_us=start_us, clock=SimClock()
-    )
+    simulation = Simulation(EpisodeSetup(vehicle, place, 1), start_us=start_us, clock=SimClock())
     frames: list[Frame] = []
     for _ in range(2 * US_PER_S // TICK_US):
         simulation.capture_due(frames.append)
@@ -269,7 +265,7 @@ def test_frames_are_taken_at_the_camera_s_rate(start_us: int) -> None:
 
 
 def test_an_endless_floor_has_no_camera() -> None:
-    simulation = Simulation(EpisodeSetup(quad(), None, 1, CALM), start_us=0, clock=SimClock())
+    simulation = Simulation(EpisodeSetup(quad(), None, 1), start_us=0, clock=SimClock())
     for _ in range(100):
         simulation.tick()
         simulation.capture_due(lambda _: pytest.fail("a frame of nothing"))

@@ -31,7 +31,6 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_lockstep import plan_lockstep
 from airl_mav.cli.evaluate_task import sitl_command
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
@@ -43,6 +42,7 @@ from airl_mav.rehearsal import chunks, evaluation_gym, run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import html
 from airl_mav.report.rebuild import rebuild
+from airl_mav.scenario.model import Ports
 from tests.support.linear_policy import ACTIONS, SPEC, weights, write_linear
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, wait_until

@@ -24,12 +24,11 @@ from airl_mav.core.clock import WallClock
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
 from companion.guard import ThreadGuard
 from companion.link import MavsdkLink
 from companion.mission import MissionResult, fly_mission
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (
     HOLD,

@@ -35,11 +35,9 @@ from airl_mav.policy.registry import load_policy
 from airl_mav.profiles.computer import Latency
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings, WindSettings
 from companion.interfaces import BodyVelocity
 from companion.mission import fly_mission
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit
 from tests.support.lockstep_kit import BEGINS, POLICY, SEED, demo_plan
@@ -275,7 +273,7 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
     if capacity_mah is not None:
         battery = vehicle.battery.model_copy(update={"capacity_mah": capacity_mah})
         vehicle = vehicle.model_copy(update={"battery": battery})
-    setup = EpisodeSetup(vehicle, None, 1, WindSettings())
+    setup = EpisodeSetup(vehicle, None, 1)
 
     def events(speed: float | None) -> list[tuple[int, str]]:
         found: list[tuple[int, str]] = []
@@ -294,7 +292,7 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
 def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
     """COM_OF_LOSS_T; what MAVSDK would repeat ends with its process."""
     told: list[int] = []
-    setup = EpisodeSetup(load_vehicle("quad"), None, 1, WindSettings())
+    setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage:
         now_us = stage.conductor.clock.time_us
         stage.firmware.on_message = lambda message: (
@@ -313,7 +311,7 @@ def test_a_broken_companion_is_told() -> None:
     def broken() -> None:
         raise ZeroDivisionError("nothing to share")
 
-    setup = EpisodeSetup(load_vehicle("quad"), None, 1, WindSettings())
+    setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage, pytest.raises(LockstepError, match="ZeroDivisionError: nothing to"):
         stage.run(setup, broken)
 
@@ -322,14 +320,14 @@ def test_bad_input_stays_bad_input() -> None:
     def refused() -> None:
         raise UsageError("--policy p: camera is not the one")
 
-    setup = EpisodeSetup(load_vehicle("quad"), None, 1, WindSettings())
+    setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage, pytest.raises(UsageError, match="camera is not the one"):
         stage.run(setup, refused)
 
 
 def test_a_hanging_companion_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("airl_mav.lockstep.threaded.PATIENCE_S", 1)
-    setup = EpisodeSetup(load_vehicle("quad"), None, 1, WindSettings())
+    setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage, pytest.raises(LockstepError, match="the companion hangs"):
         stage.run(setup, lambda: time.sleep(3.0))
 

@@ -10,15 +10,15 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 import pytest
+from airl_mav.cli.firmware_lockstep import LockstepOptions, remote_plan
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.cli.firmware_lockstep import LockstepOptions, remote_plan
 from airl_mav.core.errors import UsageError
 from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import Turn
-from airl_mav.rehearsal.following import Order
+from airl_mav.rehearsal.supervisor import Order
 from companion.tokens import Phase, TurnBack, TurnGiven
 from firmware_sim.firmware import FrameServer
 from firmware_sim.mavlink.codec import Encoder

@@ -26,13 +26,13 @@ from airl_mav.cli.profile_report import correlation_line, stages_of, verdict
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.machine import MachineState
-from airl_mav.core.ports import Ports
 from airl_mav.latency.clock_offset import Exchanges
 from airl_mav.latency.stages import STAGES
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.computer_file import existing_profile, write_profile
 from airl_mav.profiles.loading import list_profiles
+from airl_mav.scenario.model import Ports
 from companion.mission import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT

@@ -22,12 +22,12 @@ from airl_mav.cli import evaluate_task, sitl
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.episode import Plan
 from airl_mav.rehearsal.progress import RichObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.scenario.model import Ports
 from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode
 

@@ -32,10 +32,11 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
 from companion.interfaces import BodyVelocity
-from companion.pilot import Pilot, PilotSettings
-from companion.watchdog import Watchdog, WatchdogSettings
+from companion.pilot import Pilot
+from companion.watchdog import Watchdog
 
 QUAD = load_vehicle("quad")
 VEHICLE = vehicle_of(QUAD, parameter_values(QUAD.parameters).__getitem__)

@@ -14,7 +14,7 @@ from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.ardupilot.simulator import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.ardupilot_peer import ArdupilotPeer
-from tests.support.flight_rig import CALM, quad
+from tests.support.flight_rig import quad
 from tests.support.ports import free_ports
 
 
@@ -38,7 +38,7 @@ class Stage:
         self.dies: Exception | None = None
         """What looking after the process says once its thread has ended."""
         bridge.wait_connected(20.0, self._alive)
-        setup = EpisodeSetup(quad(), None, 1, CALM)
+        setup = EpisodeSetup(quad(), None, 1)
         self.simulation = Simulation(
             setup, start_us=4000, clock=SimClock(), autopilot=BridgeOnly(bridge)
         )

@@ -14,9 +14,9 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Aircraft, WindSettings
 from firmware_sim.autopilot.state import Mode, Result, Setpoint
 from firmware_sim.interfaces import Truth
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 SETPOINT_US = 50_000
@@ -58,7 +58,7 @@ class Rig:
         merged = {**vehicle.parameters, **(parameters or {})}
         vehicle = vehicle.model_copy(update={"parameters": merged})
         self.sim = Simulation(
-            EpisodeSetup(vehicle, arena, seed, wind), start_us=0, clock=SimClock()
+            EpisodeSetup(vehicle, arena, seed, Aircraft(wind=wind)), start_us=0, clock=SimClock()
         )
         self.texts: list[tuple[int, str]] = []
         """Time [µs] and text of everything said so far."""

@@ -33,9 +33,9 @@ from airl_mav.policy.observation import Kinematics, Observation, encode
 from airl_mav.policy.registry import DEFAULT_POLICY, find_policy, load_policy, policy_names
 from airl_mav.policy.runtime import Runtime, TorchRuntime
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.scenario.model import PilotSettings
 from companion.camera import ReceivedFrame
 from companion.mission import first_lens
-from companion.pilot import PilotSettings
 from tests.support.policy_kit import SPEC, export_tiny, noise
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, running

@@ -1,17 +1,18 @@
-"""Real firmware as asked for on the command line."""
+"""Real firmware as it is asked for: put together, found, and explained to who starts it."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.cli.firmware_options import FirmwareName, RealFirmwareOptions
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import LOOPBACK, Ports
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Aircraft, FirmwareName, RealFirmware
 from firmware_sim.external.airframe import (
     HITL_OUTPUT,
     SITL_OUTPUT,
@@ -38,32 +39,60 @@ from firmware_sim.mavlink.px4_links import Px4Ends
 class Wanted:
     """What is asked of real firmware."""
 
-    options: RealFirmwareOptions
-    """How it is started or reached."""
+    aircraft: Aircraft
     vehicle: VehicleProfile
-    """What it flies."""
-    ports: Ports
-    """Of the MAVLink links."""
     log: Path | None
     """What it prints goes here; None = a file in its folder."""
     bind_ends: Callable[[], Px4Ends]
     """Binds the vehicle's ends of the links, where they are ours."""
 
 
-def real_avionics(firmware: FirmwareName, wanted: Wanted) -> BridgedAvionics:
+def real_firmware(wanted: Wanted) -> BridgedAvionics:
     """Bind the ports of real firmware and return it, not yet started.
 
     Raises:
         UsageError: A port is taken, the program is not there, or the vehicle's profile lacks what
             this firmware needs.
     """
-    launcher, endpoint = _PARTS[firmware](wanted)
+    launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer")
-    return BridgedAvionics(launcher, observer, wanted.options.firmware_timeout)
+    return BridgedAvionics(launcher, observer, wanted.aircraft.real.firmware_timeout)
+
+
+def check_program(real: RealFirmware) -> None:
+    """Look for the program that is to be started. Raises UsageError if it is not there."""
+    if real.px4_dir is not None:
+        find_px4(real.px4_dir)
+    if real.ardupilot_dir is not None:
+        find_arducopter(real.ardupilot_dir)
+
+
+def load_timeout_s(aircraft: Aircraft) -> float | None:
+    """Return the longest wait until the vehicle stands ready [wall s]; None: as for any answer.
+
+    To connect, a heartbeat, the parameters read and set, ready to arm: each within the time-out.
+    """
+    if aircraft.firmware == "builtin":
+        return None
+    return 30.0 + 5.0 * aircraft.real.firmware_timeout
+
+
+def how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
+    """Return the command with which the user starts what is waited for; None: nothing is."""
+    real, ports = aircraft.real, aircraft.ports
+    if real.px4_connect and vehicle.px4 is not None:
+        return px4_program.how_to_start(real.instance, vehicle.px4.airframe)
+    if real.ardupilot_connect:
+        observer = ardupilot_program.OBSERVER_PORT + real.instance
+        links = ardupilot_program.Links(ports.api_port, ports.gcs_port, observer)
+        start = ardupilot_program.how_to_start(real.instance, links)
+        file = shlex.join(["--vehicle", aircraft.vehicle, "--out", ardupilot_program.PARAMETERS])
+        return f"airl parameters ardupilot {file} && {start}"
+    return None
 
 
 def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options, instance = wanted.options, wanted.options.instance
+    options, instance = wanted.aircraft.real, wanted.aircraft.real.instance
     airframe = px4_airframe(wanted.vehicle, SITL_OUTPUT)
     program = None if options.px4_dir is None else find_px4(options.px4_dir)
     endpoint = UdpEndpoint(
@@ -84,7 +113,8 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 
 
 def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options, ports, instance = wanted.options, wanted.ports, wanted.options.instance
+    options, ports = wanted.aircraft.real, wanted.aircraft.ports
+    instance = options.instance
     airframe = ardupilot_airframe(wanted.vehicle)
     where = options.ardupilot_dir
     program = None if where is None else find_arducopter(where)
@@ -107,7 +137,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 
 
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options = wanted.options
+    options = wanted.aircraft.real
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
     router = Router(clients_of(wanted.bind_ends()), WallClock())
     try:

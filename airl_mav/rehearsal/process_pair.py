@@ -12,11 +12,16 @@ from pydantic import BaseModel
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.channel import Event, Failed, Ready
-from airl_mav.rehearsal.episode import ProcessPlan
+from airl_mav.rehearsal.channel import Begin, Event, Failed, Ready
 from airl_mav.rehearsal.process import Child, Exited
 
 FIRMWARE, COMPANION = "firmware", "companion"
+
+MODULES = {
+    FIRMWARE: "airl_mav.rehearsal.firmware_process",
+    COMPANION: "airl_mav.rehearsal.companion_process",
+}
+"""What each process runs."""
 
 READY_TIMEOUT_S = 180.0
 """The first start after an install compiles the kernels [wall s]."""
@@ -39,21 +44,18 @@ class LostError(Exception):
         self.what, self.detail = what, detail
 
 
-class Crew:
-    """Two processes that fly together. They are made once; after a loss a new crew takes over."""
+class ProcessPair:
+    """Two processes that fly together; after a loss a new pair takes over."""
 
     def __init__(self) -> None:
         self._events: queue.Queue[tuple[str, Event | Exited]] = queue.Queue()
         self._children: dict[str, Child] = {}
 
-    def start(
-        self, firmware: ProcessPlan, companion: ProcessPlan, logs: Path, keeps: Sequence[int]
-    ) -> None:
+    def start(self, begin: Begin, logs: Path, keeps: Sequence[int]) -> None:
         """Start both processes and wait until they are ready.
 
         Args:
-            firmware: How the one is started.
-            companion: How the other is.
+            begin: What both are told first.
             logs: Folder that their standard error goes to.
             keeps: File descriptors that they inherit: locks.
 
@@ -61,10 +63,10 @@ class Crew:
             UsageError: A process says that its input cannot be used.
             LostError: A process died or did not become ready in time.
         """
-        for name, plan in ((FIRMWARE, firmware), (COMPANION, companion)):
+        for name, module in MODULES.items():
             log = logs / f"{name}.log"
-            child = Child(name, plan.module, plan.arguments, log, self._events, keeps=keeps)
-            self._children[name] = child
+            self._children[name] = child = Child(name, module, [], log, self._events, keeps=keeps)
+            child.send(begin)
         ready: set[str] = set()
 
         def note(name: str, event: Event) -> bool:

@@ -14,11 +14,11 @@ from airl_mav.cli.common import check_ports, check_range
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.ports import Ports
 from airl_mav.envs.spec import Delay
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.lockstep.remote import RemotePlan, RemoteStage
 from airl_mav.lockstep.tokens import LONGEST_REST_US, TokenSettings
+from airl_mav.scenario.model import Ports
 from firmware_sim.autopilot.state import Message
 from firmware_sim.firmware import Loaded
 from firmware_sim.mavlink.endpoint import UdpEndpoint

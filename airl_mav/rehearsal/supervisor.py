@@ -27,7 +27,7 @@ class Order(Enum):
     """There is nothing left to land."""
 
 
-class Follower:
+class Supervisor:
     """Watches one episode. Pure: no clock, no I/O."""
 
     def __init__(self, referee: Referee, started_us: int) -> None:

@@ -12,14 +12,13 @@ from airl_mav.envs.spec import Delay
 from airl_mav.latency.samplers import FixedSampler, LatencySampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.policy.actions import Policy
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
 from companion.conducted import ConductedClock
 from companion.link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.pilot import PilotSettings
 from companion.token_camera import TokenFrameSource
 from companion.token_clock import TokenTurns
-from companion.watchdog import WatchdogSettings
 
 ANSWER_TIMEOUT_S = 20.0
 """MAVSDK repeats a command that has not been answered for so long, four times at most [wall s]:

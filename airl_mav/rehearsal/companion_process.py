@@ -1,0 +1,136 @@
+"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request.
+
+Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import sys
+import threading
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
+from airl_mav.core.files import save_arrays
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.rehearsal.channel import (
+    Abort,
+    ChildChannel,
+    Ended,
+    Failed,
+    Fly,
+    Progress,
+    Ready,
+    Shutdown,
+)
+from airl_mav.scenario.resolved import ResolvedScenario
+from companion.camera import open_camera
+from companion.guard import ThreadGuard
+from companion.interfaces import LinkError
+from companion.link import MavsdkLink
+from companion.mission import check_camera, fly_mission
+
+CONNECT_TIMEOUT_S = 30.0
+"""Longest wait for the flight controller [wall s]."""
+
+
+class Missions:
+    """Flies missions; link and camera stay open for all of them."""
+
+    def __init__(self, scenario: ResolvedScenario, channel: ChildChannel) -> None:
+        """Load the policy; nothing is connected yet. Raises UsageError if it cannot be run."""
+        self._scenario = scenario
+        self._channel = channel
+        self._clock = WallClock(scenario.speed or 1.0)
+        self._requests: queue.Queue[Any] = queue.Queue()
+        self._stop, self._abandon = threading.Event(), threading.Event()
+
+    def handle(self, request: Any) -> None:
+        """Take a request, on the channel's thread."""
+        if isinstance(request, Abort):
+            (self._stop if request.land else self._abandon).set()
+            self._stop.set()
+            return
+        if isinstance(request, Fly):
+            self._stop.clear()
+            self._abandon.clear()
+            # Shared for one flight, then left alone: what lasts a while (holding an action, the
+            # watchdog) must not jump when the simulator gives up time. The rehearsal corrects the
+            # stamps afterwards.
+            if request.epoch_ns is not None:
+                self._clock.epoch_ns = request.epoch_ns
+        self._requests.put(request)
+
+    def run(self) -> None:
+        """Fly what is asked for, until it is time to end.
+
+        Raises:
+            UsageError: The policy cannot use the camera.
+            LinkError: No flight controller is heard.
+        """
+        aircraft, clock = self._scenario.scenario, self._clock
+        self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
+        with (
+            held_to(aircraft.cpu_quota),
+            closing(open_camera(f"tcp://{LOOPBACK}:{aircraft.ports.camera_port}", clock)) as frames,
+            closing(
+                MavsdkLink(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon)
+            ) as link,
+        ):
+            self._channel.send(Ready())
+            while not isinstance(request := self._requests.get(), Shutdown):
+                if not link.connected:
+                    link.connect(CONNECT_TIMEOUT_S)
+                policy = self._scenario.fresh_policy(request.seed)
+                check_camera(policy, frames, self._stop)
+                result = fly_mission(
+                    link,
+                    frames,
+                    policy,
+                    request.goal,
+                    clock,
+                    self._stop,
+                    self._abandon,
+                    self._announce,
+                    pilot_settings=self._scenario.companion_pilot,
+                    watchdog_settings=self._scenario.watchdog,
+                    guard=ThreadGuard(clock),
+                    latency=self._scenario.latency_sampler(request.seed, native=True),
+                )
+                save_arrays(Path(request.record), result.log.columns())
+                self._channel.send(
+                    Ended(reason=result.reason, notes=result.notes, path=request.record)
+                )
+
+    def _announce(self, phase: str) -> None:
+        self._channel.send(Progress(phase=phase, time_us=self._clock.time_us()))
+
+
+def main() -> int:
+    """Fly missions on request, until the pipe ends."""
+    channel = ChildChannel.on_stdio()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        begin = channel.begin()
+        if begin is None:
+            return EXIT_BROKEN
+        missions = Missions(begin.scenario, channel)
+        # Without its rehearsal a companion has no business in the air, whatever it is doing: its
+        # setpoints end and the flight controller's offboard-loss failsafe takes over.
+        channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
+        missions.run()
+    except (UsageError, LinkError) as error:
+        usage = isinstance(error, UsageError)
+        channel.send(Failed(message=str(error), usage=usage))
+        return EXIT_USAGE if usage else EXIT_BROKEN
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

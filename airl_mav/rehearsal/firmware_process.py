@@ -1,0 +1,221 @@
+"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request.
+
+Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from airl_mav.arena.generate import generate
+from airl_mav.core.clock import utc_now
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.channel import (
+    ChildChannel,
+    Failed,
+    FinishEpisode,
+    Loaded,
+    LoadEpisode,
+    Ready,
+    Saved,
+    Shutdown,
+    Text,
+)
+from airl_mav.rehearsal.true_state import state_of
+from airl_mav.scenario.model import Aircraft
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.autopilot.state import Message
+from firmware_sim.crash import CrashWatch
+from firmware_sim.external.compose import Wanted, real_firmware
+from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware
+from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.mavlink.px4_links import Px4Ends, px4_ends, px4_server
+from firmware_sim.pacing import Pacing, WallPacing
+from firmware_sim.plant.camera_server import CameraServer
+from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.warm_up import warm_up
+
+STATE_EVERY_US = 40_000
+"""The rehearsal hears the true state so often: 25 Hz."""
+
+
+def build_firmware(
+    aircraft: Aircraft,
+    vehicle: VehicleProfile,
+    pacing: Pacing,
+    *,
+    bind: str = LOOPBACK,
+    companion_host: str = LOOPBACK,
+    gcs_host: str = LOOPBACK,
+    insecure: bool = False,
+    log: Path | None = None,
+) -> Firmware:
+    """Bind all ports and return the firmware without an episode.
+
+    Args:
+        aircraft: What was asked of it.
+        vehicle: What it flies.
+        pacing: How simulated time passes.
+        bind: IPv4 address that links and camera bind.
+        companion_host: IPv4 address of the companion computer.
+        gcs_host: IPv4 address of the ground station.
+        insecure: Whether addresses are allowed that other machines can reach.
+        log: What real firmware prints goes here; None: to a file in its folder.
+
+    Raises:
+        UsageError: A port is taken, an address unusable, or real firmware is not there.
+    """
+    ports = aircraft.ports
+
+    def ends() -> Px4Ends:
+        return px4_ends(
+            bind=bind,
+            api_remote=(companion_host, ports.api_port),
+            api_local_port=ports.api_local_port,
+            gcs_remote=(gcs_host, ports.gcs_port),
+            gcs_local_port=ports.gcs_local_port,
+            insecure=insecure,
+        )
+
+    avionics: Avionics
+    if aircraft.firmware == "builtin":
+        avionics = BuiltinAvionics(px4_server(ends(), unix_us()))
+    else:
+        avionics = real_firmware(Wanted(aircraft, vehicle, log, ends))
+    try:
+        camera = CameraServer(f"tcp://{bind}:{ports.camera_port or '*'}")
+    except UsageError:
+        avionics.close()
+        raise
+    return Firmware(avionics, camera, pacing)
+
+
+class Service:
+    """Flies the episodes that the rehearsal asks for, one at a time."""
+
+    def __init__(
+        self,
+        firmware: Firmware,
+        channel: ChildChannel,
+        scenario: ResolvedScenario,
+    ) -> None:
+        """Take what flies, whom to tell, and what is flown."""
+        self._firmware = firmware
+        self._channel = channel
+        self._scenario = scenario
+        firmware.on_tick, firmware.on_message = self._report, self._tell
+        self._record = Path()
+        self._reported = 0
+        self._crash = CrashWatch()
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            LoadEpisode: self._load,
+            FinishEpisode: self._finish,
+        }
+
+    def run(self, requests: queue.Queue[Any]) -> None:
+        """Fly until it is time to end.
+
+        Raises:
+            UsageError: An episode cannot be made.
+            FirmwareLostError: Real firmware is gone.
+        """
+        while self._handle_all(requests):
+            self._firmware.step()
+
+    def _handle_all(self, requests: queue.Queue[Any]) -> bool:
+        """Handle what has arrived; False when it is time to end."""
+        with contextlib.suppress(queue.Empty):
+            while True:
+                request = requests.get(block=False)
+                if isinstance(request, Shutdown):
+                    return False
+                self._handlers[type(request)](request)
+        return True
+
+    def _load(self, request: LoadEpisode) -> None:
+        scenario, seed = self._scenario, request.seed
+        arena = generate(
+            scenario.arena,
+            scenario.scenario.arena_seed_of(seed),
+            name=scenario.scenario.arena,
+            vehicle_width_m=scenario.vehicle.body.width_m,
+        )
+        episode = EpisodeSetup(scenario.vehicle, arena, seed, scenario.scenario)
+        tlog = Path(request.tlog) if request.tlog else None
+        self._crash = CrashWatch()
+        loaded = self._firmware.load(episode, tlog, unix_us())
+        self._record = Path(request.record)
+        self._channel.send(
+            Loaded(
+                episode=request.episode,
+                time_us=loaded.time_us,
+                epoch_ns=loaded.epoch_ns,
+                slipped_us=self._firmware.slipped_us,
+                goal=(float(arena.goal[0]), float(arena.goal[1])),
+            )
+        )
+
+    def _finish(self, _: FinishEpisode) -> None:
+        self._firmware.save(self._record)
+        self._firmware.discard()
+        self._channel.send(Saved(path=str(self._record)))
+
+    def _report(self, simulation: Simulation) -> None:
+        period = simulation.time_us // STATE_EVERY_US
+        if not self._crash.look(simulation) and period == self._reported:
+            return
+        self._reported = period
+        self._channel.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
+
+    def _tell(self, message: Message) -> None:
+        simulation = self._firmware.simulation
+        time_us = 0 if simulation is None else simulation.time_us
+        self._channel.send(Text(time_us=time_us, severity=int(message.severity), text=message.text))
+
+
+def unix_us() -> int:
+    """Return the calendar time [µs since 1970], for log headers."""
+    return int(utc_now().timestamp() * US_PER_S)
+
+
+def main() -> int:
+    """Fly episodes on request, until the pipe ends."""
+    channel = ChildChannel.on_stdio()
+    # The rehearsal decides when to end, also on Ctrl-C: it closes the pipe.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    requests: queue.Queue[Any] = queue.Queue()
+    try:
+        begin = channel.begin()
+        if begin is None:
+            return EXIT_BROKEN
+        channel.listen(requests.put, lambda: requests.put(Shutdown()))
+        scenario = begin.scenario
+        firmware = build_firmware(
+            scenario.scenario,
+            scenario.vehicle,
+            WallPacing(scenario.speed or 1.0),
+            log=None if begin.log is None else Path(begin.log),
+        )
+        with closing(firmware):
+            warm_up(scenario.vehicle)
+            channel.send(Ready(details={"camera": firmware.camera_endpoint}))
+            Service(firmware, channel, scenario).run(requests)
+    except (UsageError, FirmwareLostError) as error:
+        usage = isinstance(error, UsageError)
+        channel.send(Failed(message=str(error), usage=usage))
+        return EXIT_USAGE if usage else EXIT_BROKEN
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,365 @@
+"""The scenario: the one model of all that a rehearsal can be asked for.
+
+Command-line options, scenario files, `run.json` and what the processes of a rehearsal are told are all
+this model. Meaning, unit, range and default of a setting stand here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+DEFAULT_POLICY = "static-obstacles"
+"""The shipped policy that flies by default."""
+
+DEFAULT_ARENA = "static-obstacles"
+"""The shipped arena that is flown in by default."""
+
+GREATEST_SEED = 2**31
+GREATEST_PORT = 65_535
+GREATEST_EPISODES = 100_000
+GREATEST_WORKERS = 256
+GREATEST_SLOTS = 4096
+
+EstimatorName = Literal["kernel", "filterpy"]
+FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
+LevelName = Literal["gym", "lockstep", "sitl"]
+RuntimeName = Literal["onnx", "torch"]
+AblationName = Literal["depth", "velocity", "goal"]
+
+FREE = "decides no flight"
+"""Marks a field that may differ when a run is resumed."""
+
+
+def _seed(description: str, default: Any = 1) -> Any:
+    return quantity(description, "1", ge=0, le=GREATEST_SEED, default=default)
+
+
+def _port(description: str, default: int) -> Any:
+    return quantity(description, "1", ge=0, le=GREATEST_PORT, default=default)
+
+
+class WindSettings(ProfileModel):
+    """Steady wind and gusts; calm by default."""
+
+    north_m_s: float = quantity("steady wind towards north", "m/s", ge=-50, le=50, default=0.0)
+    east_m_s: float = quantity("steady wind towards east", "m/s", ge=-50, le=50, default=0.0)
+    gust_m_s: float = quantity(
+        "standard deviation of the gusts on each horizontal axis; half of it on the vertical",
+        "m/s",
+        ge=0,
+        le=50,
+        default=0.0,
+    )
+    gust_time_s: float = quantity(
+        "correlation time of the gusts", "s", ge=0.01, le=1000, default=2.0
+    )
+
+
+class WatchdogSettings(ProfileModel):
+    """Bounds on the silence of the policy, in simulated time."""
+
+    decision_timeout_s: float = quantity(
+        "time since the last action after which the velocity is zeroed; longer than the hold time",
+        "s",
+        ge=0.1,
+        le=60,
+        default=2.0,
+    )
+    leave_after_s: float = quantity(
+        "further time after which the companion leaves offboard mode",
+        "s",
+        ge=0.1,
+        le=60,
+        default=2.0,
+    )
+    hover_after_s: float | None = quantity(
+        "zero the velocity this long after an action's hold time, whether or not a decision has come"
+        " (AirSim: 0.06); by default as the policy's card says, or never: the last setpoint persists,"
+        " as with PX4 and MAVSDK",
+        "s",
+        ge=0,
+        le=60,
+        default=None,
+    )
+
+
+@dataclass(frozen=True)
+class PilotSettings:
+    """How a policy is flown, decided."""
+
+    hold_s: float = 0.5
+    """t3: how long an action is held before the next observation [s]."""
+    goal_radius_m: float = 2.0
+    """The goal is reached closer than this, seen from above [m]."""
+    altitude_m: float = 2.5
+    """Height above the start that is held [m]."""
+    max_speed_m_s: float = 5.0
+    """Horizontal speed limit of all actions [m/s]."""
+
+
+class Ports(ProfileModel):
+    """UDP ports of the MAVLink links, as PX4 SITL uses them, and the camera's TCP port."""
+
+    api_port: int = _port("UDP port of the onboard API, where MAVSDK listens", 14540)
+    api_local_port: int = _port(
+        "UDP port that the flight controller's onboard link binds; 0: any free one", 14580
+    )
+    gcs_port: int = _port("UDP port of the ground station, where QGroundControl listens", 14550)
+    gcs_local_port: int = _port(
+        "UDP port that the flight controller's ground station link binds; 0: any free one", 18570
+    )
+    camera_port: int = _port(
+        "TCP port (ZeroMQ) of the depth camera; 0: any free one, where the client is told of it",
+        5600,
+    )
+
+
+class RealFirmware(ProfileModel):
+    """Real firmware: what to start, or how to reach what the user has started."""
+
+    px4_dir: Path | None = Field(
+        default=None,
+        description="with firmware px4: start this PX4 for every flight; a SITL build, its source"
+        " tree, or an unpacked package",
+    )
+    px4_connect: bool = Field(
+        default=False,
+        description="with firmware px4: wait for a PX4 that you start for every flight",
+    )
+    ardupilot_dir: Path | None = Field(
+        default=None,
+        description="with firmware ardupilot: start this ArduCopter for every flight; a SITL build,"
+        " its source tree, or the program itself",
+    )
+    ardupilot_connect: bool = Field(
+        default=False,
+        description="with firmware ardupilot: wait for an ArduCopter that you start for every flight",
+    )
+    instance: int = quantity(
+        "with PX4 or ArduPilot SITL: instance number; moves all of its ports, as -i and -I do",
+        "1",
+        ge=0,
+        le=9,
+        default=0,
+    )
+    serial: str | None = Field(
+        default=None, description="with firmware px4-hitl: serial device of the board: /dev/ttyACM0"
+    )
+    baud: int = quantity(
+        "with serial: bits a second; USB takes no notice of it",
+        "1/s",
+        ge=9_600,
+        le=12_000_000,
+        default=921_600,
+    )
+    firmware_timeout: float = quantity(
+        "longest wait for real firmware to connect, and for each answer before take-off, wall time",
+        "s",
+        ge=1,
+        le=3600,
+        default=60.0,
+    )
+    firmware_dir: Path | None = Field(
+        default=None,
+        description="keep what real firmware leaves (parameters, flight logs) in this folder, one"
+        " folder a flight; by default it is removed",
+    )
+
+
+class Aircraft(ProfileModel):
+    """What flies, and how it is reached."""
+
+    vehicle: str = Field(
+        default="quad", description="vehicle profile: a shipped name, or a path to a .toml"
+    )
+    wind: WindSettings = Field(default_factory=WindSettings, description="wind")
+    estimator: EstimatorName = Field(
+        default="kernel",
+        description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
+        " some twenty times slower",
+    )
+    firmware: FirmwareName = Field(
+        default="builtin",
+        description="flight controller: the built-in one, or real firmware on this vehicle and its"
+        " sensors; see docs/real-firmware.md",
+    )
+    real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
+    ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
+
+    @property
+    def companion_port(self) -> int:
+        """The UDP port on which a companion listens for the flight controller."""
+        moved = self.real.instance if self.firmware == "px4" else 0
+        return self.ports.api_port + moved
+
+
+class Decisions(ProfileModel):
+    """Who decides, and how its actions are flown."""
+
+    runtime: RuntimeName = Field(
+        default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
+    )
+    threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
+    trust: bool = Field(
+        default=False,
+        description="run policy.pt2 of a folder that is not shipped: loading it can execute code that"
+        " its author wrote",
+    )
+    cpu_quota: float | None = quantity(
+        "hold the companion to this share of one core, for real, by a Linux control group; what it"
+        " then takes is measured, nothing is injected",
+        "%",
+        ge=1,
+        le=6400,
+        default=None,
+    )
+    hold_s: float | None = quantity(
+        "t3: how long an action is held before the next observation; by default that of the policy's"
+        " card, or 0.5",
+        "s",
+        ge=0,
+        le=10,
+        default=None,
+    )
+    altitude_m: float | None = quantity(
+        "height above the start that is flown; by default that of the policy's card, or 2.5",
+        "m",
+        ge=0.5,
+        le=100,
+        default=None,
+    )
+    goal_radius_m: float | None = quantity(
+        "the goal is reached closer than this, seen from above; by default that of the policy's card,"
+        " or 3",
+        "m",
+        ge=0.2,
+        le=50,
+        default=None,
+    )
+    max_speed_m_s: float | None = quantity(
+        "horizontal speed limit of all actions; by default the fastest action of the policy's card,"
+        " or 5",
+        "m/s",
+        ge=0.1,
+        le=30,
+        default=None,
+    )
+    watchdog: WatchdogSettings = Field(
+        default_factory=WatchdogSettings, description="bounds on silence"
+    )
+    ablate: AblationName | None = Field(
+        default=None,
+        description="input of the network that is made zero; not at level sitl",
+    )
+
+
+class Lateness(ProfileModel):
+    """How late every decision is: the latency t2, in simulated time."""
+
+    computer: str = Field(
+        default="workstation",
+        description="computer profile to fly as: a shipped name, or a path to a .toml",
+    )
+    workload: str | None = Field(
+        default=None,
+        description="workload of the computer profile whose latency t2 is injected; estimate: scaled"
+        " to this policy; by default what was measured for this very policy, or else what this machine"
+        " takes (sitl) or 1 ms (gym, lockstep)",
+    )
+    latency: str | None = Field(
+        default=None,
+        description="latency t2 to inject instead of the workload's: 150ms, lognormal:396ms,20ms"
+        " (mean, standard deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured"
+        " latencies, one a line in ms, which are replayed in order",
+    )
+    latency_seed: int = _seed(
+        "draws the same latency anew on the same episodes; 0: from the episodes' own seeds", 0
+    )
+
+
+class Flights(ProfileModel):
+    """Which episodes are flown, and how."""
+
+    level: LevelName = Field(
+        default="sitl",
+        description="rung of the fidelity ladder. gym: the batch twin, some hundred episodes a second."
+        " lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the same flight"
+        " every time, bit by bit. sitl: two processes over UDP, in real time times the speed",
+    )
+    episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
+    seed: int = _seed("episode i uses seed + i for arena, sensors, wind and latency")
+    arena_seed: int | None = _seed(
+        "every episode in the arena, and with the goal, of this one seed; by default of its own",
+        None,
+    )
+    time_limit_s: float = quantity(
+        "longest flight from the start of navigation", "s", ge=1, le=3600, default=120.0
+    )
+    speed: Annotated[float | None, FREE] = quantity(
+        "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
+        " to 1000 (default: as fast as it goes)",
+        "1",
+        ge=0.01,
+        le=1000,
+        default=None,
+    )
+    workers: Annotated[int | None, FREE] = quantity(
+        "level lockstep: processes, each with one flight at a time; decides the pace, not the"
+        " results; by default as many as there are usable cores",
+        "1",
+        ge=1,
+        le=GREATEST_WORKERS,
+        default=None,
+    )
+    slots: Annotated[int, FREE] = quantity(
+        "level gym: flights at a time; decides the pace, not the results",
+        "1",
+        ge=1,
+        le=GREATEST_SLOTS,
+        default=128,
+    )
+    tlogs: Annotated[bool, FREE] = Field(
+        default=False,
+        description="level lockstep: write the MAVLink log of every flight; level sitl always does",
+    )
+
+
+class Scenario(Flights, Lateness, Decisions, Aircraft):
+    """All that a rehearsal can be asked for.
+
+    The fields are flat, but for the tables `wind`, `watchdog`, `real` and `ports`. What is left at None
+    is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
+
+    Raises:
+        pydantic.ValidationError: A field is unknown, of the wrong type, or out of range.
+    """
+
+    policy: str = Field(
+        default=DEFAULT_POLICY,
+        description="policy that decides: a name, or a path to a folder with policy.onnx and card.json",
+    )
+    arena: str = Field(
+        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
+    )
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seed of each episode, by its index."""
+        return tuple(range(self.seed, self.seed + self.episodes))
+
+    def arena_seed_of(self, seed: int) -> int:
+        """Return the seed of the arena of the episode with this seed."""
+        return seed if self.arena_seed is None else self.arena_seed
+
+
+def free_fields(level: LevelName) -> frozenset[str]:
+    """Return the names of the fields that decide no flight at a level."""
+    free = {name for name, field in Scenario.model_fields.items() if FREE in field.metadata}
+    # Level with the wall clock, what this machine takes counts in proportion to the speed.
+    return frozenset(free - {"speed"} if level == "sitl" else free)

@@ -1,0 +1,168 @@
+"""A scenario with all that it names loaded: what everything below takes, never a name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import TypeAdapter
+
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.flight.judge import Task
+from airl_mav.flight.setup import BUILT_IN, Level, Part, Setup
+from airl_mav.latency.injection import Injection
+from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
+from airl_mav.policy.actions import Policy
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.registry import PolicyInfo, load_policy
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.computer import ComputerProfile
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import FirmwareName, PilotSettings, Scenario, WatchdogSettings
+
+ACTION_STREAM = 1
+"""Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
+
+ARRIVAL_SHARE = 0.8
+"""The companion flies to this share of the goal radius: it knows its position only by estimate, while
+the referee measures the true one."""
+
+NATIVE_T2_US = round(1.0 * US_PER_MS)
+"""t2 where nothing is injected and no machine's own time counts: inference on a desktop computer."""
+
+TRANSPORT_US = round(5.0 * US_PER_MS)
+"""t1 without the wait for the frame, where no machine's own time counts: exposure to decoded [µs]."""
+
+FIRMWARE_TITLES: dict[FirmwareName, str] = {
+    "builtin": BUILT_IN,
+    "px4": "PX4 SITL",
+    "ardupilot": "ArduPilot SITL",
+    "px4-hitl": "PX4 on a board",
+}
+
+
+@dataclass(frozen=True)
+class ResolvedScenario:
+    """A scenario, checked, and the content of every profile that it names."""
+
+    scenario: Scenario
+    """As it was asked for."""
+    vehicle: VehicleProfile
+    arena: ArenaSpec
+    computer: ComputerProfile
+    policy: PolicyInfo
+    injection: Injection
+    """Where t2 is drawn from."""
+    pilot: PilotSettings
+    """How the policy is flown; the goal radius is the referee's."""
+    watchdog: WatchdogSettings
+    """Bounds on silence, with what the policy's card says of hovering."""
+
+    @property
+    def level(self) -> Level:
+        """Rung of the fidelity ladder, as a report calls it."""
+        real = self.scenario.firmware != "builtin"
+        return "firmware" if real else self.scenario.level
+
+    @property
+    def speed(self) -> float | None:
+        """Simulated seconds per wall second; None where time is not paced."""
+        scenario = self.scenario
+        if scenario.level == "sitl":
+            return 1.0 if scenario.speed is None else scenario.speed
+        return scenario.speed if scenario.level == "lockstep" else None
+
+    @property
+    def companion_pilot(self) -> PilotSettings:
+        """How the companion flies the policy: closer to the goal than the referee asks for."""
+        return replace(self.pilot, goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m)
+
+    def task(self, goal: tuple[float, float]) -> Task:
+        """Return what the referee asks of a flight to a goal (north, east) [m]."""
+        return Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
+
+    @property
+    def rules(self) -> str:
+        """The rules of an episode, as a report states them."""
+        pilot = self.pilot
+        return (
+            f"goal radius {pilot.goal_radius_m:g} m, hold {pilot.hold_s:g} s, "
+            f"height {pilot.altitude_m:g} m, time limit {self.scenario.time_limit_s:g} s"
+        )
+
+    @property
+    def setup(self) -> Setup:
+        """The facts that head every report."""
+        scenario, hover_s = self.scenario, self.watchdog.hover_after_s
+        without = f" (its input {scenario.ablate!r} made zero)" if scenario.ablate else ""
+        return Setup(
+            level=self.level,
+            firmware=FIRMWARE_TITLES[scenario.firmware],
+            vehicle=Part(scenario.vehicle, self.vehicle.description),
+            arena=Part(scenario.arena, self.arena.description),
+            policy=Part(self.policy.name, f"{self.policy.description}{without}"),
+            computer=Part(scenario.computer, self.computer.description),
+            computer_watts=self.computer.watts,
+            injection=self.injection,
+            speed=self.speed,
+            between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
+        )
+
+    @property
+    def arena_name(self) -> str:
+        """Name of the arena without its path."""
+        return Path(self.scenario.arena).stem
+
+    def latency_sampler(self, seed: int, *, native: bool) -> LatencySampler | None:
+        """Return where the episode of a seed draws t2 from.
+
+        Args:
+            seed: Of the episode.
+            native: Whether the companion's own time counts: then None means that nothing is injected;
+                otherwise t2 is that of a desktop computer.
+        """
+        sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
+        return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
+
+    def fresh_policy(self, seed: int) -> Policy:
+        """Return the policy as it begins the flight of a seed: it remembers nothing.
+
+        Raises:
+            UsageError: It cannot be run as asked.
+        """
+        loaded = self._loaded_policy
+        if isinstance(loaded, LearnedPolicy):
+            return loaded.with_generator(action_generator(seed))
+        return self._load_policy()
+
+    @cached_property
+    def _loaded_policy(self) -> Policy:
+        """The policy, its network loaded once."""
+        return self._load_policy()
+
+    def _load_policy(self) -> Policy:
+        scenario = self.scenario
+        return load_policy(
+            scenario.policy,
+            self.pilot.hold_s,
+            runtime=scenario.runtime,
+            threads=scenario.threads,
+            rng=action_generator(scenario.seed),
+            ablate=scenario.ablate,
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the loaded network behind: each process opens its own."""
+        return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
+
+
+def action_generator(seed: int) -> np.random.Generator:
+    """Return the source of a policy's random actions in the flight of a seed."""
+    return np.random.default_rng((seed, ACTION_STREAM))
+
+
+RESOLVED: TypeAdapter[ResolvedScenario] = TypeAdapter(ResolvedScenario)
+"""Writes a resolved scenario as JSON and reads it back, bit by bit the same."""
