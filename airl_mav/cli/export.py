@@ -6,18 +6,17 @@ import re
 import shlex
 import sys
 
-from pydantic import ValidationError
 from rich.console import Console
 
 from airl_mav.cli.common import check_train_installed
 from airl_mav.cli.export_command import ExportCommand
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.core.provenance import package_versions
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyFacts, Training
 from airl_mav.policy.layouts import ObservationSpec
-from airl_mav.profiles.loading import explain
 
 
 def run(command: ExportCommand, console: Console | None = None) -> int:
@@ -60,37 +59,29 @@ def facts(command: ExportCommand) -> PolicyFacts:
     if size is None:
         raise UsageError(f"--image {command.image!r}: accepted: WIDTHxHEIGHT in px, as 32x24")
     name = command.name if command.name is not None else command.out.resolve().name
-    try:
-        observation = ObservationSpec(
-            layout=command.layout,
-            width_px=int(size[1]),
-            height_px=int(size[2]),
-            horizontal_fov_deg=command.fov,
-            range_m=command.range_m,
-        )
-    except ValidationError as error:
-        raise UsageError(f"--image, --fov, --range: {explain(error, ObservationSpec)}") from None
-    try:
-        actions = ActionSpec(set=command.actions, max_speed_m_s=command.max_speed)
-    except ValidationError as error:
-        raise UsageError(f"--max-speed: {explain(error, ActionSpec)}") from None
-    try:
-        return PolicyFacts(
-            name=name,
-            description=command.description,
-            observation=observation,
-            actions=actions,
-            hold_s=command.hold,
-            goal_radius_m=command.goal_radius,
-            altitude_m=command.altitude,
-            hover_after_s=command.hover_after,
-            algorithm=command.algorithm,
-            epsilon=command.epsilon,
-            training=Training(
-                command=shlex.join(["airl", *sys.argv[1:]]),
-                versions=package_versions(),
-                date_utc=utc_now().isoformat(timespec="seconds"),
-            ),
-        )
-    except ValidationError as error:
-        raise UsageError(explain(error, PolicyFacts)) from None
+    image = {
+        "layout": command.layout,
+        "width_px": int(size[1]),
+        "height_px": int(size[2]),
+        "horizontal_fov_deg": command.fov,
+        "range_m": command.range_m,
+    }
+    speed = {"set": command.actions, "max_speed_m_s": command.max_speed}
+    facts = {
+        "name": name,
+        "description": command.description,
+        "observation": validated(ObservationSpec, image, "--image, --fov, --range"),
+        "actions": validated(ActionSpec, speed, "--max-speed"),
+        "hold_s": command.hold,
+        "goal_radius_m": command.goal_radius,
+        "altitude_m": command.altitude,
+        "hover_after_s": command.hover_after,
+        "algorithm": command.algorithm,
+        "epsilon": command.epsilon,
+        "training": Training(
+            command=shlex.join(["airl", *sys.argv[1:]]),
+            versions=package_versions(),
+            date_utc=utc_now().isoformat(timespec="seconds"),
+        ),
+    }
+    return validated(PolicyFacts, facts)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import ValidationError
-
 from airl_mav.cli.train_command import TrainCommand
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import explain
 
 
 def environment_of(command: TrainCommand, configured: EnvironmentSpec) -> EnvironmentSpec:
@@ -46,7 +44,4 @@ def environment_of(command: TrainCommand, configured: EnvironmentSpec) -> Enviro
         values["delay"] = others | delay
     if safe:
         values["safe_velocity"] = safe
-    try:
-        return EnvironmentSpec.model_validate(values)
-    except ValidationError as error:
-        raise UsageError(f"{explain(error, EnvironmentSpec)}") from None
+    return validated(EnvironmentSpec, values)

@@ -11,7 +11,7 @@ from pydantic import Field
 from airl_mav.conformance.step_response import StepResponse
 from airl_mav.conformance.steps import StepName
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile
 
 AUTO = "auto"

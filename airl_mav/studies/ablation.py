@@ -13,9 +13,9 @@ from rich.console import Console
 from airl_mav.cli import train
 from airl_mav.cli.cells import Cell
 from airl_mav.cli.train_command import TrainCommand
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.flight.paper import ABLATION
 from airl_mav.flight.statistics import Aggregate
-from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.report.bars import Bar, Group, bars_picture
 from airl_mav.report.tables import NONE, Column, TableView
 from airl_mav.studies.parts import (

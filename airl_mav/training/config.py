@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import discrete_actions
-from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 SELECTION_SEED = 500_000

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 
 NetworkKind = Literal["small", "appendix", "template"]
 Precision = Literal["float32", "bfloat16"]

@@ -60,7 +60,7 @@ def test_the_sensing_distance() -> None:
             "one of them",
         ),
         ({"max_acceleration": 4.0}, "with --sensing-distance"),
-        ({"sensing_distance": 0.0}, "safe_velocity.sensing_distance_m = 0.0"),
+        ({"sensing_distance": 0.0}, "safe_velocity.sensing_distance_m 0"),
     ],
 )
 def test_what_does_not_go_together_gets_one_line(asked: dict[str, Any], told: str) -> None:
