@@ -24,7 +24,8 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import open_model
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation import Kinematics, encode
-from airl_mav.policy.registry import DEFAULT_POLICY, find_policy
+from airl_mav.policy.registry import find_policy
+from airl_mav.scenario.model import DEFAULT_POLICY
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.export import random_inputs

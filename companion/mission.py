@@ -15,12 +15,12 @@ from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
-from airl_mav.scenario.model import WatchdogSettings
+from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.interfaces import STOP, LinkError
 from companion.link import MavsdkLink
-from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, PilotSettings
+from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
 from companion.watchdog import Watchdog
 
 PREPARE_TIMEOUT_S = 10.0

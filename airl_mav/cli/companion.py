@@ -1,51 +1,100 @@
-"""`airl-companion`: what runs on the drone's onboard computer."""
+"""`airl-companion`, `airl companion`: what runs on the drone's onboard computer."""
 
 from __future__ import annotations
 
 import signal
 import threading
+from pathlib import Path
 
-import tyro
+from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli import companion_lockstep
-from airl_mav.cli.common import (
-    EXIT_BROKEN,
-    EXIT_INTERRUPTED,
-    run_command,
-)
-from airl_mav.cli.companion_command import (
-    CompanionCommand,
-    check,
-    load,
-    lockstep_mission,
-    open_camera,
-    opened,
-    sampler,
-    watchdog_settings,
-)
-from airl_mav.cli.companion_service import serve
-from airl_mav.core.clock import WallClock
-from airl_mav.core.cpu_quota import held_to
+from airl_mav.cli.options import run_command
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.fields import quantity
 from airl_mav.core.files import save_arrays
-from airl_mav.scenario.model import PilotSettings
+from airl_mav.latency.samplers import latency_generator
+from airl_mav.policy.registry import find_policy, load_policy
+from airl_mav.scenario.model import DEFAULT_POLICY, GREATEST_SEED, Decisions, Lateness
+from airl_mav.scenario.piloting import check_quota, decide_piloting, select_latency
+from airl_mav.scenario.resolved import action_generator
 from companion.conducted import Abandoned
-from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
-from companion.mission import MissionResult, check_camera, fly_mission
+from companion.mission import MissionResult
+from companion.program import Mission, fly_alone
 
 
-def main() -> None:
-    """Entry point of `airl-companion`."""
-    command = tyro.cli(CompanionCommand, prog="airl-companion")
-    run_command(lambda: serve(command) if command.control else stand_alone(command))
+class CompanionOptions(Lateness, Decisions):
+    """Fly a policy from take-off to a goal, through MAVSDK.
+
+    Examples:
+        airl-companion --goal 20 5
+        airl-companion --connect serial:///dev/ttyAMA0:921600 --camera tcp://192.168.1.10:5600
+        airl-companion --lockstep --goal 20 5     (with airl-firmware --lockstep)
+    """
+
+    policy: str = Field(
+        default=DEFAULT_POLICY,
+        description="policy that decides: a name, or a path to a folder with policy.onnx and"
+        " card.json",
+    )
+    goal: tuple[float, float] = Field(
+        default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
+    )
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    camera: str = Field(
+        default="tcp://127.0.0.1:5600", description="ZeroMQ address of the depth camera"
+    )
+    lockstep: bool = Field(
+        default=False,
+        description="take turns with a simulator that waits for this program (airl-firmware"
+        " --lockstep): every flight of a seed is the same",
+    )
+    speed: float = quantity(
+        "simulated seconds per wall second of the simulator; 1 on a real aircraft",
+        "1",
+        ge=0.1,
+        le=100,
+        default=1.0,
+    )
+    seed: int = quantity(
+        "seed of the injected latency, and of random actions if the policy's card has any",
+        "1",
+        ge=0,
+        le=GREATEST_SEED,
+        default=1,
+    )
+    connect_timeout: float = quantity(
+        "longest wait for the flight controller; in lockstep for each of its turns, too",
+        "s",
+        ge=0.1,
+        le=3600,
+        default=30.0,
+    )
+    log: Path | None = Field(
+        default=None, description="write the stamps of every decision to this .npz file"
+    )
 
 
-def stand_alone(command: CompanionCommand) -> int:
-    """Fly one mission."""
-    pilot = check(command)
-    console = Console()
-    clock = WallClock(command.speed)
+OPTIONS = CompanionOptions
+EXTRAS = ()
+
+
+def run(options: CompanionOptions, console: Console | None = None) -> int:
+    """Fly one mission.
+
+    Returns:
+        Exit status: 0 the goal was reached, 1 it was not, 130 Ctrl-C.
+
+    Raises:
+        UsageError: The input cannot be used.
+    """
+    console = console or Console(soft_wrap=True)
+    mission = _mission(options)
     stop, abandon, interrupted = threading.Event(), threading.Event(), threading.Event()
 
     def interrupt(*_: object) -> None:
@@ -54,77 +103,15 @@ def stand_alone(command: CompanionCommand) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
-    if command.lockstep:
-        return _alone_in_lockstep(command, pilot, stop, abandon, interrupted, console)
-    policy = load(command, pilot)
-    bounds = watchdog_settings(command)
-    latency = sampler(command, command.seed)
+    what = "simulator" if options.lockstep else "flight controller"
+    console.print(f"waiting for a {what} on {options.connect}", markup=False)
     try:
-        with (
-            held_to(command.cpu_quota),
-            opened(command, clock, abandon) as (link, frames),
-        ):
-            console.print(f"waiting for a flight controller on {command.connect}", markup=False)
-            link.connect(command.connect_timeout, stop)
-            check_camera(policy, frames, stop)
-            result = fly_mission(
-                link,
-                frames,
-                policy,
-                command.goal,
-                clock,
-                stop,
-                abandon,
-                lambda phase: console.print(f"{clock.time_us() / 1e6:8.2f} s  {phase}"),
-                pilot_settings=pilot,
-                watchdog_settings=bounds,
-                guard=ThreadGuard(clock),
-                latency=latency,
-            )
-    except LinkError as error:
+        result = _fly(options, mission, stop, abandon, console)
+    except (LinkError, Abandoned) as error:
         console.print(f"error: {error}", style="red", markup=False)
         return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
-    return _conclude(command, result, interrupted, console)
-
-
-def _alone_in_lockstep(
-    command: CompanionCommand,
-    pilot: PilotSettings,
-    stop: threading.Event,
-    abandon: threading.Event,
-    interrupted: threading.Event,
-    console: Console,
-) -> int:
-    """Fly one mission, taking turns with the simulator."""
-    mission = lockstep_mission(command, pilot, load(command, pilot), command.goal, command.seed)
-    console.print(f"waiting for a simulator on {command.connect}", markup=False)
-    try:
-        result, sha256 = companion_lockstep.fly(
-            mission,
-            command.connect,
-            command.connect_timeout,
-            lambda clock: open_camera(command.camera, clock),
-            stop,
-            abandon,
-            lambda phase, time_us: console.print(f"{time_us / 1e6:8.2f} s  {phase}"),
-        )
-    except (LinkError, Abandoned) as error:
-        console.print(f"error: {error}", style="red", markup=False, soft_wrap=True)
-        return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
-    for name, digest in sha256.items():
-        console.print(f"{name:<13} {digest}", highlight=False, soft_wrap=True)
-    return _conclude(command, result, interrupted, console)
-
-
-def _conclude(
-    command: CompanionCommand,
-    result: MissionResult,
-    interrupted: threading.Event,
-    console: Console,
-) -> int:
-    """Save the log and say how a mission ended; return the exit status."""
-    if command.log is not None:
-        save_arrays(command.log, result.log.columns())
+    if options.log is not None:
+        save_arrays(options.log, result.log.columns())
     for note in result.notes:
         console.print(note, style="yellow", markup=False)
     console.print(f"{result.reason}; {len(result.log)} decisions")
@@ -133,5 +120,67 @@ def _conclude(
     return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
 
 
+def _mission(options: CompanionOptions) -> Mission:
+    """Check all that can be wrong before a connection is opened, and load the policy."""
+    for metres in options.goal:
+        if not abs(metres) <= 10_000.0:
+            raise FieldError("goal", metres, "-10000 <= value <= 10000 m")
+    if options.log is not None and not options.log.parent.is_dir():
+        raise FieldError("log", options.log, problem=f"no folder {options.log.parent}")
+    policy = find_policy(options.policy)
+    pilot, watchdog = decide_piloting(options, policy, goal_radius_m=2.0)
+    # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
+    injection = select_latency(options, policy, on_this_computer=not options.lockstep)
+    check_quota(options, injection, "lockstep" if options.lockstep else "sitl")
+    loaded = load_policy(
+        policy,
+        pilot.hold_s,
+        runtime=options.runtime,
+        threads=options.threads,
+        rng=action_generator(options.seed),
+        ablate=options.ablate,
+    )
+    sampler = injection.sampler(latency_generator(options.seed, options.latency_seed))
+    return Mission(options.goal, loaded, pilot, watchdog, sampler)
+
+
+def _fly(
+    options: CompanionOptions,
+    mission: Mission,
+    stop: threading.Event,
+    abandon: threading.Event,
+    console: Console,
+) -> MissionResult:
+    def progress(phase: str, time_us: int) -> None:
+        console.print(f"{time_us / 1e6:8.2f} s  {phase}")
+
+    if not options.lockstep:
+        return fly_alone(
+            mission,
+            connect=options.connect,
+            camera=options.camera,
+            connect_timeout_s=options.connect_timeout,
+            speed=options.speed,
+            cpu_quota=options.cpu_quota,
+            stop=stop,
+            abandon=abandon,
+            progress=progress,
+        )
+    from airl_mav.lockstep.token_companion import fly
+
+    result, sha256 = fly(
+        mission,
+        options.connect,
+        options.camera,
+        options.connect_timeout,
+        stop,
+        abandon,
+        progress,
+    )
+    for name, digest in sha256.items():
+        console.print(f"{name:<13} {digest}", highlight=False)
+    return result
+
+
 if __name__ == "__main__":
-    main()
+    run_command("airl-companion", "airl_mav.cli.companion")

@@ -1,43 +1,29 @@
-"""Entry points of the console scripts: say what to install when a part is missing.
-
-The companion's installation is light; the commands of the simulator are there all the same, and
-must not greet its user with a traceback.
-"""
+"""Entry points of the console scripts."""
 
 from __future__ import annotations
 
-import importlib
+import sys
 
-from airl_mav.cli.common import check_installed, run_command
-
-
-def _start(command: str, *needed: str) -> None:
-    """Run the main of `airl_mav.cli.<command>`, if the extras that it needs are installed."""
-
-    def start() -> int:
-        check_installed(*needed)
-        importlib.import_module(f"airl_mav.cli.{command}").main()
-        return 0
-
-    # The imports take a second: who interrupts them sees no traceback either.
-    run_command(start)
+from airl_mav.cli.options import run_command
 
 
 def sitl() -> None:
     """`airl-sitl`."""
-    _start("sitl", "sim")
+    run_command("airl-sitl", "airl_mav.cli.sitl")
 
 
 def firmware() -> None:
     """`airl-firmware`."""
-    _start("firmware", "sim")
+    run_command("airl-firmware", "airl_mav.cli.firmware")
 
 
 def companion() -> None:
     """`airl-companion`: needs nothing beyond the light installation."""
-    _start("companion")
+    run_command("airl-companion", "airl_mav.cli.companion")
 
 
 def airl() -> None:
-    """`airl`: each subcommand says itself what it needs."""
-    _start("main")
+    """`airl`: the subcommands."""
+    from airl_mav.cli.main import main
+
+    main(sys.argv[1:])

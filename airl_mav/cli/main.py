@@ -2,71 +2,75 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Annotated, Any, NamedTuple, Union
+import difflib
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
 
-import tyro
+from rich.console import Console
+from rich.table import Table
 
-from airl_mav.cli.arena_command import ArenaCommand
-from airl_mav.cli.common import check_installed, run_command
-from airl_mav.cli.conformance_command import ConformanceCommand
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.export_command import ExportCommand
-from airl_mav.cli.gap_command import GapCommand
-from airl_mav.cli.ladder_command import LadderCommand
-from airl_mav.cli.parameters_command import ParametersCommand
-from airl_mav.cli.profile_command import ProfileCommand
-from airl_mav.cli.report_command import ReportCommand
-from airl_mav.cli.sweep_command import SweepCommand
-from airl_mav.cli.train_command import TrainCommand
+from airl_mav import __version__
+from airl_mav.cli.options import run_command
+from airl_mav.core.errors import EXIT_USAGE
 
-
-class Subcommand(NamedTuple):
-    """One subcommand of `airl`."""
-
-    options: type[Any]
-    """What it can be asked for: a dataclass in a module of its own, `cli/<name>_command.py`, that
-    imports nothing beyond the light installation. Its docstring is the help."""
-    module: str
-    """Where its `run(command) -> exit status` is: imported when it is asked for, not before."""
-    needs: tuple[str, ...] = ("sim",)
-    """Extras without which it does nothing at all (keys of `cli.common.EXTRAS`)."""
-
-
-SUBCOMMANDS: dict[str, Subcommand] = {
-    # To add one: write cli/<name>_command.py and cli/<name>.py, and a line here.
-    "arena": Subcommand(ArenaCommand, "airl_mav.cli.arena"),
-    "conformance": Subcommand(ConformanceCommand, "airl_mav.cli.conformance", needs=()),
-    "evaluate": Subcommand(EvaluateCommand, "airl_mav.cli.evaluate"),
-    "export": Subcommand(ExportCommand, "airl_mav.cli.export"),
-    "gap": Subcommand(GapCommand, "airl_mav.cli.gap"),
-    "ladder": Subcommand(LadderCommand, "airl_mav.cli.ladder"),
-    "parameters": Subcommand(ParametersCommand, "airl_mav.cli.parameters"),
-    "profile": Subcommand(ProfileCommand, "airl_mav.cli.profile", needs=()),
-    "report": Subcommand(ReportCommand, "airl_mav.cli.report"),
-    "sweep": Subcommand(SweepCommand, "airl_mav.cli.sweep"),
-    "train": Subcommand(TrainCommand, "airl_mav.cli.train"),
+SUBCOMMANDS: dict[str, str] = {
+    # To add one: write cli/<name>.py with OPTIONS and run(), and a line here.
+    "sitl": "rehearse a policy: firmware and companion as two processes, a report (airl-sitl)",
+    "firmware": "flight controller, vehicle and camera alone, for any client (airl-firmware)",
+    "companion": "what runs on the drone's onboard computer (airl-companion)",
+    "evaluate": "fly policies through seeded episodes, with intervals",
+    "gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
+    " mitigation",
+    "degrade": "the same policy at growing latencies: where it breaks down",
+    "ladder": "the same policy and seeds at several levels of the fidelity ladder",
+    "profile": "measure how long this computer takes for a policy's decisions",
+    "train": "train a policy on the batch twin",
+    "export": "turn a stable-baselines3 model into a policy folder",
+    "sweep": "train and evaluate many networks: the architecture search",
+    "report": "a run's tables and page again, or a comparison of several runs",
+    "arena": "look at an arena, or at what its profile draws",
+    "parameters": "a vehicle's parameters as a file for firmware that you start",
+    "conformance": "does a flight controller do what the rehearsal assumes?",
+    "list": "shipped vehicles, arenas, policies, computers, sweeps",
 }
+"""Subcommands, and what each is for; module `airl_mav.cli.<name>`."""
+
+MODULES = {"list": "airl_mav.cli.listing"}
+"""Where a subcommand's module is not called as the subcommand is."""
 
 
-def main() -> None:
-    """Entry point of `airl`."""
-    run_command(_run)
-
-
-def _run() -> int:
-    """Read the command line and run what it asks for."""
-    # Typed as Any: a union made from a table is nothing that a type checker could read.
-    union: Any = Union[  # noqa: UP007
-        tuple(
-            Annotated[entry.options, tyro.conf.subcommand(name, prefix_name=False)]
-            for name, entry in SUBCOMMANDS.items()
+def main(words: Sequence[str] | None = None) -> NoReturn:
+    """Run a subcommand and exit with its status."""
+    words = sys.argv[1:] if words is None else words
+    console = Console(soft_wrap=True)
+    if not words or words[0] in ("-h", "--help"):
+        _print_help(console)
+        sys.exit(0 if words else EXIT_USAGE)
+    name, *rest = words
+    if name == "--version":
+        console.print(f"airl-mav {__version__}", highlight=False)
+        sys.exit(0)
+    if name not in SUBCOMMANDS:
+        near = difflib.get_close_matches(name, SUBCOMMANDS, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(SUBCOMMANDS)}"
+        Console(stderr=True, soft_wrap=True).print(
+            f"error: airl {name}: no such command; {hint}", style="red", markup=False
         )
-    ]
-    command = tyro.cli(union, prog="airl", description=__doc__)
-    (entry,) = (entry for entry in SUBCOMMANDS.values() if entry.options is type(command))
-    check_installed(*entry.needs)
-    return int(importlib.import_module(entry.module).run(command))
+        sys.exit(EXIT_USAGE)
+    run_command(f"airl {name}", MODULES.get(name, f"airl_mav.cli.{name}"), rest)
+
+
+def _print_help(console: Console) -> None:
+    console.print("usage: airl COMMAND [OPTIONS]\n\nCommands:", highlight=False)
+    table = Table.grid(padding=(0, 2, 0, 2))
+    for name, purpose in SUBCOMMANDS.items():
+        table.add_row(name, purpose)
+    console.print(table)
+    console.print(
+        "\nairl COMMAND --help shows its options and examples; airl --version the version.",
+        highlight=False,
+    )
 
 
 if __name__ == "__main__":

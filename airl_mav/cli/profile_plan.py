@@ -23,13 +23,13 @@ from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
 from airl_mav.policy.layouts import LayoutName, ObservationSpec, camera_mismatch
-from airl_mav.policy.registry import DEFAULT_POLICY, find_policy
+from airl_mav.policy.registry import find_policy
 from airl_mav.policy.template import write_template
 from airl_mav.profiles.computer import ComputerProfile, Network
 from airl_mav.profiles.computer_file import existing_profile
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario.model import PilotSettings
+from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings
 
 FLOWN_HOLD_S = 0.05
 """t3 while stages are measured in flight [s]: 1,000 decisions are over in less than two minutes."""

@@ -1,51 +1,50 @@
-"""A rehearsal in lockstep: N seeded episodes in this process, one run folder."""
+"""Episodes in lockstep in this process, one after the other, with somebody who looks on."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection
 
-from airl_mav.lockstep.flight import LockstepPlan, Watching, fly
-from airl_mav.policy.actions import Policy
+from airl_mav.lockstep.flight import Watching, fly
 from airl_mav.rehearsal.channel import Text
-from airl_mav.rehearsal.evaluation import Job
 from airl_mav.rehearsal.rehearsal import Observer
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.rehearsal.true_state import state_of
+from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.state import Message
 from firmware_sim.simulation import Simulation
+from firmware_sim.warm_up import warm_up
 
 SHOW_EVERY = 125
 """The observer sees the true state every so many ticks: twice a simulated second."""
 
 
 def rehearse(
-    plan: LockstepPlan,
-    jobs: Sequence[Job],
-    fresh_policy: Callable[[int], Policy],
-    folder: RunFolder,
-    observer: Observer,
+    scenario: ResolvedScenario, folder: RunFolder, observer: Observer, done: Collection[int] = ()
 ) -> None:
     """Fly episodes; each is saved as it ends.
 
     Args:
-        plan: What is flown on what.
-        jobs: The episodes.
-        fresh_policy: Gives the policy as it begins a flight with a seed.
+        scenario: What is flown.
         folder: Where everything goes.
         observer: Who looks on.
+        done: Numbers of the episodes that need not be flown.
 
     Raises:
         UsageError: The policy cannot use the camera; no arena can be made of a seed.
         LockstepError: The companion hangs, or broke.
     """
-    for job in jobs:
+    observer.waiting("loading")
+    warm_up(scenario.vehicle)
+    for index, seed in enumerate(scenario.scenario.seeds):
+        if index in done:
+            continue
         flown = fly(
-            plan,
-            fresh_policy(job.seed),
-            job.index,
-            job.seed,
-            tlog=folder.tlog_path(job.index),
-            watching=_watching(observer, job.index, job.seed),
+            scenario,
+            scenario.fresh_policy(seed),
+            index,
+            seed,
+            tlog=folder.tlog_path(index),
+            watching=_watching(observer, index, seed),
         )
         folder.save_episodes([flown])
         observer.finished(flown.record)

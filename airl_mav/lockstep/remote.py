@@ -1,11 +1,18 @@
-"""Vehicle and flight controller on a simulated clock that a companion in another process shares."""
+"""Vehicle and flight controller on a simulated clock that a companion in another process shares.
+
+`airl-firmware --lockstep`: simulated time waits for that companion.
+"""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import SEEN, FlightDigest
@@ -15,9 +22,11 @@ from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.rehearsal.supervisor import Supervisor
+from airl_mav.scenario.model import Ports
 from firmware_sim.firmware import BuiltinAvionics, Firmware, FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 
@@ -145,3 +154,70 @@ class RemoteStage:
         self._judge.look(simulation)
         if self.on_tick is not None:
             self.on_tick(simulation)
+
+
+@dataclass(frozen=True)
+class Sockets:
+    """Where the companion is reached; they outlive a flight."""
+
+    endpoint: UdpEndpoint
+    camera: CameraServer
+
+    @classmethod
+    def open(cls, ports: Ports, bind: str, companion_host: str, *, insecure: bool) -> Sockets:
+        """Bind the onboard link's port and the camera's. Raises UsageError when they are taken."""
+        endpoint = UdpEndpoint(
+            (bind, ports.api_local_port),
+            (companion_host, ports.api_port),
+            local_option="--api-local-port",
+            remote_option="--api-port",
+            insecure=insecure,
+        )
+        try:
+            return cls(endpoint, CameraServer(f"tcp://{bind}:{ports.camera_port or '*'}"))
+        except UsageError:
+            endpoint.close()
+            raise
+
+    def stage(self, plan: RemotePlan, broken_off: Callable[[], bool]) -> RemoteStage:
+        """Return the stage of one flight; see there."""
+        return RemoteStage(self.endpoint, self.camera, plan, broken_off=broken_off)
+
+    def close(self) -> None:
+        """Release the ports."""
+        self.endpoint.close()
+        self.camera.close()
+
+
+def fly_stage(
+    stage: RemoteStage, stop: threading.Event, end_us: int | None, say: Callable[[str], None]
+) -> None:
+    """Fly a loaded stage until the companion has ended; say how it went, and the fingerprint.
+
+    Args:
+        stage: The flight.
+        stop: Set from outside to end it.
+        end_us: Simulated time at which it ends in any case [µs].
+        say: Is told what happens, a line at a time.
+
+    Raises:
+        LockstepError: The companion is gone, or does not keep to the turns.
+    """
+    start_us, stopwatch = stage.time_us, WallClock()
+    stage.on_phase = lambda phase, time_us: say(f"{time_us / US_PER_S:8.2f} s  {phase}")
+    stage.on_verdict = lambda verdict: say(
+        f"{verdict.time_us / US_PER_S:8.2f} s  {verdict.outcome.value}: {verdict.reason}",
+    )
+    while not stage.ended and not stop.is_set() and (end_us is None or stage.time_us < end_us):
+        alone = stage.turns == 0
+        stage.step()
+        if alone:
+            stopwatch = WallClock()  # the wait for the companion is no part of the flight
+    flown_s = (stage.time_us - start_us) / US_PER_S
+    wall_s = max(stopwatch.time_us(), 1) / US_PER_S
+    say(
+        f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time; "
+        f"{stage.turns} turns"
+    )
+    for name, sha256 in stage.lanes().items():
+        say(f"{name:<13} {sha256}")

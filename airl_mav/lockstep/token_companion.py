@@ -1,22 +1,19 @@
-"""`airl-companion --lockstep`: the companion of a simulator that waits for it."""
+"""The companion of a simulator that waits for it (`airl-companion --lockstep`)."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 
-from airl_mav.core.constants import US_PER_MS
-from airl_mav.envs.spec import Delay
-from airl_mav.latency.samplers import FixedSampler, LatencySampler
+from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
-from airl_mav.policy.actions import Policy
-from airl_mav.scenario.model import PilotSettings, WatchdogSettings
-from companion.camera import ZmqFrameSource
+from airl_mav.scenario.resolved import NATIVE_T2_US
+from companion.camera import open_camera
 from companion.conducted import ConductedClock
 from companion.link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
+from companion.program import Mission
 from companion.token_camera import TokenFrameSource
 from companion.token_clock import TokenTurns
 
@@ -26,24 +23,11 @@ never in a flight, also when a process is stopped for a while, but it notices a 
 gone."""
 
 
-@dataclass(frozen=True)
-class Mission:
-    """What is flown."""
-
-    goal: tuple[float, float]
-    """North, east [m] from the start."""
-    policy: Policy
-    pilot: PilotSettings
-    watchdog: WatchdogSettings
-    latency: LatencySampler | None
-    """t2; None: as in training, nothing is timed here."""
-
-
 def fly(
     mission: Mission,
     connect: str,
+    camera_address: str,
     timeout_s: float,
-    open_camera: Callable[[ConductedClock], ZmqFrameSource],
     stop: threading.Event,
     abandon: threading.Event,
     progress: Callable[[str, int], None],
@@ -53,8 +37,8 @@ def fly(
     Args:
         mission: What is flown.
         connect: MAVSDK connection to the simulator.
+        camera_address: ZeroMQ address of the camera.
         timeout_s: How long to wait for it, and for each turn [wall s].
-        open_camera: Connects to the camera.
         stop: Set to end the flight early; the simulator sets it, too.
         abandon: Set to end it without landing; the simulator sets it, too.
         progress: Called with the name of each phase as it begins, and the simulated time [µs].
@@ -76,7 +60,7 @@ def fly(
         progress(phase, clock.time_us())
 
     with (
-        closing(open_camera(clock)) as frames,
+        closing(open_camera(camera_address, clock)) as frames,
         # Who gives turns is heard, however long the wall clock says that it was silent.
         closing(MavsdkLink(connect, clock, abandon, heard=lambda: True)) as link,
     ):
@@ -97,6 +81,6 @@ def fly(
                 pilot_settings=mission.pilot,
                 watchdog_settings=mission.watchdog,
                 guard=clock,
-                latency=mission.latency or FixedSampler(round(Delay().native_ms * US_PER_MS)),
+                latency=mission.latency or FixedSampler(NATIVE_T2_US),
             )
     return result, {SEEN: digest.lanes()[SEEN]}

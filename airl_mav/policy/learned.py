@@ -142,6 +142,7 @@ def decide(
 
 def load_learned(
     folder: Path,
+    card: PolicyCard | None = None,
     *,
     runtime: RuntimeName = "onnx",
     threads: int = 1,
@@ -152,6 +153,7 @@ def load_learned(
 
     Args:
         folder: The folder.
+        card: Its card, where it has been read; None: it is read here.
         runtime: What runs the network; `torch` takes the folder's `policy.pt2`.
         threads: Threads of one inference.
         rng: Source of random actions; a card with an epsilon needs one.
@@ -160,7 +162,7 @@ def load_learned(
     Raises:
         UsageError: Card and policy do not fit each other, or the runtime is not installed.
     """
-    card = read_card(folder)
+    card = card or read_card(folder)
     network = open_network(folder, card, runtime, threads)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     _warm_up(policy, network)

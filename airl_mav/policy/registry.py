@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
-
-DEFAULT_POLICY = "static-obstacles"
-"""What flies when nobody says what."""
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (
@@ -75,7 +72,7 @@ def policy_description(name: str) -> str:
 
 
 def load_policy(
-    name: str,
+    policy: PolicyInfo | str,
     hold_s: float,
     *,
     runtime: RuntimeName = "onnx",
@@ -83,10 +80,10 @@ def load_policy(
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
 ) -> Policy:
-    """Return a policy by name, or by the path of its folder.
+    """Return a policy, ready to decide.
 
     Args:
-        name: Its name or path.
+        policy: What is known of it; or its name, or the path of its folder.
         hold_s: How long each of its actions will be held [s].
         runtime: What runs the network of a learned policy.
         threads: Threads of one of its inferences.
@@ -97,12 +94,15 @@ def load_policy(
         UsageError: There is no such policy (lists those that exist), its card does not fit it, or
             it cannot be run as asked.
     """
-    folder = _folder(name)
-    if folder is not None:
-        return load_learned(folder, runtime=runtime, threads=threads, rng=rng, ablate=ablate)
-    if runtime != "onnx" or ablate is not None:
-        raise UsageError(f"--policy {name!r}: not a learned policy: no runtime or ablation of it")
-    return POLICIES[name][1](hold_s)
+    known = find_policy(policy) if isinstance(policy, str) else policy
+    if known.folder is not None and known.card is not None:
+        return load_learned(
+            known.folder, known.card, runtime=runtime, threads=threads, rng=rng, ablate=ablate
+        )
+    for field, value in (("runtime", None if runtime == "onnx" else runtime), ("ablate", ablate)):
+        if value is not None:
+            raise FieldError(field, value, f"for a learned policy; {known.name} is none")
+    return POLICIES[known.name][1](hold_s)
 
 
 def _shipped() -> list[str]:

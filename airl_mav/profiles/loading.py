@@ -43,6 +43,15 @@ def list_profiles(kind: Kind) -> list[str]:
     return sorted(path.stem for path in (profiles_dir() / kind).glob("*.toml"))
 
 
+def describe_profile(kind: Kind, name: str) -> str:
+    """Return the line in which a shipped profile describes itself, "" when it has none.
+
+    Raises:
+        UsageError: There is no such profile, or it is no TOML.
+    """
+    return str(_read(kind, _path(kind, name), ()).get("description", ""))
+
+
 def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """Load a shipped profile by name, or any file by path (recognised by its .toml suffix).
 

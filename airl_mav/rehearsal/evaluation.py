@@ -1,76 +1,60 @@
-"""What an evaluation is at every level: seeded episodes of one setup in one folder, resumable."""
+"""A run and its folder: opened for a scenario, new or to be gone on with."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import Setup
 from airl_mav.rehearsal.run_folder import RUN_FILE, RunFolder, load
-
-LEAVES_RESULTS_ALONE = ("policy_path", "slots", "speed", "tlogs", "workers")
-"""Settings that may change when a run is taken up again."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """An episode to be flown."""
-
-    index: int
-    """Its number in the run."""
-    seed: int
+from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
+from airl_mav.scenario.model import free_fields
+from airl_mav.scenario.resolved import ResolvedScenario
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """What is flown, whatever the level."""
+def run_settings(scenario: ResolvedScenario) -> dict[str, Any]:
+    """Return all that is written down of a run, as plain values.
 
-    setup: Setup
-    seeds: tuple[int, ...]
-    """Seed of each episode, by index; no two the same."""
-    config: Mapping[str, Any]
-    """Every setting, as plain values: what differs in any of them is another run, but for those
-    of `LEAVES_RESULTS_ALONE`."""
-
-    def jobs(self, done: Iterable[EpisodeRecord] = ()) -> list[Job]:
-        """Return what is left to be flown when some episodes are done."""
-        there = {record.index for record in done}
-        return [Job(index, seed) for index, seed in enumerate(self.seeds) if index not in there]
-
-
-@dataclass(frozen=True)
-class Watch:
-    """Who looks on while an evaluation flies."""
-
-    finished: Callable[[EpisodeRecord], None] = field(default=lambda _: None)
-    """Is told of each episode as it ends."""
-    say: Callable[[str], None] = field(default=lambda _: None)
-    """Is told, in words, what a person should know."""
-    stop: Callable[[], bool] = field(default=lambda: False)
-    """Asked again and again; True ends it all, with what has ended kept."""
+    The scenario as asked for, what it comes to, and the content of profiles and policy: a name does
+    not tell a changed one.
+    """
+    profiles: dict[str, BaseModel] = {
+        "vehicle": scenario.vehicle,
+        "arena": scenario.arena,
+        "computer": scenario.computer,
+    }
+    if scenario.injection.latency is not None:
+        profiles["latency"] = scenario.injection.latency
+    return {
+        **scenario.scenario.model_dump(mode="json"),
+        "pilot": asdict(scenario.pilot),
+        "watchdog": scenario.watchdog.model_dump(mode="json"),
+        "policy_sha256": scenario.policy.sha256,
+        "profiles_sha256": {
+            kind: hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
+            for kind, profile in profiles.items()
+        },
+    }
 
 
-def open_folder(
-    out: Path | None,
-    name: str,
-    evaluation: Evaluation,
-    *,
-    free: Collection[str] = LEAVES_RESULTS_ALONE,
-    may_grow: bool = False,
+def open_run(
+    scenario: ResolvedScenario, out: Path | None, name: str
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
 
+    A run with the first ones of the seeds is the same run, and is added to.
+
     Args:
+        scenario: What is flown.
         out: The folder; None makes a new one.
         name: Name of a new run.
-        evaluation: What is flown.
-        free: Settings that may differ, a table of them by its name.
-        may_grow: Whether a run with the first ones of the seeds is the same one, and is added to.
 
     Returns:
         The folder, and the episodes that it holds.
@@ -78,13 +62,15 @@ def open_folder(
     Raises:
         UsageError: It holds another run.
     """
-    config, seeds = evaluation.config, evaluation.seeds
+    config, seeds = run_settings(scenario), scenario.scenario.seeds
     if out is None or not (out / RUN_FILE).exists():
-        folder = RunFolder.create(out, name, config, setup=evaluation.setup, seeds=seeds)
+        folder = RunFolder.create(out, name, config, setup=scenario.setup, seeds=seeds)
+        save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
         return folder, ()
     held = load(out).info
-    grows = may_grow and len(held.seeds) < len(seeds) and held.seeds == seeds[: len(held.seeds)]
-    if difference := another_config(held.config, config, (*free, "episodes") if grows else free):
+    grows = len(held.seeds) < len(seeds) and held.seeds == seeds[: len(held.seeds)]
+    free = free_fields(scenario.scenario.level) | ({"episodes"} if grows else set())
+    if difference := another_config(held.config, config, free):
         raise UsageError(
             f"--out {out}: holds a run with {difference}; accepted: a new folder, or the same "
             "settings to go on"
@@ -93,11 +79,12 @@ def open_folder(
     folder.sweep()
     if grows:
         folder.plan_again(config, seeds)
+        save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
     return folder, run.episodes
 
 
 def another_config(
-    held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = LEAVES_RESULTS_ALONE
+    held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = ()
 ) -> str | None:
     """Return the first setting in which two configurations differ, or None when they do not.
 

@@ -1,7 +1,7 @@
 """The scenario: the one model of all that a rehearsal can be asked for.
 
-Command-line options, scenario files, `run.json` and what the processes of a rehearsal are told are all
-this model. Meaning, unit, range and default of a setting stand here and nowhere else.
+Command-line options, scenario files, `run.json` and what the processes of a rehearsal are told are
+all this model. Meaning, unit, range and default of a setting stand here and nowhere else.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 
 DEFAULT_POLICY = "static-obstacles"
 """The shipped policy that flies by default."""
@@ -79,8 +79,10 @@ class WatchdogSettings(ProfileModel):
         default=2.0,
     )
     hover_after_s: float | None = quantity(
-        "zero the velocity this long after an action's hold time, whether or not a decision has come"
-        " (AirSim: 0.06); by default as the policy's card says, or never: the last setpoint persists,"
+        "zero the velocity this long after an action's hold time, whether or not a decision has"
+        " come"
+        " (AirSim: 0.06); by default as the policy's card says, or never: the last setpoint"
+        " persists,"
         " as with PX4 and MAVSDK",
         "s",
         ge=0,
@@ -139,7 +141,8 @@ class RealFirmware(ProfileModel):
     )
     ardupilot_connect: bool = Field(
         default=False,
-        description="with firmware ardupilot: wait for an ArduCopter that you start for every flight",
+        description="with firmware ardupilot: wait for an ArduCopter that you start for every"
+        " flight",
     )
     instance: int = quantity(
         "with PX4 or ArduPilot SITL: instance number; moves all of its ports, as -i and -I do",
@@ -208,7 +211,8 @@ class Decisions(ProfileModel):
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
     trust: bool = Field(
         default=False,
-        description="run policy.pt2 of a folder that is not shipped: loading it can execute code that"
+        description="run policy.pt2 of a folder that is not shipped: loading it can execute code"
+        " that"
         " its author wrote",
     )
     cpu_quota: float | None = quantity(
@@ -220,7 +224,8 @@ class Decisions(ProfileModel):
         default=None,
     )
     hold_s: float | None = quantity(
-        "t3: how long an action is held before the next observation; by default that of the policy's"
+        "t3: how long an action is held before the next observation; by default that of the"
+        " policy's"
         " card, or 0.5",
         "s",
         ge=0,
@@ -235,7 +240,8 @@ class Decisions(ProfileModel):
         default=None,
     )
     goal_radius_m: float | None = quantity(
-        "the goal is reached closer than this, seen from above; by default that of the policy's card,"
+        "the goal is reached closer than this, seen from above; by default that of the policy's"
+        " card,"
         " or 3",
         "m",
         ge=0.2,
@@ -268,8 +274,10 @@ class Lateness(ProfileModel):
     )
     workload: str | None = Field(
         default=None,
-        description="workload of the computer profile whose latency t2 is injected; estimate: scaled"
-        " to this policy; by default what was measured for this very policy, or else what this machine"
+        description="workload of the computer profile whose latency t2 is injected; estimate:"
+        " scaled"
+        " to this policy; by default what was measured for this very policy, or else what this"
+        " machine"
         " takes (sitl) or 1 ms (gym, lockstep)",
     )
     latency: str | None = Field(
@@ -288,8 +296,10 @@ class Flights(ProfileModel):
 
     level: LevelName = Field(
         default="sitl",
-        description="rung of the fidelity ladder. gym: the batch twin, some hundred episodes a second."
-        " lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the same flight"
+        description="rung of the fidelity ladder. gym: the batch twin, some hundred episodes a"
+        " second."
+        " lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the same"
+        " flight"
         " every time, bit by bit. sitl: two processes over UDP, in real time times the speed",
     )
     episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
@@ -333,8 +343,8 @@ class Flights(ProfileModel):
 class Scenario(Flights, Lateness, Decisions, Aircraft):
     """All that a rehearsal can be asked for.
 
-    The fields are flat, but for the tables `wind`, `watchdog`, `real` and `ports`. What is left at None
-    is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
+    The fields are flat, but for the tables `wind`, `watchdog`, `real` and `ports`. What is left at
+    None is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
 
     Raises:
         pydantic.ValidationError: A field is unknown, of the wrong type, or out of range.
@@ -342,7 +352,8 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
 
     policy: str = Field(
         default=DEFAULT_POLICY,
-        description="policy that decides: a name, or a path to a folder with policy.onnx and card.json",
+        description="policy that decides: a name, or a path to a folder with policy.onnx and"
+        " card.json",
     )
     arena: str = Field(
         default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from typing import Any
+from dataclasses import replace
 
 from airl_mav.arena.generate import generate
-from airl_mav.core.cpu_quota import check_permitted
 from airl_mav.core.errors import FieldError
-from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
 from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
-from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.model import (
-    Decisions,
-    Lateness,
-    PilotSettings,
-    Ports,
-    Scenario,
-    WatchdogSettings,
-)
+from airl_mav.scenario.model import Ports, Scenario
+from airl_mav.scenario.piloting import check_quota, decide_piloting
 from airl_mav.scenario.resolved import NATIVE_T2_US, ResolvedScenario
 
 SITL_SPEEDS = 0.5, 10.0
@@ -43,8 +34,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     """Check all that can be wrong before anything starts, and load all that the scenario names.
 
     Raises:
-        UsageError: A field contradicts another, a profile or the policy cannot be used, or no arena can
-            be made of the first seed. `FieldError`s name the field.
+        UsageError: A field contradicts another, a profile or the policy cannot be used, or no
+            arena can be made of the first seed. `FieldError`s name the field.
     """
     check_level(scenario)
     check_firmware(scenario)
@@ -63,7 +54,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
-    check_quota(scenario, injection)
+    check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,
         vehicle=vehicle,
@@ -77,36 +68,6 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     # What cannot be run is better found here than by a process that is already flying.
     resolved.fresh_policy(scenario.seed)
     return resolved
-
-
-def decide_piloting(asked: Decisions, policy: PolicyInfo) -> tuple[PilotSettings, WatchdogSettings]:
-    """Return how a policy is flown: as asked, else as its card says, else by default.
-
-    Raises:
-        FieldError: A decision would be overdue before its predecessor's hold time is over.
-    """
-    card = policy.card
-    known: dict[str, Any] = {"goal_radius_m": GOAL_RADIUS_M}
-    hover_s = asked.watchdog.hover_after_s
-    if card is not None:
-        known = {
-            "hold_s": card.hold_s,
-            "goal_radius_m": card.goal_radius_m,
-            "altitude_m": card.altitude_m,
-            "max_speed_m_s": card.actions.max_speed_m_s,
-        }
-        hover_s = card.hover_after_s if hover_s is None else hover_s
-    names = asdict(PilotSettings())
-    given = {name: value for name in names if (value := getattr(asked, name)) is not None}
-    pilot = PilotSettings(**(known | given))
-    timeout_s = asked.watchdog.decision_timeout_s
-    if timeout_s <= pilot.hold_s:
-        raise FieldError(
-            "watchdog.decision_timeout_s",
-            f"{timeout_s:g}",
-            f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
-        )
-    return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
 
 
 def check_level(scenario: Scenario) -> None:
@@ -169,47 +130,12 @@ def check_firmware(asked: Scenario) -> None:
                 )
 
 
-def check_quota(asked: Decisions, injection: Injection, *, lockstep: bool = False) -> None:
-    """Raise UsageError for a limit on the processor that is of no use, or not permitted."""
-    if asked.cpu_quota is None:
-        return
-    level = asked.level if isinstance(asked, Scenario) else "lockstep" if lockstep else "sitl"
-    if level != "sitl" or injection.latency is not None:
-        why = "an injected latency" if level == "sitl" else f"level {level}"
-        raise FieldError(
-            "cpu_quota",
-            f"{asked.cpu_quota:g}",
-            f"without {why}: only where the companion's own time counts",
-        )
-    check_permitted(asked.cpu_quota)
-
-
-def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
-    """Return the latency that a companion by itself flies with.
-
-    Args:
-        asked: What was asked for.
-        policy: What flies.
-        on_this_computer: Whether it runs on the very computer that it flies as: what was measured there
-            is then no addition.
-
-    Raises:
-        UsageError: There is no such computer, workload or source.
-    """
-    return select_injection(
-        asked.latency,
-        load_computer(asked.computer),
-        asked.workload,
-        policy_sha256=None if on_this_computer else policy.sha256,
-        macs=policy.macs,
-    )
-
-
 def _labelled(injection: Injection, scenario: Scenario) -> Injection:
     """Return the latency as a report of the level calls it."""
     if scenario.cpu_quota is not None:
         label = (
-            f"native speed of the machine that flew, companion held to {scenario.cpu_quota:g} % of a "
+            f"native speed of the machine that flew, companion held to {scenario.cpu_quota:g} %"
+            f" of a "
             "core; nothing injected"
         )
         return replace(injection, label=label)

@@ -27,14 +27,17 @@ ACTION_STREAM = 1
 """Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
 
 ARRIVAL_SHARE = 0.8
-"""The companion flies to this share of the goal radius: it knows its position only by estimate, while
+"""The companion flies to this share of the goal radius: it knows its position only by estimate,
+while
 the referee measures the true one."""
 
 NATIVE_T2_US = round(1.0 * US_PER_MS)
-"""t2 where nothing is injected and no machine's own time counts: inference on a desktop computer."""
+"""t2 where nothing is injected and no machine's own time counts: inference on a desktop
+computer."""
 
 TRANSPORT_US = round(5.0 * US_PER_MS)
-"""t1 without the wait for the frame, where no machine's own time counts: exposure to decoded [µs]."""
+"""t1 without the wait for the frame, where no machine's own time counts: exposure to decoded
+[µs]."""
 
 FIRMWARE_TITLES: dict[FirmwareName, str] = {
     "builtin": BUILT_IN,
@@ -121,8 +124,8 @@ class ResolvedScenario:
 
         Args:
             seed: Of the episode.
-            native: Whether the companion's own time counts: then None means that nothing is injected;
-                otherwise t2 is that of a desktop computer.
+            native: Whether the companion's own time counts: then None means that nothing is
+                injected; otherwise t2 is that of a desktop computer.
         """
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)

@@ -21,12 +21,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
+from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from numpy.typing import NDArray
 from pydantic import Field
 from rich.console import Console
 from rich.progress import Progress
 
-from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity

@@ -29,13 +29,14 @@ from airl_mav.cli.gap_plan import TRAINING_LATENCY_SEED, plan_gap
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
-from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo
+from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.report.gap import terminal as gap_terminal
 from airl_mav.report.gap.build import GapStudy, worst_seeds
 from airl_mav.report.gap.file import GAP_FILE, read_gap, write_gap
 from airl_mav.report.gap.tables import columns_table, detail_table, gaps_table
 from airl_mav.report.gap.words import answers
+from airl_mav.scenario.model import DEFAULT_POLICY
 
 EPISODES = 24
 ROLES = ("reference", "target", "mitigated", "training", "mitigated-reference")

@@ -30,10 +30,10 @@ from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card, write_card
 from airl_mav.policy.layouts import ObservationSpec, encode_layout
 from airl_mav.policy.learned import LearnedPolicy, decide, load_learned
 from airl_mav.policy.observation import Kinematics, Observation, encode
-from airl_mav.policy.registry import DEFAULT_POLICY, find_policy, load_policy, policy_names
+from airl_mav.policy.registry import find_policy, load_policy, policy_names
 from airl_mav.policy.runtime import Runtime, TorchRuntime
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.scenario.model import PilotSettings
+from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings
 from companion.camera import ReceivedFrame
 from companion.mission import first_lens
 from tests.support.policy_kit import SPEC, export_tiny, noise

@@ -1,0 +1,53 @@
+"""`airl list`: what is shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
+from rich.console import Console
+from rich.table import Table
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.policy.registry import find_policy, policy_names
+from airl_mav.profiles.loading import describe_profile, list_profiles
+
+KINDS: dict[str, Callable[[], list[tuple[str, str]]]] = {
+    "policies": lambda: [(name, find_policy(name).description) for name in policy_names()],
+    **{
+        kind: lambda kind=kind: [  # type: ignore[misc]  # bound now, not when it is called
+            (name, describe_profile(kind, name)) for name in list_profiles(kind)
+        ]
+        for kind in ("vehicles", "arenas", "computers", "training", "sweeps")
+    },
+}
+
+
+class ListOptions(BaseModel):
+    """List what is shipped: vehicles, arenas, policies, computers, training configurations, sweeps.
+
+    Examples:
+        airl list
+        airl list policies
+    """
+
+    kind: Annotated[
+        Literal["vehicles", "arenas", "policies", "computers", "training", "sweeps", "all"],
+        POSITIONAL,
+    ] = Field(default="all", description="what to list")
+
+
+OPTIONS = ListOptions
+EXTRAS = ()
+
+
+def run(options: ListOptions, console: Console | None = None) -> int:
+    """Print the names with one line about each. Returns exit status 0."""
+    console = console or Console()
+    for kind in KINDS if options.kind == "all" else (options.kind,):
+        table = Table(title=kind, title_justify="left", box=None, show_header=False)
+        for name, description in KINDS[kind]():
+            table.add_row(name, description)
+        console.print(table)
+    return 0

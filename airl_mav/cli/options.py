@@ -1,0 +1,215 @@
+"""Command lines made from models: a field's meaning, unit, range and default stand on the model.
+
+A command's options are a pydantic model, mostly the scenario's own groups of fields. tyro reads the
+words; the model checks the values, so that what is wrong gets one line which names the option.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TypeVar
+
+import tyro
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from rich.console import Console
+
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, FieldError, UsageError
+from airl_mav.core.fields import range_of, validated
+from airl_mav.scenario.file import read_scenario_file
+
+Options = TypeVar("Options", bound=BaseModel)
+
+POSITIONAL = "positional"
+"""Marks a field whose values come without an option's name."""
+
+PREFIXED = ("wind",)
+"""Tables whose options carry the table's name; those of the others are unique by themselves."""
+
+RENAMED: dict[str, tuple[str, ...]] = {
+    "--hold": ("--hold-s",),
+    "--altitude": ("--altitude-m",),
+    "--goal-radius": ("--goal-radius-m",),
+    "--time-limit": ("--time-limit-s",),
+    "--hover-after": ("--hover-after-s",),
+}
+"""Old options, and what they are called now."""
+
+
+def read_options(
+    model: type[Options],
+    prog: str,
+    words: Sequence[str],
+    *,
+    renamed: Mapping[str, tuple[str, ...]] = RENAMED,
+) -> Options:
+    """Read a command line into its model.
+
+    A first word that ends in .toml is a scenario file: its values are the defaults of the options.
+
+    Args:
+        model: What the command can be asked for; its docstring is the help.
+        prog: Name of the command.
+        words: The command line without the command's name.
+        renamed: Options that still work under an old name, which is said on standard error.
+
+    Raises:
+        UsageError: A value is out of its range, or the scenario file cannot be used.
+        SystemExit: tyro has printed the help, or what is wrong with the words.
+    """
+    words = _with_new_names(words, renamed)
+    file: Path | None = None
+    held: dict[str, Any] = {}
+    takes_file = "policy" in model.model_fields and not _positionals(model)
+    if takes_file and words and words[0].endswith(".toml"):
+        file, words = Path(words[0]), words[1:]
+        held = read_scenario_file(file)
+    try:
+        defaults = validated(model, held)
+    except FieldError as error:
+        raise UsageError(f"{file}: {error.line(sign=' = ')}") from None
+    parsed = tyro.cli(_arguments(model, defaults), prog=prog, description=model.__doc__, args=words)
+    try:
+        return validated(model, dataclasses.asdict(parsed))
+    except FieldError as error:
+        raise UsageError(told(error, words, file)) from None
+
+
+def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> str:
+    """Return an error about a field in one line that names the option, or the line of the file."""
+    option = option_of(error.field)
+    given = any(word == option or word.startswith(f"{option}=") for word in words)
+    if file is not None and not given:
+        return f"{file}: {error.line(sign=' = ')}"
+    return error.line(option)
+
+
+def option_of(field: str) -> str:
+    """Return the option of a field: hold_s -> --hold-s, watchdog.leave_after_s ->
+    --leave-after-s."""
+    table, _, name = field.rpartition(".")
+    full = f"{table}.{name}" if table in PREFIXED else name
+    return "--" + full.replace("_", "-")
+
+
+def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """Return the words with old options replaced, and say so."""
+    out: list[str] = []
+    for word in words:
+        name, equals, value = word.partition("=")
+        if name not in renamed:
+            out.append(word)
+            continue
+        new = renamed[name]
+        Console(stderr=True, soft_wrap=True).print(
+            f"{name} is called {' '.join(new)} now", style="yellow", markup=False, highlight=False
+        )
+        out += [*new[:-1], f"{new[-1]}{equals}{value}"]
+    return out
+
+
+def _positionals(model: type[BaseModel]) -> list[str]:
+    return [name for name, field in model.model_fields.items() if POSITIONAL in field.metadata]
+
+
+def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
+    """Return the dataclass that tyro reads into: the model's types and defaults without its
+    ranges."""
+    fields: list[tuple[str, Any, Any]] = []
+    # Positional words first: what has no default must come before what has one.
+    names = sorted(
+        model.model_fields, key=lambda name: POSITIONAL not in model.model_fields[name].metadata
+    )
+    for name in names:
+        field, default = model.model_fields[name], getattr(defaults, name)
+        kind: Any = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            inner = _arguments(kind, default)
+            prefix = name in PREFIXED
+            kind = inner if prefix else tyro.conf.OmitArgPrefixes[inner]  # type: ignore[valid-type]
+            fields.append((name, kind, dataclasses.field(default_factory=inner)))
+            continue
+        marks: list[Any] = [tyro.conf.arg(help=_help(field))]
+        if POSITIONAL in field.metadata:
+            marks = [
+                tyro.conf.Positional,
+                tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
+            ]
+        fields.append((name, Annotated[(kind, *marks)], dataclasses.field(default=default)))  # type: ignore[valid-type]
+    made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)
+    made.__doc__ = model.__doc__
+    return made
+
+
+def _metavar(name: str, kind: Any) -> str:
+    word = name.removesuffix("s").upper() if "tuple" in str(kind) else name.upper()
+    return f"[{word} ...]" if "tuple" in str(kind) else word
+
+
+def _help(field: FieldInfo) -> str:
+    """Return a field's meaning with its range and unit, as a sentence."""
+    meaning = field.description or ""
+    meaning = meaning[:1].upper() + meaning[1:]
+    limits = range_of(field)
+    return f"{meaning}. Accepted: {limits}." if limits else f"{meaning}."
+
+
+def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> NoReturn:
+    """Run the command of a module and exit with its status.
+
+    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`; and where it
+    differs from the usual, `RENAMED_OPTIONS` and `EXTRAS`, the extras without which it does
+    nothing. Usage errors become one line and exit status 2, a machine that fails one line and 1.
+    """
+    words = sys.argv[1:] if words is None else words
+    try:
+        command = importlib.import_module(module)
+        check_installed(*getattr(command, "EXTRAS", ("sim",)))
+        renamed = getattr(command, "RENAMED_OPTIONS", RENAMED)
+        options = read_options(command.OPTIONS, prog, words, renamed=renamed)
+        code = _run(command.run, options, words)
+    except UsageError as error:
+        _fail(str(error))
+        code = EXIT_USAGE
+    except OSError as error:  # a full disk, above all
+        _fail(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+        code = EXIT_BROKEN
+    except KeyboardInterrupt:
+        code = EXIT_INTERRUPTED
+    sys.exit(code)
+
+
+def _run(run: Callable[[Any], int], options: BaseModel, words: Sequence[str]) -> int:
+    try:
+        return run(options)
+    except FieldError as error:
+        raise UsageError(told(error, words)) from None
+
+
+def _fail(message: str) -> None:
+    Console(stderr=True, soft_wrap=True).print(f"error: {message}", style="red", markup=False)
+
+
+EXTRAS = {
+    "profile": ("onnx",),
+    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy"),
+    "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
+}
+"""What the extras install, by their names in pyproject.toml."""
+
+
+def check_installed(*extras: str) -> None:
+    """Raise UsageError, with what to install, unless all that these extras install is there."""
+    lacking = {
+        extra: missing
+        for extra in extras
+        if (missing := [name for name in EXTRAS[extra] if find_spec(name) is None])
+    }
+    if lacking:
+        names = ", ".join(sorted({name for missing in lacking.values() for name in missing}))
+        raise UsageError(f"not installed: {names}; pip install 'airl-mav[{','.join(lacking)}]'")

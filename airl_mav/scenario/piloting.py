@@ -1,0 +1,96 @@
+"""How a policy is flown and how late it decides: as asked, else as its card says, else by default.
+
+What the companion needs of a scenario's resolution; imports no simulator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from airl_mav.core.cpu_quota import check_permitted
+from airl_mav.core.errors import FieldError
+from airl_mav.flight.judge import GOAL_RADIUS_M
+from airl_mav.latency.injection import Injection
+from airl_mav.latency.source import select_injection
+from airl_mav.policy.registry import PolicyInfo
+from airl_mav.profiles.computer import load_computer
+from airl_mav.scenario.model import (
+    Decisions,
+    Lateness,
+    LevelName,
+    PilotSettings,
+    WatchdogSettings,
+)
+
+
+def decide_piloting(
+    asked: Decisions, policy: PolicyInfo, goal_radius_m: float = GOAL_RADIUS_M
+) -> tuple[PilotSettings, WatchdogSettings]:
+    """Return how a policy is flown: as asked, else as its card says, else by default.
+
+    Args:
+        asked: What was asked for.
+        policy: What flies.
+        goal_radius_m: Goal radius of a policy without a card [m].
+
+    Raises:
+        FieldError: A decision would be overdue before its predecessor's hold time is over.
+    """
+    card = policy.card
+    known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
+    hover_s = asked.watchdog.hover_after_s
+    if card is not None:
+        known = {
+            "hold_s": card.hold_s,
+            "goal_radius_m": card.goal_radius_m,
+            "altitude_m": card.altitude_m,
+            "max_speed_m_s": card.actions.max_speed_m_s,
+        }
+        hover_s = card.hover_after_s if hover_s is None else hover_s
+    names = asdict(PilotSettings())
+    given = {name: value for name in names if (value := getattr(asked, name)) is not None}
+    pilot = PilotSettings(**(known | given))
+    timeout_s = asked.watchdog.decision_timeout_s
+    if timeout_s <= pilot.hold_s:
+        raise FieldError(
+            "watchdog.decision_timeout_s",
+            f"{timeout_s:g}",
+            f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
+        )
+    return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
+
+
+def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> None:
+    """Raise UsageError for a limit on the processor that is of no use, or not permitted."""
+    if asked.cpu_quota is None:
+        return
+    if level != "sitl" or injection.latency is not None:
+        why = "an injected latency" if level == "sitl" else f"level {level}"
+        raise FieldError(
+            "cpu_quota",
+            f"{asked.cpu_quota:g}",
+            f"without {why}: only where the companion's own time counts",
+        )
+    check_permitted(asked.cpu_quota)
+
+
+def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
+    """Return the latency that a companion by itself flies with.
+
+    Args:
+        asked: What was asked for.
+        policy: What flies.
+        on_this_computer: Whether it runs on the very computer that it flies as: what was measured
+            there is then no addition.
+
+    Raises:
+        UsageError: There is no such computer, workload or source.
+    """
+    return select_injection(
+        asked.latency,
+        load_computer(asked.computer),
+        asked.workload,
+        policy_sha256=None if on_this_computer else policy.sha256,
+        macs=policy.macs,
+    )

@@ -1,0 +1,44 @@
+"""The firmware by itself: ticks until told to stop, and what can be said of them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.firmware import Firmware
+
+
+def fly(
+    firmware: Firmware,
+    stop: threading.Event,
+    duration_s: float | None,
+    say: Callable[[str], None],
+) -> None:
+    """Fly until told to stop, or for a duration of simulated time; say how it went.
+
+    Args:
+        firmware: With an episode.
+        stop: Set from outside to end it.
+        duration_s: Simulated time after which it ends [s]; None: never by itself.
+        say: Is told how it went, a line at a time.
+
+    Raises:
+        FirmwareLostError: Real firmware is gone.
+    """
+    start_us, stopwatch = firmware.clock.time_us(), WallClock()
+    end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)
+    while not stop.is_set() and (end_us is None or firmware.clock.time_us() < end_us):
+        firmware.step()
+    flown_s = (firmware.clock.time_us() - start_us) / US_PER_S
+    wall_s = max(stopwatch.time_us(), 1) / US_PER_S
+    say(f"{flown_s:.1f} s simulated in {wall_s:.1f} s: {flown_s / wall_s:.2f} x real time")
+    if firmware.slipped_us:
+        given_up_s = firmware.slipped_us / US_PER_S
+        say(f"{given_up_s:.2f} s given up: this host could not keep up")
+    for name, link in firmware.avionics.counters().items():
+        say(
+            f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
+            f"sent {link.tx}, not sent {link.send_errors}"
+        )
