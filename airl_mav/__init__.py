@@ -1,3 +1,42 @@
-"""The shared vocabulary of a rehearsal: what a flight is, what a policy sees, how it is judged."""
+"""Rehearse learned drone policies through MAVLink: the Python API.
 
-__version__ = "0.1.0"
+>>> from airl_mav import Scenario, rehearse
+>>> run = rehearse(Scenario(level="lockstep", episodes=2))
+>>> run.quality.success_rate.value, run.latency["t2"].mean()
+
+Everything is imported when it is first used, so that a companion computer loads no simulator.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.2.0"
+
+_EXPORTS = {
+    "Scenario": "airl_mav.scenario.model",
+    "Run": "airl_mav.experiments.run",
+    "load_run": "airl_mav.experiments.run",
+    "rehearse": "airl_mav.experiments.fly",
+}
+"""Public names, and the modules that define them."""
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.fly import rehearse
+    from airl_mav.experiments.run import Run, load_run
+    from airl_mav.scenario.model import Scenario
+
+__all__ = ["Run", "Scenario", "load_run", "rehearse"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_EXPORTS[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*globals(), *_EXPORTS])

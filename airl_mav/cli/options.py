@@ -131,7 +131,7 @@ def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
         if isinstance(kind, type) and issubclass(kind, BaseModel):
             inner = _arguments(kind, default)
             prefix = name in PREFIXED
-            kind = inner if prefix else tyro.conf.OmitArgPrefixes[inner]  # type: ignore[valid-type]
+            kind = inner if prefix else Annotated[(inner, tyro.conf.OmitArgPrefixes)]
             fields.append((name, kind, dataclasses.field(default_factory=inner)))
             continue
         marks: list[Any] = [tyro.conf.arg(help=_help(field))]
@@ -140,7 +140,7 @@ def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
                 tyro.conf.Positional,
                 tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
             ]
-        fields.append((name, Annotated[(kind, *marks)], dataclasses.field(default=default)))  # type: ignore[valid-type]
+        fields.append((name, Annotated[(kind, *marks)], dataclasses.field(default=default)))
     made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)
     made.__doc__ = model.__doc__
     return made

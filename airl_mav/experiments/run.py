@@ -1,0 +1,88 @@
+"""A run as Python sees it: its episodes, quality of flight, latencies, paths and report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from airl_mav.flight.record import EpisodeRecord, run_sha256
+from airl_mav.flight.statistics import Aggregate, aggregate
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stages import Samples, pool, stage_samples
+from airl_mav.rehearsal.run_folder import Arrays, LoadedRun, RunInfo, load
+from airl_mav.report.rebuild import rebuild
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder, read. What is large is read when it is first asked for."""
+
+    path: Path
+    """Its folder."""
+
+    @cached_property
+    def _loaded(self) -> LoadedRun:
+        return load(self.path)
+
+    @property
+    def info(self) -> RunInfo:
+        """What was flown on what: settings, seeds, versions, machine."""
+        return self._loaded.info
+
+    @property
+    def episodes(self) -> tuple[EpisodeRecord, ...]:
+        """The record of each episode, by index."""
+        return self._loaded.episodes
+
+    @cached_property
+    def quality(self) -> Aggregate:
+        """Success rate, and means over the successful flights, each with its 95 % interval."""
+        return aggregate(self.episodes)
+
+    @cached_property
+    def latency(self) -> dict[str, Samples]:
+        """Durations (n,) [µs] of each stage over all decisions: `t1`, `t2`, `t3`, `link`, `control`,
+        `end_to_end`, `period`, ...; see `latency.stages.STAGES`."""
+        return pool(stage_samples(stamps) for stamps in self.stamps.values())
+
+    @property
+    def stamps(self) -> dict[int, Arrays]:
+        """Raw stamps of the decisions (n,) [µs] by name, by episode index."""
+        return self._loaded.latency
+
+    @property
+    def trajectories(self) -> dict[int, Trajectory]:
+        """True paths, by episode index: time [µs], position and velocity NED, attitude, power."""
+        return self._loaded.trajectories
+
+    @property
+    def sha256(self) -> str | None:
+        """Fingerprint of all flights: equal when they are equal bit by bit; None where flights are
+        never the same (level sitl)."""
+        return run_sha256(self.episodes)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all planned episodes have been flown."""
+        return len(self.episodes) == len(self.info.seeds)
+
+    def report(self) -> Path | None:
+        """Write the page and pictures of the run; return the page, None without episodes.
+
+        Raises:
+            UsageError: A profile of the run cannot be found any more.
+        """
+        _, page = rebuild(self.path)
+        return page
+
+
+def load_run(path: Path | str) -> Run:
+    """Read a run folder.
+
+    Raises:
+        UsageError: The folder holds no run, or a file of it cannot be read.
+    """
+    run = Run(Path(path))
+    _ = run.info  # What is wrong with the folder is found now.
+    return run
