@@ -2,92 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.common import GREATEST_SEED, check_range
-from airl_mav.cli.gap_command import GapCommand
-from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.workers import GREATEST_WORKERS
+from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.options import scenario_of
+from airl_mav.core.fields import quantity
+from airl_mav.experiments.gap import (
+    DEFAULT_COMPUTER,
+    DEFAULT_MITIGATED,
+    DEFAULT_REFERENCE,
+    declare_gap,
+)
+from airl_mav.scenario.model import (
+    DEFAULT_ARENA,
+    DEFAULT_POLICY,
+    Aircraft,
+    Decisions,
+    Flights,
+    Lateness,
+    LevelName,
+)
 
-if TYPE_CHECKING:
-    from airl_mav.cli.cells import FlownCell
-    from airl_mav.cli.gap_plan import GapPlan
-    from airl_mav.report.gap.build import HeldArena
+
+class GapOptions(Flights, Lateness, Decisions, Aircraft):
+    """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
+
+    The policy on a workstation and on the onboard computer; a policy that was trained as late as
+    that
+    computer decides, there, in the conditions of its training, and on the workstation. Always the
+    same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against both
+    references, beside those of the paper. The same --out goes on with what was interrupted.
+
+    Examples:
+        airl gap
+        airl gap --policy MINE --mitigated none --latency pi.txt
+        airl gap --level lockstep --episodes 500
+    """
+
+    policy: str = Field(
+        default=DEFAULT_POLICY,
+        description="policy without mitigation: a name, or a path to a folder with policy.onnx and"
+        " card.json",
+    )
+    mitigated: str = Field(
+        default=DEFAULT_MITIGATED,
+        description="policy that was trained as late as the computer decides: a name, or a path;"
+        " none: fly the gap without mitigation only",
+    )
+    computer: str = Field(
+        default=DEFAULT_COMPUTER,
+        description="onboard computer: a shipped profile, or a path to a .toml",
+    )
+    reference: str = Field(
+        default=DEFAULT_REFERENCE,
+        description="computer that the gap is measured from: a shipped profile, or a path",
+    )
+    reference_workload: str | None = Field(
+        default=None,
+        description="workload of the reference; by default the target's if the reference has it,"
+        " otherwise what was measured there for the very policy, or else 1 ms (gym, lockstep), or"
+        " what this machine takes (sitl)",
+    )
+    arena: tuple[str, ...] = Field(
+        default=(DEFAULT_ARENA,),
+        description="arena profiles: shipped names, or paths; of several, each gets its tables",
+    )
+    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
+    episodes: int = quantity(
+        "episodes of each policy on each computer in each arena",
+        "1",
+        ge=1,
+        le=100_000,
+        default=1000,
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of the gap: a run folder for each policy on each computer, gap.json,"
+        " gap.md and gap.html; by default runs/<UTC time>-gap-<policy>-<computer>",
+    )
 
 
-def run(command: GapCommand, console: Console | None = None) -> int:
+OPTIONS = GapOptions
+
+
+def run(options: GapOptions, console: Console | None = None) -> int:
     """Measure the gap.
 
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
-
     Returns:
-        Exit status: 0 all episodes flown, 1 a process died (sitl, lockstep), 130 Ctrl-C.
+        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
 
     Raises:
         UsageError: The input cannot be used.
     """
-    console = console or Console()
-    _check(command)
-    # Imported late: the kernels take a second to load, and a typo must not wait for them.
-    from airl_mav.cli.cells import check_root, fly_cells
-    from airl_mav.cli.gap_plan import plan_gap
-    from airl_mav.report.gap.file import GAP_FILE
-
-    plan = plan_gap(command)
-    name = f"{plan.policy.name}-{plan.target.name}"
-    root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-gap-{_plain(name)}"
-    check_root(root, but=GAP_FILE)
-    for remark in plan.remarks:
-        console.print(remark, style="yellow", soft_wrap=True, markup=False, highlight=False)
-    flown, code = fly_cells(root, [planned.cell for planned in plan.cells], console)
-    if flown:
-        from airl_mav.report.gap.build import build_gap
-        from airl_mav.report.gap.terminal import show_gap
-
-        show_gap(build_gap(root, plan.facts, _held(plan, flown)), console)
+    experiment = declare_gap(
+        scenario_of(options),
+        mitigated=options.mitigated,
+        reference=options.reference,
+        reference_workload=options.reference_workload,
+        arenas=options.arena,
+    )
+    code, _ = fly_and_show(experiment, options.out, console or Console())
     return code
-
-
-def _held(plan: GapPlan, flown: Sequence[FlownCell]) -> list[HeldArena]:
-    """Return where the flights of each column lie, of those columns that have any."""
-    from airl_mav.report.gap.build import Held, HeldArena
-
-    by_key = {held.cell.key: held for held in flown}
-    columns: dict[str, list[Held]] = {}
-    for planned in plan.cells:
-        if (held := by_key.get(planned.cell.key)) is not None:
-            columns.setdefault(planned.arena, []).append(
-                Held(
-                    role=planned.role,
-                    title=planned.title,
-                    folder=held.folder,
-                    planned=planned.cell.command.episodes,
-                    rules=held.rules,
-                )
-            )
-    return [HeldArena(arena, tuple(held)) for arena, held in columns.items()]
-
-
-def _plain(name: str) -> str:
-    """Return a name that can be one of a folder."""
-    return "".join(c if c.isalnum() or c in "._-" else "-" for c in name)
-
-
-def _check(command: GapCommand) -> None:
-    """Check what needs no loading. Raises UsageError."""
-    check_range("--episodes", command.episodes, 1, 100_000)
-    check_range("--seed", command.seed, 0, GREATEST_SEED)
-    if command.workers is not None:
-        if command.level != "lockstep":
-            raise UsageError(
-                f"--workers {command.workers} with --level {command.level}: accepted: with --level "
-                "lockstep"
-            )
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)

@@ -3,84 +3,73 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.common import EXIT_INTERRUPTED, GREATEST_SEED, check_draws, check_range
-from airl_mav.cli.evaluate import DEFAULT_ARENA
-from airl_mav.cli.ladder_command import LadderCommand
-from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
+from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.options import POSITIONAL, scenario_of
+from airl_mav.core.fields import quantity
+from airl_mav.experiments.evaluate import training_arena
+from airl_mav.experiments.ladder import LEVELS, declare_ladder
 from airl_mav.policy.registry import find_policy
-from airl_mav.rehearsal.run_folder import RUN_FILE
-from airl_mav.rehearsal.workers import GREATEST_WORKERS
-from airl_mav.report.matrix import MATRIX_FILE
-
-FACTS = ("vehicle", "computer", "workload", "latency", "seed")
-"""Options that head a ladder, beside policy and arena."""
+from airl_mav.scenario.model import Aircraft, Decisions, Flights, Lateness, LevelName
 
 
-def run(command: LadderCommand, console: Console | None = None) -> int:
+class LadderOptions(Flights, Lateness, Decisions, Aircraft):
+    """Fly the same policy and seeds at several levels of fidelity, and say what differs.
+
+    Success, flight time, distance and energy side by side, with the differences from the first
+    level on
+    the same seeds and their 95 % intervals. The same --out goes on with what was interrupted.
+
+    Examples:
+        airl ladder static-obstacles
+        airl ladder static-obstacles --levels gym lockstep --episodes 500
+    """
+
+    policy: Annotated[str, POSITIONAL] = Field(
+        description="a name, or a path to a folder with policy.onnx and card.json"
+    )
+    arena: str | None = Field(
+        default=None,
+        description="arena profile; by default that which the policy was trained in",
+    )
+    episodes: int = quantity("episodes at each level", "1", ge=1, le=100_000, default=100)
+    levels: tuple[LevelName, ...] = Field(
+        default=LEVELS, description="levels that fly, two or more; the first is the reference"
+    )
+    sitl_episodes: int | None = quantity(
+        "episodes at level sitl, which flies in real time times the speed: the first ones of the"
+        " seeds; by default 10, or all if they are fewer",
+        "1",
+        ge=1,
+        le=100_000,
+        default=None,
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of the ladder: a run folder for each level, ladder.json and"
+        " ladder.html; by default runs/<UTC time>-ladder-<policy>-<arena>",
+    )
+
+
+OPTIONS = LadderOptions
+
+
+def run(options: LadderOptions, console: Console | None = None) -> int:
     """Fly the levels and show what differs.
 
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
-
     Returns:
-        Exit status: 0 all episodes flown, 1 a process died (sitl, lockstep), 130 Ctrl-C.
+        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
 
     Raises:
         UsageError: The input cannot be used.
     """
-    console = console or Console()
-    arena = _check(command)
-    # Imported late: the kernels take a second to load, and a typo must not wait for them.
-    from airl_mav.cli.ladder_levels import Climb
-
-    climb = Climb(command, arena)
-    name = f"{climb.policy.name}-{Path(arena).stem}"
-    root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-ladder-{name}"
-    for file, what in ((RUN_FILE, "a single run"), (MATRIX_FILE, "a table of policies x arenas")):
-        if (root / file).exists():
-            raise UsageError(f"--out {root}: holds {what}; accepted: another folder")
-    held, code = climb.fly(root, console)
-    if len(held) > 1:
-        from airl_mav.report.ladder.build import build_ladder, write_ladder
-        from airl_mav.report.ladder.page import build_page
-        from airl_mav.report.ladder.terminal import print_ladder
-
-        facts: dict[str, Any] = {"policy": climb.policy.name, "arena": arena}
-        facts |= {key: getattr(command, key) for key in FACTS} | {"rules": climb.rules}
-        ladder = build_ladder(root, facts, held)
-        write_ladder(ladder)
-        print_ladder(ladder, console, build_page(ladder))
-    if code == EXIT_INTERRUPTED:
-        console.print(
-            f"interrupted: the same command with --out {root} goes on",
-            style="yellow",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
+    arena = options.arena or training_arena(find_policy(options.policy))
+    experiment = declare_ladder(
+        scenario_of(options, arena=arena), options.levels, sitl_episodes=options.sitl_episodes
+    )
+    code, _ = fly_and_show(experiment, options.out, console or Console())
     return code
-
-
-def _check(command: LadderCommand) -> str:
-    """Check what needs no loading; return the arena. Raises UsageError."""
-    levels = command.levels
-    if len(set(levels)) < len(levels) or len(levels) < 2:
-        told = " ".join(levels) or "nothing"
-        raise UsageError(f"--levels {told}: accepted: two or more of gym lockstep sitl, each once")
-    check_range("--episodes", command.episodes, 1, 100_000)
-    check_range("--seed", command.seed, 0, GREATEST_SEED)
-    check_draws(command.latency_seed, command.arena_seed)
-    if command.workers is not None:
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
-    if command.sitl_episodes is not None:
-        check_range("--sitl-episodes", command.sitl_episodes, 1, command.episodes)
-    if command.arena is not None:
-        return command.arena
-    card = find_policy(command.policy).card
-    return (None if card is None else card.training.arena) or DEFAULT_ARENA

@@ -22,6 +22,7 @@ from rich.console import Console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, FieldError, UsageError
 from airl_mav.core.fields import range_of, validated
 from airl_mav.scenario.file import read_scenario_file
+from airl_mav.scenario.model import Scenario
 
 Options = TypeVar("Options", bound=BaseModel)
 
@@ -78,6 +79,17 @@ def read_options(
         return validated(model, dataclasses.asdict(parsed))
     except FieldError as error:
         raise UsageError(told(error, words, file)) from None
+
+
+def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
+    """Return the scenario that a command's options hold; changes that are None are passed over."""
+    given = {
+        name: getattr(options, name)
+        for name in Scenario.model_fields
+        if name in type(options).model_fields and not isinstance(getattr(options, name), tuple)
+    }
+    given |= {name: value for name, value in changes.items() if value is not None}
+    return Scenario(**{name: value for name, value in given.items() if value is not None})
 
 
 def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.options import RENAMED, run_command
+from airl_mav.cli.options import RENAMED, run_command, scenario_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.fly import EXIT_CODES, fly_live
@@ -54,7 +54,7 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         UsageError: The input cannot be used.
     """
     console = console or Console()
-    scenario = resolve(Scenario.model_validate(options.model_dump(exclude={"out"})))
+    scenario = resolve(scenario_of(options))
     with RichProgress(console) as progress:
         flown = fly_live(
             scenario, options.out, progress, announce=partial(_announce, scenario, console)

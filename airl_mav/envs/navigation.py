@@ -76,6 +76,8 @@ class Navigation:
         spec: EnvironmentSpec,
         n: int,
         *,
+        vehicle: VehicleProfile | None = None,
+        arena: ArenaSpec | None = None,
         injection: Injection | None = None,
         latency_draw: int = 0,
         arena_seed: int | None = None,
@@ -86,6 +88,8 @@ class Navigation:
         Args:
             spec: The environment.
             n: Number of vehicles.
+            vehicle: The profile that `spec` names, where it has been loaded; None: it is loaded.
+            arena: The same of the arena.
             injection: Where t2 comes from; None: what `spec.delay` says.
             latency_draw: 0, or another number for other draws of the same latency.
             arena_seed: Of the arena and goal of all episodes; None: each one's own seed.
@@ -96,8 +100,8 @@ class Navigation:
         """
         self.spec = spec
         self.n = n
-        self.vehicle: VehicleProfile = load_vehicle(spec.vehicle)
-        self.arena_spec: ArenaSpec = load_profile("arenas", spec.arena, ArenaSpec)
+        self.vehicle: VehicleProfile = vehicle or load_vehicle(spec.vehicle)
+        self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
         self.camera: Camera = self.vehicle.camera.model_copy(
             update=spec.camera.model_dump(exclude_none=True)
         )

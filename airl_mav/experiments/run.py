@@ -42,7 +42,8 @@ class Run:
 
     @cached_property
     def latency(self) -> dict[str, Samples]:
-        """Durations (n,) [µs] of each stage over all decisions: `t1`, `t2`, `t3`, `link`, `control`,
+        """Durations (n,) [µs] of each stage over all decisions: `t1`, `t2`, `t3`, `link`,
+        `control`,
         `end_to_end`, `period`, ...; see `latency.stages.STAGES`."""
         return pool(stage_samples(stamps) for stamps in self.stamps.values())
 

@@ -1,15 +1,11 @@
-"""A run and its folder: opened for a scenario, new or to be gone on with."""
+"""The folder of a scenario's run: a new one, or one that is gone on with."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-from pydantic import BaseModel
 
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
@@ -19,42 +15,17 @@ from airl_mav.scenario.model import free_fields
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
-def run_settings(scenario: ResolvedScenario) -> dict[str, Any]:
-    """Return all that is written down of a run, as plain values.
-
-    The scenario as asked for, what it comes to, and the content of profiles and policy: a name does
-    not tell a changed one.
-    """
-    profiles: dict[str, BaseModel] = {
-        "vehicle": scenario.vehicle,
-        "arena": scenario.arena,
-        "computer": scenario.computer,
-    }
-    if scenario.injection.latency is not None:
-        profiles["latency"] = scenario.injection.latency
-    return {
-        **scenario.scenario.model_dump(mode="json"),
-        "pilot": asdict(scenario.pilot),
-        "watchdog": scenario.watchdog.model_dump(mode="json"),
-        "policy_sha256": scenario.policy.sha256,
-        "profiles_sha256": {
-            kind: hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
-            for kind, profile in profiles.items()
-        },
-    }
-
-
-def open_run(
-    scenario: ResolvedScenario, out: Path | None, name: str
+def open_folder(
+    out: Path | None, name: str, scenario: ResolvedScenario
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
 
     A run with the first ones of the seeds is the same run, and is added to.
 
     Args:
-        scenario: What is flown.
         out: The folder; None makes a new one.
         name: Name of a new run.
+        scenario: What is flown.
 
     Returns:
         The folder, and the episodes that it holds.
@@ -62,7 +33,7 @@ def open_run(
     Raises:
         UsageError: It holds another run.
     """
-    config, seeds = run_settings(scenario), scenario.scenario.seeds
+    config, seeds = scenario.config, scenario.seeds
     if out is None or not (out / RUN_FILE).exists():
         folder = RunFolder.create(out, name, config, setup=scenario.setup, seeds=seeds)
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
@@ -84,7 +55,7 @@ def open_run(
 
 
 def another_config(
-    held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = ()
+    held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = free_fields("gym")
 ) -> str | None:
     """Return the first setting in which two configurations differ, or None when they do not.
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 from typing import Protocol
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import (
@@ -31,7 +31,6 @@ from airl_mav.rehearsal.episode import Episode, save_episode
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, ProcessPair
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
-from airl_mav.rehearsal.workers import TRIES
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.external.compose import load_timeout_s
 
@@ -132,8 +131,10 @@ class Rehearsal:
             except LostError as error:
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
-                if len(notes) == TRIES:
-                    raise RehearsalError(f"{flight}: lost {TRIES} times; at last {error}") from None
+                if len(notes) == MAX_ATTEMPTS:
+                    raise RehearsalError(
+                        f"{flight}: lost {MAX_ATTEMPTS} times; at last {error}"
+                    ) from None
                 self._observer.lost(f"{flight} begins again: {error}")
             else:
                 return

@@ -319,9 +319,20 @@ class Flights(ProfileModel):
         le=1000,
         default=None,
     )
+    executor: Annotated[Literal["process", "ray"], FREE] = Field(
+        default="process",
+        description="levels gym and lockstep: who carries out the flights, processes of this"
+        " machine"
+        " or a Ray cluster; decides the pace, not the results",
+    )
+    ray_address: Annotated[str, FREE] = Field(
+        default="local",
+        description="with executor ray: local starts a Ray on this machine, auto takes the one that"
+        " runs here, else HOST:PORT of a cluster's head",
+    )
     workers: Annotated[int | None, FREE] = quantity(
-        "level lockstep: processes, each with one flight at a time; decides the pace, not the"
-        " results; by default as many as there are usable cores",
+        "levels gym and lockstep: jobs at a time, each on one core; decides the pace, not the"
+        " results; by default 1 at level gym, at lockstep as many as there are usable cores",
         "1",
         ge=1,
         le=GREATEST_WORKERS,

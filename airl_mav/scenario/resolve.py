@@ -81,10 +81,15 @@ def check_level(scenario: Scenario) -> None:
             raise FieldError(
                 "speed", f"{scenario.speed:g}", f"{low:g} <= value <= {high:g} at level sitl"
             )
-    if level != "lockstep":
-        for field, value in (("tlogs", scenario.tlogs), ("workers", scenario.workers)):
-            if value:
-                raise FieldError(field, value, "at level lockstep")
+    elif level == "gym":
+        usual = Scenario()
+        for field in ("wind", "estimator", "max_speed_m_s", "speed"):
+            if (value := getattr(scenario, field)) != getattr(usual, field):
+                raise FieldError(field, value, "at level lockstep or sitl; the twin has none")
+    if level != "lockstep" and scenario.tlogs:
+        raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
+    if level == "sitl" and scenario.workers is not None:
+        raise FieldError("workers", scenario.workers, "at level gym or lockstep")
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import hashlib
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import BaseModel, TypeAdapter
 
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Task
+from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import BUILT_IN, Level, Part, Setup
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
@@ -48,6 +51,15 @@ FIRMWARE_TITLES: dict[FirmwareName, str] = {
 
 
 @dataclass(frozen=True)
+class PlannedEpisode:
+    """An episode to be flown."""
+
+    index: int
+    """Its number in the run."""
+    seed: int
+
+
+@dataclass(frozen=True)
 class ResolvedScenario:
     """A scenario, checked, and the content of every profile that it names."""
 
@@ -63,6 +75,41 @@ class ResolvedScenario:
     """How the policy is flown; the goal radius is the referee's."""
     watchdog: WatchdogSettings
     """Bounds on silence, with what the policy's card says of hovering."""
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seed of each episode, by index."""
+        return self.scenario.seeds
+
+    def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
+        """Return what is left to be flown when some episodes are done."""
+        there = {record.index for record in done}
+        return [PlannedEpisode(i, seed) for i, seed in enumerate(self.seeds) if i not in there]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """All that is written down of a run, as plain values.
+
+        The scenario as asked for, what it comes to, and the content of profiles and policy: a name
+        does not tell a changed one.
+        """
+        profiles: dict[str, BaseModel] = {
+            "vehicle": self.vehicle,
+            "arena": self.arena,
+            "computer": self.computer,
+        }
+        if self.injection.latency is not None:
+            profiles["latency"] = self.injection.latency
+        return {
+            **self.scenario.model_dump(mode="json"),
+            "pilot": asdict(self.pilot),
+            "watchdog": self.watchdog.model_dump(mode="json"),
+            "policy_sha256": self.policy.sha256,
+            "profiles_sha256": {
+                kind: hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
+                for kind, profile in profiles.items()
+            },
+        }
 
     @property
     def level(self) -> Level:

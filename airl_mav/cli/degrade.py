@@ -1,0 +1,74 @@
+"""`airl degrade`: the same policies at growing latencies, and where they break down."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.options import POSITIONAL, scenario_of
+from airl_mav.core.fields import quantity
+from airl_mav.experiments.degrade import LATENCIES, declare_degradation
+from airl_mav.scenario.model import (
+    DEFAULT_ARENA,
+    DEFAULT_POLICY,
+    Aircraft,
+    Decisions,
+    Flights,
+    Lateness,
+    LevelName,
+)
+
+
+class DegradeOptions(Flights, Lateness, Decisions, Aircraft):
+    """Fly policies at growing latencies on the same seeds: success, time, distance, energy as
+    curves.
+
+    The same --out goes on with what was interrupted.
+
+    Examples:
+        airl degrade
+        airl degrade static-obstacles static-obstacles-ras-pi-4 --latencies native 200ms 400ms
+        airl degrade MINE --level lockstep --episodes 100
+    """
+
+    policies: Annotated[tuple[str, ...], POSITIONAL] = Field(
+        default=(DEFAULT_POLICY,),
+        description="names, or paths to folders with policy.onnx and card.json",
+    )
+    latencies: tuple[str, ...] = Field(
+        default=LATENCIES,
+        description="sources of t2 as latency takes them, growing; native: none injected; the first"
+        " is the reference",
+    )
+    arena: str = Field(
+        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
+    )
+    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
+    episodes: int = quantity("episodes at each latency", "1", ge=1, le=100_000, default=300)
+    out: Path | None = Field(
+        default=None,
+        description="folder of the curve: a run folder for each latency, degradation.json and"
+        " degradation.html; by default runs/<UTC time>-degradation-<policies>",
+    )
+
+
+OPTIONS = DegradeOptions
+
+
+def run(options: DegradeOptions, console: Console | None = None) -> int:
+    """Fly the latencies and show what they cost.
+
+    Returns:
+        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
+
+    Raises:
+        UsageError: The input cannot be used.
+    """
+    scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
+    experiment = declare_degradation(scenario, options.latencies, options.policies)
+    code, _ = fly_and_show(experiment, options.out, console or Console())
+    return code

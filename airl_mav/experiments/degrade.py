@@ -1,0 +1,83 @@
+"""The latency curve: the same policies at latencies that grow, on the same seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.experiment import (
+    Experiment,
+    ExperimentResult,
+    entry_of,
+    make_cell,
+    run_and_compare,
+)
+from airl_mav.policy.registry import find_policy
+from airl_mav.report.comparison.degradation import degradation_recipe
+from airl_mav.scenario.model import Scenario
+
+NATIVE = "native"
+"""Stands for no injected latency."""
+
+LATENCIES = (NATIVE, "150ms", "300ms", "400ms", "950ms")
+"""The paper's steps."""
+
+FACTS = ("arena", "level", "vehicle", "episodes", "seed")
+
+
+def degrade(
+    scenario: Scenario,
+    latencies: Sequence[str] = LATENCIES,
+    policies: Sequence[str] = (),
+    *,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> ExperimentResult:
+    """Fly policies at growing latencies and say what that costs.
+
+    Args:
+        scenario: What is flown; its latency and workload are passed over.
+        latencies: Sources of t2, growing; `native`: none injected. The first is the reference.
+        policies: Names or folders; none given: the scenario's.
+        out: Folder; the same one goes on. None makes `runs/<UTC time>-degradation-...`.
+        progress: Whether to draw bars on standard error.
+
+    Raises:
+        UsageError: Something cannot be flown, or `out` holds something else.
+        RehearsalError: It was broken off: processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    """
+    declared = declare_degradation(scenario, latencies, policies)
+    return run_and_compare(declared, out, progress=progress)
+
+
+def declare_degradation(
+    scenario: Scenario, latencies: Sequence[str] = LATENCIES, policies: Sequence[str] = ()
+) -> Experiment:
+    """Declare a latency curve; see `degrade`. Raises UsageError."""
+    if len(latencies) < 2 or len(set(latencies)) < len(latencies):
+        raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
+    names = list(policies) or [scenario.policy]
+    cells, roles = [], {}
+    for path in names:
+        policy = find_policy(path).name
+        for latency in latencies:
+            given = None if latency == NATIVE else latency
+            label = latency if given is None or not Path(given).is_file() else Path(given).stem
+            cell = make_cell(
+                "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{policy}-{label}"),
+                f"{policy} at {label}",
+                scenario.model_copy(update={"policy": path, "latency": given, "workload": None}),
+            )
+            cells.append(cell)
+            roles[cell.name] = entry_of(cell, label=label, role=label, group=policy)
+    facts = {field: getattr(scenario, field) for field in FACTS}
+    return Experiment(
+        kind="degradation",
+        name=f"{'-'.join(find_policy(name).name for name in names)}",
+        facts={"policies": [find_policy(name).name for name in names], **facts},
+        cells=tuple(cells),
+        recipe=degradation_recipe,
+        roles=roles,
+    )

@@ -1,0 +1,152 @@
+"""Evaluations: policies in arenas, each pair a run of seeded episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.campaign import Cell
+from airl_mav.experiments.experiment import (
+    Experiment,
+    ExperimentResult,
+    entry_of,
+    make_cell,
+    run_and_compare,
+)
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import aggregate
+from airl_mav.policy.card import MeasuredResult, add_result
+from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.report.comparison.matrix import matrix_recipe
+from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
+
+SHARED = ("level", "vehicle", "computer", "workload", "latency", "ablate", "episodes", "seed")
+"""Fields that head a table: the same for all of it."""
+
+NOT_THE_POLICYS_OWN = (
+    "ablate",
+    "arena_seed",
+    "goal_radius_m",
+    "hold_s",
+    "altitude_m",
+    "max_speed_m_s",
+)
+"""Fields whose results are not written onto a policy's card when they are given."""
+
+
+def evaluate(
+    scenario: Scenario,
+    policies: Sequence[str],
+    arenas: Sequence[str] = (),
+    *,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> ExperimentResult:
+    """Fly policies in arenas on the same seeds and compare them in a table.
+
+    Args:
+        scenario: All but policy and arena, which are passed over.
+        policies: Names or folders.
+        arenas: Names or paths; none given: those that the policies were trained in.
+        out: Folder; the same one goes on. None makes `runs/<UTC time>-matrix-...`.
+        progress: Whether to draw bars on standard error.
+
+    Raises:
+        UsageError: Something cannot be flown, or `out` holds something else.
+        RehearsalError: It was broken off: processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    """
+    return run_and_compare(matrix(scenario, policies, arenas), out, progress=progress)
+
+
+def matrix(scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = ()) -> Experiment:
+    """Declare a table of policies x arenas. Raises UsageError as `evaluate`."""
+    cells = evaluation_cells(scenario, policies, arenas)
+    facts = {field: getattr(scenario, field) for field in SHARED}
+    return Experiment(
+        kind="matrix",
+        name=f"{len(policies)}-policies",
+        facts=facts,
+        cells=cells,
+        recipe=matrix_recipe,
+        roles={
+            cell.name: entry_of(
+                cell, label=cell.scenario.policy.name, group=cell.scenario.arena_name
+            )
+            for cell in cells
+        },
+    )
+
+
+def evaluation_cells(
+    scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = ()
+) -> tuple[Cell, ...]:
+    """Return an evaluation for each policy in each arena.
+
+    Raises:
+        UsageError: A policy or an arena cannot be flown, or two would share a row or a column.
+    """
+    if not policies:
+        raise FieldError("policies", "()", "one or more names or folders")
+    found = [find_policy(name) for name in policies]
+    _check_names("policies", [policy.name for policy in found])
+    if not arenas:
+        arenas = list(dict.fromkeys(training_arena(policy) for policy in found))
+    else:
+        _check_names("arena", [Path(arena).stem for arena in arenas])
+    return tuple(
+        make_cell(
+            f"{policy.name}-{Path(arena).stem}",
+            f"{policy.name} in {Path(arena).stem}",
+            scenario.model_copy(update={"policy": path, "arena": arena}),
+        )
+        for path, policy in zip(policies, found, strict=True)
+        for arena in arenas
+    )
+
+
+def training_arena(policy: PolicyInfo) -> str:
+    """Return the arena that a policy was trained in, or the default one."""
+    return (None if policy.card is None else policy.card.training.arena) or DEFAULT_ARENA
+
+
+def check_plain(cells: Sequence[Cell]) -> None:
+    """Raise UsageError for results that are not the policies' own: none goes onto a card."""
+    for cell in cells:
+        asked, usual = cell.scenario.scenario, Scenario()
+        for field in (*NOT_THE_POLICYS_OWN, "time_limit_s", "watchdog"):
+            if (value := getattr(asked, field)) != getattr(usual, field):
+                raise FieldError(field, value, "without on-card: these are not the policy's own")
+        if cell.scenario.policy.folder is None:
+            raise FieldError("on_card", problem=f"{cell.scenario.policy.name} has no card")
+
+
+def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
+    """Write what a finished evaluation found onto the policy's card, in place of an earlier one."""
+    asked, folder = cell.scenario.scenario, cell.scenario.policy.folder
+    if folder is None:
+        return
+    quality = aggregate(episodes)
+    workload = None if asked.workload is None else f"{asked.computer}/{asked.workload}"
+    add_result(
+        folder,
+        MeasuredResult(
+            arena=cell.scenario.arena_name,
+            level=asked.level,
+            latency=asked.latency or workload,
+            episodes=len(episodes),
+            seed=asked.seed,
+            success_rate=quality.success_rate.value or 0.0,
+            flight_time_s=quality.flight_time_s.value,
+            distance_m=quality.distance_m.value,
+            energy_j=quality.energy_j.value,
+        ),
+    )
+
+
+def _check_names(field: str, names: Sequence[str]) -> None:
+    """Raise FieldError when two of them would share a row, a column and a folder."""
+    for name in names:
+        if names.count(name) > 1:
+            raise FieldError(field, name, "each name once")

@@ -1,0 +1,274 @@
+"""An experiment: named scenarios, flown on the same seeds, and how they are compared.
+
+`evaluate`, `gap`, `ladder` and `degrade` declare experiments; this flies and compares them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from airl_mav.core.clock import utc_now
+from airl_mav.core.progress import Progress
+from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_flights
+from airl_mav.experiments.fly import (
+    Ended,
+    executor_of,
+    fly_live,
+    raise_unless_complete,
+    shown,
+    tell_end,
+)
+from airl_mav.experiments.run import Run
+from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.signals import stop_on_signals
+from airl_mav.report.comparison.model import Comparison, ComparisonRecipe, Kind, RunEntry
+from airl_mav.report.comparison.show import build_comparison, write_comparison
+from airl_mav.report.measures import OUTCOME_WORDS
+from airl_mav.scenario.model import Scenario, free_fields
+from airl_mav.scenario.resolve import resolve
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is flown, and how it is compared."""
+
+    kind: Kind
+    name: str
+    """Of a new folder, after the kind."""
+    facts: dict[str, Any]
+    """What heads the comparison."""
+    cells: tuple[Cell, ...]
+    recipe: Callable[[Mapping[str, Any], Sequence[RunEntry]], ComparisonRecipe]
+    """Says which runs are compared with which."""
+    roles: Mapping[str, RunEntry] = field(default_factory=dict)
+    """What the run of a cell is in the comparison, by the cell's name; its folder is filled in."""
+    remarks: tuple[str, ...] = ()
+    """What a person should know before it flies."""
+
+    def root(self, out: Path | None) -> Path:
+        """Return the folder: as asked, or a new one under `runs`."""
+        plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in self.name)
+        return out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{plain}"
+
+    @property
+    def declaration(self) -> Declaration:
+        """What the folder says of it."""
+        shared = shared_flights(self.cells)
+        return Declaration(
+            kind=self.kind,
+            settings={},
+            cells={
+                cell.name: DeclaredCell(
+                    title=cell.title,
+                    settings=cell.scenario.config,
+                    folder=None if shared[cell.name] is cell else shared[cell.name].name,
+                )
+                for cell in self.cells
+            },
+        )
+
+
+@dataclass(frozen=True)
+class ExperimentRun:
+    """An experiment as far as it has been flown."""
+
+    experiment: Experiment
+    path: Path
+    """Its folder; a run folder for each cell lies in it."""
+    cells: tuple[CellRun, ...]
+    """Those that have flights, in the order of the experiment."""
+    ended: Ended
+    problem: str = ""
+
+    @property
+    def runs(self) -> dict[str, Run]:
+        """The run of each cell, by its name."""
+        return {flown.cell.name: Run(flown.path) for flown in self.cells}
+
+    def compare(self) -> tuple[Comparison, dict[str, LoadedRun], Path]:
+        """Work the comparison out and write its files.
+
+        Returns:
+            The comparison, its runs by name, and the path of its page.
+
+        Raises:
+            UsageError: No cell has flights, or the folder cannot be written.
+        """
+        entries = [
+            replace(
+                self.experiment.roles[flown.cell.name],
+                folder=flown.path.relative_to(self.path.absolute()).as_posix()
+                if flown.path.is_absolute()
+                else flown.path.relative_to(self.path).as_posix(),
+            )
+            for flown in self.cells
+        ]
+        experiment = self.experiment
+        recipe = experiment.recipe(experiment.facts, entries)
+        comparison, loaded = build_comparison(self.path, experiment.kind, recipe)
+        return comparison, loaded, write_comparison(comparison, loaded, self.path)
+
+
+@dataclass(frozen=True)
+class ExperimentResult:
+    """What an experiment has come to, for Python."""
+
+    path: Path
+    """Its folder."""
+    runs: dict[str, Run]
+    """The run of each cell, by its name."""
+    comparison: Comparison
+    """Figures of every run, and the differences between them over pairs of flights."""
+    page: Path
+    """The report."""
+
+
+def make_cell(name: str, title: str, scenario: Scenario) -> Cell:
+    """Resolve a scenario as a cell. Raises UsageError if it cannot be flown."""
+    # A copy without the loaded network: many large ones would fill the memory.
+    return Cell(name, title, replace(resolve(scenario)))
+
+
+def entry_of(cell: Cell, *, label: str = "", role: str = "", group: str = "") -> RunEntry:
+    """Return what the run of a cell is in a comparison."""
+    card = cell.scenario.policy.card
+    trained_in = None if card is None else card.training.arena
+    return RunEntry(
+        name=cell.name,
+        folder=cell.name,
+        label=label or cell.title,
+        role=role,
+        group=group,
+        planned=len(cell.scenario.seeds),
+        rules=cell.scenario.rules,
+        trained_in=None if trained_in is None else Path(trained_in).stem,
+    )
+
+
+def run_and_compare(
+    experiment: Experiment, out: Path | str | None, *, progress: bool
+) -> ExperimentResult:
+    """Fly an experiment to its end and compare its runs: what the functions of the API share.
+
+    Raises:
+        UsageError: It cannot be flown, or the folder holds something else.
+        RehearsalError: It was broken off: processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    """
+    with shown(progress) as shows:
+        flown = run_experiment(experiment, None if out is None else Path(out), shows)
+    raise_unless_complete(flown.ended, flown.problem)
+    comparison, _, page = flown.compare()
+    return ExperimentResult(flown.path, flown.runs, comparison, page)
+
+
+def run_experiment(experiment: Experiment, out: Path | None, progress: Progress) -> ExperimentRun:
+    """Fly what is left of an experiment; Ctrl-C and SIGTERM end it with what has ended kept.
+
+    Args:
+        experiment: What is flown.
+        out: Its folder; the same one goes on. None: a new one.
+        progress: Who looks on.
+
+    Raises:
+        UsageError: The folder holds something else, or a cell cannot be flown.
+    """
+    root = experiment.root(out)
+    for remark in (*experiment.remarks, *known_seeds(experiment.cells)):
+        progress.note(remark, "yellow")
+
+    def tell(run: CellRun) -> None:
+        progress.note(f"{run.cell.title}: {outcome_line(run)}")
+
+    runs: list[CellRun] = []
+    state: Ended = "complete"
+    problem = ""
+    with open_campaign(
+        root,
+        experiment.declaration,
+        command=" ".join(sys.argv),
+        free=free_fields("gym"),
+        say=lambda text: progress.note(text, "yellow"),
+    ) as store:
+        for level, group in groupby(
+            experiment.cells, key=lambda cell: cell.scenario.scenario.level
+        ):
+            fly = _fly_live if level == "sitl" else _fly_by_workers
+            flown, state, problem = fly(store, tuple(group), progress, tell)
+            runs += flown
+            if state != "complete":
+                break
+    tell_end(root, state, problem, progress)
+    return ExperimentRun(
+        experiment, root, tuple(run for run in runs if run.episodes), state, problem
+    )
+
+
+_Flown = tuple[list[CellRun], Ended, str]
+"""Runs as far as they have come, how it ended, and why."""
+
+
+def _fly_by_workers(
+    store: CampaignStore,
+    cells: Sequence[Cell],
+    progress: Progress,
+    tell: Callable[[CellRun], None],
+) -> _Flown:
+    with stop_on_signals() as stop, executor_of(cells[0].scenario.scenario) as executor:
+        run = run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
+        state: Ended = "complete"
+        if run.error is not None:
+            state = "broken off"
+        elif not run.complete or stop():
+            state = "interrupted"
+    return list(run.cells), state, run.error or ""
+
+
+def _fly_live(
+    store: CampaignStore,
+    cells: Sequence[Cell],
+    progress: Progress,
+    tell: Callable[[CellRun], None],
+) -> _Flown:
+    runs: list[CellRun] = []
+    for cell in cells:
+        flown = fly_live(cell.scenario, store.cell_path(cell.name), progress, name=cell.name)
+        runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
+        if flown.ended != "complete":
+            return runs, flown.ended, flown.problem
+        tell(runs[-1])
+    return runs, "complete", ""
+
+
+def outcome_line(run: CellRun) -> str:
+    """Return how the flights of a cell ended."""
+    outcomes = [episode.outcome for episode in run.episodes]
+    told = ", ".join(
+        f"{outcomes.count(outcome):,} {words}"
+        for outcome, words in OUTCOME_WORDS.items()
+        if outcome in outcomes
+    )
+    return told if run.new else f"{told} (flown before)"
+
+
+def known_seeds(cells: Sequence[Cell]) -> list[str]:
+    """Return a warning for each policy that may know its episodes from training."""
+    warnings: dict[str, str] = {}
+    for cell in cells:
+        policy, asked = cell.scenario.policy, cell.scenario.scenario
+        training = None if policy.card is None else policy.card.training
+        if training is None or training.first_arena_seed is None:
+            continue
+        first, last = training.first_arena_seed, training.last_arena_seed
+        if asked.seed + asked.episodes > first and (last is None or asked.seed <= last):
+            warnings[policy.name] = (
+                f"{policy.name} was trained on seeds from {first} on: not all episodes are new to"
+                f" it"
+            )
+    return list(warnings.values())

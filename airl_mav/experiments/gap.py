@@ -1,0 +1,264 @@
+"""The hardware gap: a policy on a workstation and on an onboard computer, with and without
+mitigation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import validated
+from airl_mav.envs.spec import Delay
+from airl_mav.experiments.campaign import Cell
+from airl_mav.experiments.experiment import (
+    Experiment,
+    ExperimentResult,
+    entry_of,
+    make_cell,
+    run_and_compare,
+)
+from airl_mav.policy.card import PolicyCard
+from airl_mav.policy.registry import PolicyInfo, find_policy
+from airl_mav.profiles.computer import load_computer
+from airl_mav.report.comparison.gap import Role, gap_recipe
+from airl_mav.report.comparison.model import RunEntry
+from airl_mav.scenario.model import Scenario
+
+DEFAULT_MITIGATED = "static-obstacles-ras-pi-4"
+"""The shipped policy that was trained as late as the paper's Raspberry Pi decides."""
+
+DEFAULT_COMPUTER, DEFAULT_REFERENCE = "ras-pi-4", "workstation"
+
+DEFAULT_WORKLOAD = "template-5x32"
+"""The paper's network for No Obstacles, and that of its mitigation: 396 ms on the Raspberry Pi."""
+
+NOT_MITIGATED = "none"
+"""In place of the mitigated policy: fly the gap alone."""
+
+TRAINING_LATENCY_SEED = 1
+"""The latencies of the training's conditions are drawn anew: with the same draws as the target's,
+the
+mitigated policy would be compared with itself."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """A computer with its latency."""
+
+    name: str
+    """For people and folders: the computer, or the latency where that was given."""
+    computer: str
+    workload: str | None
+    latency: str | None = None
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The scenario's fields that they set."""
+        return {"computer": self.computer, "workload": self.workload, "latency": self.latency}
+
+    @property
+    def label(self) -> str:
+        """How a title calls them."""
+        return f"on {self.name}" if self.latency is None else f"at {Path(self.name).name}"
+
+
+def gap(
+    scenario: Scenario,
+    *,
+    mitigated: str = DEFAULT_MITIGATED,
+    reference: str = DEFAULT_REFERENCE,
+    reference_workload: str | None = None,
+    arenas: Sequence[str] = (),
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> ExperimentResult:
+    """Measure what a policy loses on an onboard computer, without mitigation and with it.
+
+    Always the same seeds: the policy on the reference computer and on the onboard computer; a
+    policy
+    that was trained as late as that computer decides, there, under the conditions of its training,
+    and on the reference.
+
+    Args:
+        scenario: Policy, onboard computer with its workload or latency (none given: the paper's
+            network on its Raspberry Pi 4), and how it is flown.
+        mitigated: Name or folder of the mitigated policy, or `none`.
+        reference: Computer profile that the gap is measured from.
+        reference_workload: Workload of the reference; None: the same as the target's if the
+            reference has it, otherwise what was measured there for the very policy.
+        arenas: Arena profiles, each with tables of its own; none given: the scenario's.
+        out: Folder; the same one goes on. None makes `runs/<UTC time>-gap-...`.
+        progress: Whether to draw bars on standard error.
+
+    Raises:
+        UsageError: Something cannot be flown, or `out` holds something else.
+        RehearsalError: It was broken off: processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    """
+    declared = declare_gap(
+        scenario,
+        mitigated=mitigated,
+        reference=reference,
+        reference_workload=reference_workload,
+        arenas=arenas,
+    )
+    return run_and_compare(declared, out, progress=progress)
+
+
+def declare_gap(
+    scenario: Scenario,
+    *,
+    mitigated: str = DEFAULT_MITIGATED,
+    reference: str = DEFAULT_REFERENCE,
+    reference_workload: str | None = None,
+    arenas: Sequence[str] = (),
+) -> Experiment:
+    """Declare a hardware gap; see `gap`. Raises UsageError."""
+    policy, other = find_policy(scenario.policy), _mitigated(mitigated)
+    if other is not None and other.name == policy.name:
+        raise FieldError("mitigated", mitigated, f"another policy, or {NOT_MITIGATED}")
+    arenas = list(arenas) or [scenario.arena]
+    names = [Path(arena).stem for arena in arenas]
+    if len(set(names)) < len(names):
+        raise FieldError("arena", " ".join(names), "each arena once")
+    target = _target(scenario)
+    undelayed = _reference(reference, reference_workload, target)
+    training, remarks = _training(other, target)
+    cells: list[Cell] = []
+    roles: dict[str, RunEntry] = {}
+    for arena in arenas:
+        here = scenario.model_copy(update={"arena": arena})
+        path = None if other is None else mitigated
+        for cell, entry in _cells(here, policy, other, path, target, undelayed, training):
+            cells.append(cell)
+            roles[cell.name] = entry
+    facts = {
+        "policy": policy.name,
+        "mitigated": None if other is None else other.name,
+        "computer": target.computer,
+        "workload": target.workload,
+        "latency": target.latency,
+        "reference": undelayed.computer,
+        "reference_workload": undelayed.workload,
+        "level": scenario.level,
+        "vehicle": scenario.vehicle,
+        "episodes": scenario.episodes,
+        "seed": scenario.seed,
+        "remarks": list(remarks),
+    }
+    name = f"{policy.name}-{target.name}"
+    return Experiment("gap", name, facts, tuple(cells), gap_recipe, roles, remarks)
+
+
+def _cells(
+    scenario: Scenario,
+    policy: PolicyInfo,
+    mitigated: PolicyInfo | None,
+    mitigated_path: str | None,
+    target: Conditions,
+    reference: Conditions,
+    training: Sequence[Conditions],
+) -> list[tuple[Cell, RunEntry]]:
+    """Return the runs of one arena."""
+    short = Path(scenario.arena).stem
+
+    def planned(
+        role: Role, title: str, place: Conditions, number: int = 1, **more: Any
+    ) -> tuple[Cell, RunEntry]:
+        name = f"{short}-{role}" if number == 1 else f"{short}-{role}-{number}"
+        asked = scenario.model_copy(update={**place.fields, **more})
+        cell = make_cell(name, f"{title}, {short}", asked)
+        return cell, entry_of(cell, label=title, role=role, group=scenario.arena)
+
+    cells = [
+        planned("reference", f"{policy.name} {reference.label}", reference),
+        planned("target", f"{policy.name} {target.label}", target),
+    ]
+    if mitigated is None:
+        return cells
+    flown = {"policy": mitigated_path}
+    cells.append(planned("mitigated", f"{mitigated.name} {target.label}", target, **flown))
+    for number, place in enumerate(training, start=1):
+        which = f" ({place.name})" if len(training) > 1 else ""
+        title = f"{mitigated.name} as trained{which}"
+        drawn = {**flown, "latency_seed": TRAINING_LATENCY_SEED}
+        cells.append(planned("training", title, place, number, **drawn))
+    title = f"{mitigated.name} {reference.label}"
+    cells.append(planned("mitigated-reference", title, reference, **flown))
+    return cells
+
+
+def _mitigated(name: str) -> PolicyInfo | None:
+    """Return the mitigated policy; None: not asked for. Raises UsageError."""
+    if name == NOT_MITIGATED:
+        return None
+    try:
+        return find_policy(name)
+    except UsageError as error:
+        if name != DEFAULT_MITIGATED or "no such policy" not in f"{error}":
+            raise
+        raise FieldError(
+            "mitigated",
+            name,
+            "the folder of a policy that was trained with the computer and workload, or "
+            f"{NOT_MITIGATED}: it is not among the shipped policies",
+        ) from None
+
+
+def _target(scenario: Scenario) -> Conditions:
+    """Return the onboard computer as it is flown."""
+    if scenario.latency is None:
+        workload = DEFAULT_WORKLOAD if scenario.workload is None else scenario.workload
+        return Conditions(Path(scenario.computer).stem, scenario.computer, workload)
+    if scenario.workload is not None:
+        raise FieldError("latency", scenario.latency, "without a workload")
+    return Conditions(scenario.latency, scenario.computer, None, scenario.latency)
+
+
+def _reference(computer: str, workload: str | None, target: Conditions) -> Conditions:
+    """Return the computer that the gap is measured from."""
+    if workload is None and target.workload in load_computer(computer).workloads:
+        workload = target.workload
+    return Conditions(Path(computer).stem, computer, workload)
+
+
+def _training(
+    mitigated: PolicyInfo | None, target: Conditions
+) -> tuple[tuple[Conditions, ...], tuple[str, ...]]:
+    """Return the conditions that a policy was trained in, one a source of latency, and remarks.
+
+    The computer is the target's: it decides what its watts cost, and nothing else.
+    """
+    if mitigated is None:
+        return (), ()
+    environment = None if mitigated.card is None else training_environment(mitigated.card)
+    if environment is None:
+        return (), (
+            f"{mitigated.name} does not say how late its decisions were in training: it is not "
+            "compared with that.",
+        )
+    found = validated(Delay, environment.get("delay", {}), f"{mitigated.name}: environment.delay")
+    remarks: tuple[str, ...] = ()
+    extra = environment.get("randomisation", {}).get("extra_delay_ms", (0.0, 0.0))
+    if any(extra):
+        remarks = (
+            f"{mitigated.name} was trained with {extra[0]:g} to {extra[1]:g} ms on top of that: "
+            "not in its column.",
+        )
+    if found.latency:
+        sources = found.latency
+    elif found.workload is None:
+        sources = (f"{found.native_ms:g}ms",) if found.native_ms else ()
+    elif found.workload in load_computer(found.computer).workloads:
+        sources = (f"{found.computer}/{found.workload}",)
+    else:  # An estimate: it needs the policy beside the computer.
+        return (Conditions("training", found.computer, found.workload),), remarks
+    return tuple(Conditions(s, target.computer, None, s) for s in sources), remarks
+
+
+def training_environment(card: PolicyCard) -> Mapping[str, Any] | None:
+    """Return the environment that a policy was trained in; None: its card does not say."""
+    environment = card.training.config.get("environment")
+    return environment if isinstance(environment, Mapping) else None

@@ -1,0 +1,171 @@
+"""Level gym: the batch twin flies many episodes at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.core.constants import US_PER_S
+from airl_mav.envs.contact import FLOOR, WALL
+from airl_mav.envs.evaluation import (
+    OUTCOMES,
+    Flown,
+    LearnedPilots,
+    Pilots,
+    SinglePilots,
+    fly_seeds,
+)
+from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.trace import Trace
+from airl_mav.experiments.executors import Stop
+from airl_mav.experiments.fliers import FlyEpisodes
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario, action_generator
+
+BLOCK_SLOTS = 4
+"""Episodes a job and slot: in a shorter job most slots would wait for the longest flights."""
+
+
+def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
+    """Return the environment of the batch twin in which a scenario is flown."""
+    asked, card = scenario.scenario, scenario.policy.card
+    shape: dict[str, Any]
+    if card is None:
+        # It looks at the camera's own image.
+        camera = scenario.vehicle.camera
+        shape = {"image_width_px": camera.width_px, "image_height_px": camera.height_px}
+    else:
+        shape = {
+            "layout": card.observation.layout,
+            "image_width_px": card.observation.width_px,
+            "image_height_px": card.observation.height_px,
+            "actions": card.actions.set,
+            "max_speed_m_s": card.actions.max_speed_m_s,
+        }
+    pilot = scenario.pilot
+    return spec_of(
+        None,
+        {
+            "vehicle": asked.vehicle,
+            "arena": asked.arena,
+            **shape,
+            "episode": {
+                "goal_radius_m": pilot.goal_radius_m,
+                "time_limit_s": asked.time_limit_s,
+                "hold_s": pilot.hold_s,
+                "hover_after_s": scenario.watchdog.hover_after_s,
+                "altitude_m": pilot.altitude_m,
+            },
+            "delay": {
+                "computer": asked.computer,
+                "workload": asked.workload,
+                "latency": () if asked.latency is None else (asked.latency,),
+            },
+        },
+    )
+
+
+@dataclass(frozen=True)
+class GymFlier:
+    """Flies the episodes of a scenario in the batch twin. Implements `fliers.Flier`.
+
+    A flight depends on its seed alone, not on the slots or on what flies beside it.
+    """
+
+    scenario: ResolvedScenario
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:
+        """Return how many episodes make a job; see `fliers.Flier`."""
+        return max(
+            1, min(BLOCK_SLOTS * self.scenario.scenario.slots, math.ceil(episodes / workers))
+        )
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (no logs here)
+        """Load the policy; see `fliers.Flier`."""
+        scenario = self.scenario
+        environment, pilots = environment_of(scenario), _pilots(scenario)
+
+        def fly(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+            index_of = {episode.seed: episode.index for episode in episodes}
+            slots = min(scenario.scenario.slots, len(index_of))
+            trace = Trace(slots)
+            navigation = Navigation(
+                environment,
+                slots,
+                vehicle=scenario.vehicle,
+                arena=scenario.arena,
+                injection=scenario.injection,
+                latency_draw=scenario.scenario.latency_seed,
+                arena_seed=scenario.scenario.arena_seed,
+                trace=trace,
+            )
+            for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=stop):
+                yield self._episode(navigation, trace, slot, flown, index_of[flown.seed])
+
+        return fly
+
+    def _episode(
+        self, navigation: Navigation, trace: Trace, slot: int, flown: Flown, index: int
+    ) -> FlownEpisode:
+        """Return the flight whose end its slot still shows."""
+        arena, rules = navigation.arenas[slot], navigation.spec.episode
+        assert arena is not None  # noqa: S101 (it has just been flown in)
+        outcome = OUTCOMES[flown.verdict]
+        flights, trajectory = navigation.flights(), trace.trajectory(slot)
+        ended_us = round(flown.flight_time_s * US_PER_S)
+        record = EpisodeRecord(
+            index=index,
+            seed=flown.seed,
+            arena=self.scenario.scenario.arena,
+            arena_seed=self.scenario.scenario.arena_seed_of(flown.seed),
+            outcome=outcome,
+            reason=_reason(outcome, flights, slot, arena, rules.time_limit_s),
+            goal=(float(arena.goal[0]), float(arena.goal[1])),
+            goal_radius_m=rules.goal_radius_m,
+            time_limit_s=rules.time_limit_s,
+            # The twin begins in a hover above the start: there is no take-off.
+            started_us=0,
+            navigation_us=0,
+            ended_us=ended_us,
+            wall_s=None,
+            slipped_us=0,
+            battery_remaining=float(flights.battery[slot]),
+            quality=measure_quality(trajectory, 0, ended_us, self.scenario.computer.watts),
+        )
+        return FlownEpisode(record, trajectory, trace.latency(slot))
+
+
+def _pilots(scenario: ResolvedScenario) -> Pilots:
+    """Return who decides for all vehicles."""
+    loaded = scenario.fresh_policy(scenario.scenario.seed)
+    if isinstance(loaded, LearnedPolicy):
+        # As the companion draws them.
+        return LearnedPilots(loaded, action_generator)
+    seed = scenario.scenario.seed
+    return SinglePilots(lambda: scenario.fresh_policy(seed), scenario.pilot.max_speed_m_s)
+
+
+def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s: float) -> str:
+    """Return why a flight ended, in the referee's words."""
+    if outcome is Outcome.COLLISION:
+        return f"hit {_name(arena, int(flights.touched[slot]))}"
+    if outcome is Outcome.BATTERY:
+        return "battery empty"
+    away = f"{flights.goal_distance_m[slot]:.2f} m from the goal"
+    return away if outcome is Outcome.SUCCESS else f"{away} after {limit_s:g} s"
+
+
+def _name(arena: Arena, touched: int) -> str:
+    """Return what was hit, as the plant calls it."""
+    if touched in (FLOOR, WALL):
+        return "floor" if touched == FLOOR else "wall"
+    moving = "moving" if touched >= arena.n_static else "static"
+    return f"{moving}-{Shape(int(arena.obstacles.shape[touched])).name.lower()}-{touched}"

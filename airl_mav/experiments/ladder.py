@@ -1,0 +1,89 @@
+"""The fidelity ladder: the same policy and seeds at several levels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.experiment import (
+    Experiment,
+    ExperimentResult,
+    entry_of,
+    make_cell,
+    run_and_compare,
+)
+from airl_mav.report.comparison.ladder import ladder_recipe
+from airl_mav.scenario.model import LevelName, Scenario
+
+LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
+
+SITL_EPISODES = 10
+"""Episodes at level sitl unless asked for: they take real time."""
+
+FACTS = ("arena", "vehicle", "computer", "workload", "latency", "seed")
+"""Fields that head a ladder, beside the policy."""
+
+
+def ladder(
+    scenario: Scenario,
+    levels: Sequence[LevelName] = LEVELS,
+    *,
+    sitl_episodes: int | None = None,
+    out: Path | str | None = None,
+    progress: bool = False,
+) -> ExperimentResult:
+    """Fly the same scenario at several levels and say what differs.
+
+    Args:
+        scenario: What is flown; its level is passed over.
+        levels: Two or more; the first is the reference of the others.
+        sitl_episodes: Number of episodes at level sitl; None: 10, or all if they are fewer.
+        out: Folder; the same one goes on. None makes `runs/<UTC time>-ladder-...`.
+        progress: Whether to draw bars on standard error.
+
+    Raises:
+        UsageError: Something cannot be flown, or `out` holds something else.
+        RehearsalError: It was broken off: processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    """
+    declared = declare_ladder(scenario, levels, sitl_episodes=sitl_episodes)
+    return run_and_compare(declared, out, progress=progress)
+
+
+def declare_ladder(
+    scenario: Scenario,
+    levels: Sequence[LevelName] = LEVELS,
+    *,
+    sitl_episodes: int | None = None,
+) -> Experiment:
+    """Declare a ladder; see `ladder`. Raises UsageError."""
+    if len(set(levels)) < len(levels) or len(levels) < 2:
+        raise FieldError(
+            "levels", " ".join(levels) or "none", "two or more of gym lockstep sitl, each once"
+        )
+    if sitl_episodes is not None and not 1 <= sitl_episodes <= scenario.episodes:
+        raise FieldError("sitl_episodes", sitl_episodes, f"1 <= value <= {scenario.episodes}")
+    fewer = min(sitl_episodes or SITL_EPISODES, scenario.episodes)
+    cells = tuple(
+        make_cell(level, level, scenario.model_copy(update=_at(level, scenario, fewer)))
+        for level in levels
+    )
+    policy, arena = cells[0].scenario.policy, cells[0].scenario.arena_name
+    facts = {"policy": policy.name, **{field: getattr(scenario, field) for field in FACTS}}
+    facts["rules"] = "; ".join(dict.fromkeys(cell.scenario.rules for cell in cells))
+    return Experiment(
+        kind="ladder",
+        name=f"{policy.name}-{arena}",
+        facts=facts,
+        cells=cells,
+        recipe=ladder_recipe,
+        roles={cell.name: entry_of(cell) for cell in cells},
+    )
+
+
+def _at(level: LevelName, scenario: Scenario, sitl_episodes: int) -> dict[str, object]:
+    """Return what differs at a level: fields that only others have are left at their default."""
+    if level == "sitl":
+        return {"level": level, "episodes": sitl_episodes, "workers": None, "tlogs": False}
+    return {"level": level, "speed": None}

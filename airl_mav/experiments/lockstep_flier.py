@@ -1,0 +1,37 @@
+"""Level lockstep: one flight at a time in each worker."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from airl_mav.experiments.executors import Stop
+from airl_mav.experiments.fliers import FlyEpisodes
+from airl_mav.lockstep.flight import fly
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+from firmware_sim.warm_up import warm_up
+
+
+@dataclass(frozen=True)
+class LockstepFlier:
+    """Flies the episodes of a scenario in lockstep. Implements `fliers.Flier`."""
+
+    scenario: ResolvedScenario
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:  # noqa: ARG002
+        """Return how many episodes make a job; see `fliers.Flier`."""
+        return 1
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
+        """Load everything; see `fliers.Flier`."""
+        scenario = self.scenario
+        warm_up(scenario.vehicle)
+
+        def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+            for episode in episodes:
+                tlog = folder.tlog_path(episode.index) if scenario.scenario.tlogs else None
+                policy = scenario.fresh_policy(episode.seed)
+                yield fly(scenario, policy, episode.index, episode.seed, tlog=tlog)
+
+        return fly_all
