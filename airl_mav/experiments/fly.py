@@ -1,5 +1,6 @@
 """A scenario, flown into its run folder at whatever level; what was flown before is gone on
-with."""
+with.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The hardware gap: a policy on a workstation and on an onboard computer, with and without
-mitigation."""
+mitigation.
+"""
 
 from __future__ import annotations
 

@@ -44,7 +44,8 @@ class Run:
     def latency(self) -> dict[str, Samples]:
         """Durations (n,) [µs] of each stage over all decisions: `t1`, `t2`, `t3`, `link`,
         `control`,
-        `end_to_end`, `period`, ...; see `latency.stages.STAGES`."""
+        `end_to_end`, `period`, ...; see `latency.stages.STAGES`.
+        """
         return pool(stage_samples(stamps) for stamps in self.stamps.values())
 
     @property
@@ -60,7 +61,8 @@ class Run:
     @property
     def sha256(self) -> str | None:
         """Fingerprint of all flights: equal when they are equal bit by bit; None where flights are
-        never the same (level sitl)."""
+        never the same (level sitl).
+        """
         return run_sha256(self.episodes)
 
     @property
