@@ -14,13 +14,13 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments.executors import MAX_WORKERS
 from airl_mav.flight.record import run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import Result as CardResult
 from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
-from airl_mav.rehearsal.workers import GREATEST_WORKERS
 from airl_mav.report.matrix import (
     MATRIX_FILE,
     MATRIX_TABLE_FILE,
@@ -98,7 +98,7 @@ def _check_level(command: EvaluateCommand) -> None:
         raise UsageError(
             f"--workers {command.workers} with --level {level}: accepted: with --level lockstep"
         )
-    check_range("--workers", command.workers, 1, GREATEST_WORKERS)
+    check_range("--workers", command.workers, 1, MAX_WORKERS)
 
 
 def _check_plain(command: EvaluateCommand, policies: Sequence[PolicyInfo]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from airl_mav.cli.common import check_range
@@ -12,6 +13,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import LearnedPilots, Pilots, SinglePilots
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.latency.injection import without_timing
@@ -22,17 +24,15 @@ from airl_mav.policy.registry import PolicyInfo, find_policy, load_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import Camera, load_vehicle
 from airl_mav.rehearsal.evaluation import Evaluation
-from airl_mav.rehearsal.evaluation_gym import GymPlan
 
 GREATEST_SLOTS = 4096
 """Flights at a time: more would fill gigabytes with paths."""
 
 
-def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[GymPlan, Pilots]:
+def plan_evaluation(
+    command: EvaluateCommand, policy: str, arena: str
+) -> tuple[Evaluation, GymFlier]:
     """Check everything that can be wrong before anything flies.
-
-    Returns:
-        The plan, and who decides.
 
     Raises:
         UsageError: Names the option, its value and what is accepted.
@@ -43,7 +43,7 @@ def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[
     if info.card is not None and (reason := vehicle_mismatch(info.card, vehicle.camera)):
         raise UsageError(f"policy {policy}: vehicle {command.vehicle}: {reason}")
     environment = _environment(command, info, arena, vehicle.camera)
-    pilots = _pilots(command, policy, environment)
+    _pilots(command, policy, environment)
     injection = without_timing(
         select_injection(
             command.latency,
@@ -84,15 +84,15 @@ def plan_evaluation(command: EvaluateCommand, policy: str, arena: str) -> tuple[
         "environment": environment.model_dump(mode="json"),
     }
     evaluation = Evaluation(setup, seeds(command), config)
-    plan = GymPlan(
-        evaluation,
+    return evaluation, GymFlier(
         environment,
         injection,
+        computer.watts,
+        partial(_pilots, command, policy, environment),
         command.slots,
         latency_draw=command.latency_seed,
         arena_seed=command.arena_seed,
     )
-    return plan, pilots
 
 
 def _environment(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,26 +11,22 @@ from rich.console import Console
 
 from airl_mav.cli import sitl
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
-from airl_mav.cli.episode_bar import EpisodeBar, stop_on_signals
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_gym import plan_evaluation
 from airl_mav.cli.evaluate_lockstep import plan_lockstep
+from airl_mav.cli.signals import stop_on_signals
 from airl_mav.cli.sitl_command import SitlCommand, check
+from airl_mav.core.progress import RichProgress
+from airl_mav.experiments.campaign import Cell, Flier, run_cell
+from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.policy.registry import PolicyInfo, find_policy
-from airl_mav.rehearsal.evaluation import Evaluation, Watch, open_folder
-from airl_mav.rehearsal.evaluation_gym import fly_gym
-from airl_mav.rehearsal.evaluation_lockstep import fly_lockstep
-from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.run_folder import RunFolder, load
-from airl_mav.rehearsal.workers import WorkerError
+from airl_mav.rehearsal.evaluation import Evaluation
+from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.overview import write_overview
 from airl_mav.report.rebuild import pictured_arenas
 from companion.watchdog import WatchdogSettings
-
-FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]
-"""Flies what is left into a folder that holds some episodes already."""
 
 
 @dataclass(frozen=True)
@@ -68,15 +63,16 @@ def prepare(command: EvaluateCommand, policy: str, arena: str) -> Task:
     """Check everything that can be wrong before anything flies. Raises UsageError."""
     info = find_policy(policy)
     if command.level == "gym":
-        plan, pilots = plan_evaluation(command, policy, arena)
-        episode = plan.environment.episode
+        evaluation, gym = plan_evaluation(command, policy, arena)
+        episode = gym.environment.episode
         rules = episode.goal_radius_m, episode.hold_s, episode.altitude_m, episode.time_limit_s
-        fly = partial(_fly, plan.evaluation, partial(fly_gym, plan, pilots))
+        fly = partial(_fly, evaluation, gym, ExecutorSettings(), True)
         return Task(info, arena, _in_words(*rules), fly)
     rehearsal = sitl_command(command, info, policy, arena)
     if command.level == "lockstep":
-        run, pilot = plan_lockstep(command, rehearsal)
-        fly = partial(_fly, run.evaluation, partial(fly_lockstep, run))
+        evaluation, lockstep, pilot = plan_lockstep(command, rehearsal)
+        executor = ExecutorSettings(workers=command.workers)
+        fly = partial(_fly, evaluation, lockstep, executor, False)
     else:
         _, pilot = check(rehearsal)
         fly = partial(_fly_sitl, rehearsal)
@@ -91,46 +87,37 @@ def _in_words(radius_m: float, hold_s: float, altitude_m: float, limit_s: float)
     )
 
 
-def _fly(evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: Console) -> Result:
-    """Fly what is left of an evaluation, alone in its folder."""
-    with locked(out, partial(_say, console)) if out is not None else nullcontext():
-        return _fly_alone(evaluation, fly_rest, out, console)
-
-
-def _fly_alone(
-    evaluation: Evaluation, fly_rest: FlyRest, out: Path | None, console: Console
+def _fly(
+    evaluation: Evaluation,
+    flier: Flier,
+    settings: ExecutorSettings,
+    in_process: bool,
+    out: Path | None,
+    console: Console,
 ) -> Result:
+    """Fly what is left of an evaluation."""
     setup, config = evaluation.setup, evaluation.config
     arena = Path(setup.arena.name).stem
     without = f"-no-{config['ablate']}" if config["ablate"] else ""
     level = "" if setup.level == "gym" else f"-{setup.level}"
     label = f"evaluate-{setup.policy.name}{without}-{arena}{level}"
-    folder, done = open_folder(out, label, evaluation)
-    planned = len(evaluation.seeds)
-    if done:
-        _say(console, f"{folder.path}: {len(done)} of {planned} episodes are there")
-    flown = list(done)
-    broken = False
-    title = f"{setup.policy.name} in {arena}"
-    with EpisodeBar(console, title, done, planned) as bar, stop_on_signals() as stop:
-
-        def finished(record: EpisodeRecord) -> None:
-            flown.append(record)
-            bar.finished(record)
-
-        try:
-            fly_rest(folder, done, Watch(finished, bar.say, stop))
-        except WorkerError as error:
-            _say(console, f"error: {error}", "red")
-            broken = True
+    cell = Cell(label, f"{setup.policy.name} in {arena}", evaluation, flier)
+    with (
+        open_executor(settings, in_process=in_process) as executor,
+        RichProgress(console) as progress,
+        stop_on_signals() as stop,
+    ):
+        run = run_cell(out, cell, executor, progress=progress, stop=stop)
         # Also when the last flight had ended by then: what would come after it must not begin.
         stopped = stop()
-    if left := len(flown) < planned:
-        ended = "broken off" if broken else "interrupted"
-        _say(console, f"{ended}: what was flown is kept; --out {folder.path} goes on", "yellow")
-    episodes = tuple(sorted(flown, key=lambda record: record.index))
-    code = EXIT_BROKEN if broken else EXIT_INTERRUPTED if left or stopped else 0
-    return Result(folder.path, code, episodes, len(flown) - len(done))
+    (flown,) = run.cells
+    if run.error is not None:
+        _say(console, f"error: {run.error}", "red")
+    if not run.complete:
+        ended = "interrupted" if run.error is None else "broken off"
+        _say(console, f"{ended}: what was flown is kept; --out {flown.path} goes on", "yellow")
+    code = EXIT_BROKEN if run.error else 0 if run.complete and not stopped else EXIT_INTERRUPTED
+    return Result(flown.path, code, flown.episodes, flown.new)
 
 
 def _say(console: Console, text: str, style: str | None = None) -> None:

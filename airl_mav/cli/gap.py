@@ -12,7 +12,7 @@ from airl_mav.cli.common import GREATEST_SEED, check_range
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.workers import GREATEST_WORKERS
+from airl_mav.experiments.executors import MAX_WORKERS
 
 if TYPE_CHECKING:
     from airl_mav.cli.cells import FlownCell
@@ -90,4 +90,4 @@ def _check(command: GapCommand) -> None:
                 f"--workers {command.workers} with --level {command.level}: accepted: with --level "
                 "lockstep"
             )
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
+        check_range("--workers", command.workers, 1, MAX_WORKERS)

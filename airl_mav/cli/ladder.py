@@ -12,9 +12,9 @@ from airl_mav.cli.evaluate import DEFAULT_ARENA
 from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments.executors import MAX_WORKERS
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
-from airl_mav.rehearsal.workers import GREATEST_WORKERS
 from airl_mav.report.matrix import MATRIX_FILE
 
 FACTS = ("vehicle", "computer", "workload", "latency", "seed")
@@ -77,7 +77,7 @@ def _check(command: LadderCommand) -> str:
     check_range("--seed", command.seed, 0, GREATEST_SEED)
     check_draws(command.latency_seed, command.arena_seed)
     if command.workers is not None:
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
+        check_range("--workers", command.workers, 1, MAX_WORKERS)
     if command.sitl_episodes is not None:
         check_range("--sitl-episodes", command.sitl_episodes, 1, command.episodes)
     if command.arena is not None:

@@ -17,7 +17,7 @@ from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.report_command import ReportCommand
-from airl_mav.cli.sweep_command import SweepCommand
+from airl_mav.cli.sweep import SweepCommand
 from airl_mav.cli.train_command import TrainCommand
 
 

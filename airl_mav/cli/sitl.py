@@ -33,7 +33,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import Plan, ProcessPlan
-from airl_mav.rehearsal.evaluation import Evaluation, Job, open_folder
+from airl_mav.rehearsal.evaluation import Evaluation, PlannedEpisode, open_folder
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import RichObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
@@ -119,7 +119,7 @@ def fly(command: SitlCommand, console: Console, label: str | None = None) -> Flo
             keeps = held.enter_context(locked(folder.path, say))
         if done:
             _say(console, f"{folder.path}: {len(done)} of {command.episodes} episodes are there")
-        jobs = evaluation.jobs(done)
+        jobs = evaluation.left(done)
         if not jobs:
             return Flown(folder.path, 0, 0)
         _say_what_flies(command, setup, console)
@@ -267,7 +267,7 @@ def _rehearse_in_lockstep(
     command: SitlCommand,
     setup: Setup,
     pilot: PilotSettings,
-    jobs: Sequence[Job],
+    jobs: Sequence[PlannedEpisode],
     folder: RunFolder,
     observer: RichObserver,
 ) -> None:

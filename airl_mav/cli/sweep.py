@@ -4,45 +4,84 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import ValidationError
+import tyro
+from pydantic import BaseModel, ValidationError
 from rich.console import Console
 
-from airl_mav.cli.common import (
-    EXIT_BROKEN,
-    EXIT_INTERRUPTED,
-    GREATEST_SEED,
-    check_range,
-    check_train_installed,
-)
-from airl_mav.cli.episode_bar import stop_on_signals
-from airl_mav.cli.sweep_command import SweepCommand
-from airl_mav.cli.sweep_progress import SweepProgress
+from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, check_range, check_train_installed
+from airl_mav.cli.signals import stop_on_signals
 from airl_mav.core.errors import UsageError
-from airl_mav.core.provenance import usable_cores
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import explain, load_profile
-from airl_mav.rehearsal.workers import GREATEST_WORKERS, WorkerError
-from airl_mav.sweep.config import Examination, Grid, SweepConfig, load_sweep
-from airl_mav.sweep.executors import Executor, LocalExecutor, Work
-from airl_mav.sweep.store import SweepFolder
-from airl_mav.sweep.summary import Computer, estimated_ms, summarize, write_sweep
-from airl_mav.sweep.trial import trials
+from airl_mav.core.progress import RichProgress
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.executors import ExecutorSettings
+    from airl_mav.sweep.config import SweepConfig
 
 GREATEST_SEEDS = 1000
-GREATEST_GPUS = 8.0
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass(frozen=True)
+class SweepCommand:
+    """Search for the network that flies best: train many, judge all, draw heat maps.
+
+    Air Learning's search over its template: layers x filters, several training seeds a cell. The
+    same --out goes on with what was interrupted, whoever was killed.
+    """
+
+    sweep: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")] = "quick"
+    """quick (two cores, an hour), full (the paper's grid), paper (the same on the paper's image,
+    for GPUs), tiny (seconds, shows nothing), or a path to a .toml."""
+
+    out: Path | None = None
+    """Folder of the sweep. None: runs/sweep-<name>."""
+
+    seeds: int | None = None
+    """Training seeds of each cell, 1 to N, 1 to 1000. None: the sweep's."""
+
+    steps: int | None = None
+    """Decisions of each training. None: the sweep's."""
+
+    episodes: int | None = None
+    """Flights that judge each trained network. None: the sweep's."""
+
+    seed: int | None = None
+    """Seed of the first of these flights; flight i has seed + i, in every cell. None: the
+    sweep's."""
+
+    computer: str | None = None
+    """Computer profile: a shipped name, or a path to a .toml. Each cell then shows its decision
+    latency t2 there, estimated from multiply-accumulates. May change when a sweep goes on."""
+
+    executor: Literal["process", "ray"] = "process"
+    """Who carries out the trials: processes of this machine, or Ray."""
+
+    workers: int | None = None
+    """Trials at a time, 1 to 256, each on one core. None: one for each core, here or in the
+    cluster."""
+
+    ray_address: str = "local"
+    """local starts a Ray here, auto takes the one that runs here, else HOST:PORT of a cluster whose
+    machines all see --out."""
+
+    device: Literal["cpu", "cuda"] = "cpu"
+    """What trains: cpu, one core a trial, or cuda."""
+
+    ray_gpus: float | None = None
+    """Share of a GPU that Ray keeps for each trial, 0 to 8. None: 1 with --device cuda, else 0."""
+
+    dry_run: bool = False
+    """Say what would be done: trials, parameters, multiply-accumulates, decisions. Nothing is
+    trained or written."""
 
 
 def run(command: SweepCommand, console: Console | None = None) -> int:
     """Carry out what is left of a sweep, and show what came out.
-
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
 
     Returns:
         Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
@@ -50,159 +89,98 @@ def run(command: SweepCommand, console: Console | None = None) -> int:
     Raises:
         UsageError: The input cannot be used.
     """
+    from airl_mav.experiments.executors import open_executor
+    from airl_mav.profiles.computer import load_computer
+    from airl_mav.report.sweep.terminal import print_plan, print_sweep
+    from airl_mav.sweep.run import run_sweep
+    from airl_mav.sweep.summary import Computer, estimated_ms
+
     console = console or Console()
-    config, computer = sweep_of(command), _computer(command)
+    config, settings = _config(command), _executor(command)
+    computer = None
+    if command.computer is not None:
+        computer = Computer(command.computer, load_computer(command.computer))
+        estimated_ms(computer.profile, 1)  # Raises for a computer without a workload.
     name = Path(command.sweep).stem
     path = (command.out or Path("runs") / f"sweep-{name}").absolute()
     if command.dry_run:
-        from airl_mav.report.sweep.terminal import print_plan
-
         print_plan(name, config, computer, path, console)
         return 0
-    _check_installed(command)
-    folder = SweepFolder.at(path, config)
-    with folder.locked():
-        made = folder.made(shlex.join(["airl", *sys.argv[1:]]))
-        sweep = summarize(folder, made, computer)
-        write_sweep(sweep)
-        console.print(f"sweep      {name}: {config.description}", markup=False, highlight=False)
-        console.print(f"folder     {path}", soft_wrap=True, markup=False, highlight=False)
-        code = _carry_out(
-            command, folder, console, lambda: write_sweep(summarize(folder, made, computer))
-        )
-        sweep = summarize(folder, made, computer)
-        write_sweep(sweep)
-        if sweep.ended:
-            from airl_mav.report.sweep.page import build_page
-            from airl_mav.report.sweep.terminal import print_sweep
+    check_train_installed()
+    with RichProgress(console) as progress, open_executor(settings) as executor:
+        progress.note(f"sweep      {name}: {config.description}\nfolder     {path}")
+        with stop_on_signals() as stop:
+            sweep, error = run_sweep(
+                path,
+                config,
+                executor,
+                command=shlex.join(["airl", *sys.argv[1:]]),
+                progress=progress,
+                device=command.device,
+                computer=computer,
+                stop=stop,
+            )
+        if error is not None:
+            progress.note(error, "yellow")
+    if sweep.ended:
+        from airl_mav.report.sweep.page import build_page
 
-            print_sweep(sweep, console, build_page(sweep))
-    if code:
-        told = "interrupted" if code == EXIT_INTERRUPTED else "not all trials have ended"
-        console.print(
-            f"{told}: the same command with --out {path} goes on",
-            style="yellow",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-    return code
-
-
-def _carry_out(
-    command: SweepCommand, folder: SweepFolder, console: Console, ended: Callable[[], None]
-) -> int:
-    """Carry out the trials that are left; `ended` is called as each one ends."""
-    wanted = trials(folder.config)
-    waiting = [trial for trial in wanted if folder.result(trial) is None]
-    if not waiting:
+        print_sweep(sweep, console, build_page(sweep))
+    if sweep.ended == sweep.planned:
         return 0
-    # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
-    from airl_mav.sweep.work import TrialWork
-
-    work = TrialWork(folder, shlex.join(["airl", *sys.argv[1:]]), command.device)
-    progress = SweepProgress(console, folder, wanted, len(wanted) - len(waiting))
-    with ExitStack() as stack:
-        executor = stack.enter_context(_executor(command, work, progress.say))
-        stack.enter_context(progress)
-        progress.begin(waiting)
-        interrupted = stack.enter_context(stop_on_signals())
-
-        def stop() -> bool:
-            progress.look()
-            return interrupted()
-
-        try:
-            for result in executor.run(waiting, stop):
-                progress.finished(result)
-                ended()
-        except WorkerError as error:
-            progress.say(str(error))
-            return EXIT_BROKEN
-        return EXIT_INTERRUPTED if interrupted() else 0
+    told = "interrupted" if error is None else "not all trials have ended"
+    progress.note(f"{told}: the same command with --out {path} goes on", "yellow")
+    return EXIT_INTERRUPTED if error is None else EXIT_BROKEN
 
 
-@contextmanager
-def _executor(command: SweepCommand, work: Work, lost: Callable[[str], None]) -> Iterator[Executor]:
-    """Give whoever carries out the trials."""
-    cores = min(usable_cores(), GREATEST_WORKERS)
-    if command.ray is None:
-        yield LocalExecutor(work, command.workers or cores, lost)
-        return
-    from airl_mav.sweep.ray_executor import LOCAL, RayExecutor, connected
-
-    cores = command.workers or cores
-    most = cores if command.ray == LOCAL else command.workers
-    gpus = command.ray_gpus
-    if gpus is None:
-        gpus = 1.0 if command.device == "cuda" else 0.0
-    with connected(command.ray, cores):
-        yield RayExecutor(work, most, gpus, lost)
-
-
-def sweep_of(command: SweepCommand) -> SweepConfig:
+def _config(command: SweepCommand) -> SweepConfig:
     """Load the sweep, put the command line's values into it, and check it. Raises UsageError."""
-    if command.workers is not None:
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
-    if command.ray_gpus is not None:
-        if command.ray is None:
-            raise UsageError(f"--ray-gpus {command.ray_gpus:g}: accepted: with --ray")
-        check_range("--ray-gpus", command.ray_gpus, 0.0, GREATEST_GPUS)
-    config = load_sweep(command.sweep)
-    changes: dict[str, object] = {}
+    from airl_mav.profiles.arena import ArenaSpec
+    from airl_mav.profiles.loading import load_profile
+    from airl_mav.sweep.config import SweepConfig, load_sweep
+
+    data = load_sweep(command.sweep).model_dump(exclude_unset=True)
     if command.seeds is not None:
         check_range("--seeds", command.seeds, 1, GREATEST_SEEDS)
-        changes["seeds"] = tuple(range(1, command.seeds + 1))
-    if command.steps is not None:
-        check_range("--steps", command.steps, 1, 10**10)
-        changes["training"] = config.training.model_copy(update={"steps": command.steps})
-    flights = config.evaluation.model_dump()
-    if command.episodes is not None:
-        check_range("--episodes", command.episodes, 1, 100_000)
-        flights["episodes"] = command.episodes
-    if command.seed is not None:
-        check_range("--seed", command.seed, 0, GREATEST_SEED)
-        flights["seed"] = command.seed
-    changes["evaluation"] = _examination(flights)
-    # Workers, and other machines, may have another working directory.
-    changes["grids"] = tuple(_found(grid) for grid in config.grids)
-    return config.model_copy(update=changes)
+        data["seeds"] = range(1, command.seeds + 1)
+    for table, field, value in (
+        ("training", "steps", command.steps),
+        ("evaluation", "episodes", command.episodes),
+        ("evaluation", "seed", command.seed),
+    ):
+        if value is not None:
+            data.setdefault(table, {})[field] = value
+    for grid in data["grids"]:
+        load_profile("arenas", grid["arena"], ArenaSpec)
+        if grid["arena"].endswith(".toml"):
+            # Workers, and other machines, may have another working directory.
+            grid["arena"] = f"{Path(grid['arena']).absolute()}"
+    return _checked(SweepConfig, data)
 
 
-def _examination(flights: dict[str, int]) -> Examination:
-    try:
-        return Examination.model_validate(flights)
-    except ValidationError as error:
-        told = explain(error, Examination)
-        raise UsageError(f"--episodes, --seed: {told}") from None
+def _executor(command: SweepCommand) -> ExecutorSettings:
+    """Return who carries out the trials. Raises UsageError."""
+    from airl_mav.experiments.executors import ExecutorSettings
 
-
-def _found(grid: Grid) -> Grid:
-    """Return a grid whose arena exists, by its full path if it has one. Raises UsageError."""
-    load_profile("arenas", grid.arena, ArenaSpec)
-    if not grid.arena.endswith(".toml"):
-        return grid
-    return grid.model_copy(update={"arena": f"{Path(grid.arena).absolute()}"})
-
-
-def _computer(command: SweepCommand) -> Computer | None:
-    """Return the computer whose latency is estimated. Raises UsageError."""
-    if command.computer is None:
-        return None
-    computer = Computer(command.computer, load_computer(command.computer))
-    estimated_ms(computer.profile, 1)
-    return computer
-
-
-def _check_installed(command: SweepCommand) -> None:
-    """Raise UsageError unless all that the trainings need is there."""
-    check_train_installed()
-    if command.ray is not None:
-        from airl_mav.sweep.ray_executor import check_ray_installed
-
-        check_ray_installed()
-    elif command.device == "cuda":
+    gpus = command.ray_gpus
+    if gpus is not None and command.executor != "ray":
+        raise UsageError(f"--ray-gpus {gpus:g}: accepted: with --executor ray")
+    if command.device == "cuda" and command.executor == "process":
+        check_train_installed()
         import torch
 
         if not torch.cuda.is_available():
             raise UsageError("--device cuda: torch finds no GPU here; accepted: cpu")
+    data = {name: getattr(command, name) for name in ("executor", "workers", "ray_address")}
+    default = 1.0 if command.device == "cuda" else 0.0
+    return _checked(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})
+
+
+def _checked(model: type[Model], data: dict[str, Any]) -> Model:
+    """Return a model of the command line's values. Raises UsageError."""
+    from airl_mav.profiles.loading import explain
+
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise UsageError(explain(error, model)) from None

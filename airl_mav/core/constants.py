@@ -1,4 +1,4 @@
-"""Physical constants and unit conversions. SI, with sources."""
+"""Physical constants with their sources, unit conversions, and what holds for all processes."""
 
 from __future__ import annotations
 
@@ -45,3 +45,6 @@ TICK_HZ: Final = US_PER_S // TICK_US
 
 DEG: Final = math.pi / 180.0
 """One degree [rad]."""
+
+MAX_ATTEMPTS: Final = 3
+"""A job or a flight whose processes are lost is begun so many times, the first included."""

@@ -158,9 +158,8 @@ class _RichBar:
         self, bars: RichBars, label: str, total: float, completed: float, unit: str | None
     ) -> None:
         self._bars = bars
-        self._task = bars.add_task(
-            label, total=total, completed=completed, before=completed, unit=unit, postfix=""
-        )
+        self._task = bars.add_task(label, total=total, before=completed, unit=unit, postfix="")
+        bars.update(self._task, completed=completed)
 
     def advance(self, amount: float = 1.0) -> None:
         """Add to what is completed."""
@@ -168,8 +167,9 @@ class _RichBar:
 
     def update(self, *, completed: float | None = None, postfix: str | None = None) -> None:
         """Set what is completed, or the text after the bar."""
-        fields = {} if postfix is None else {"postfix": postfix}
-        self._bars.update(self._task, completed=completed, **fields)
+        self._bars.update(self._task, completed=completed)
+        if postfix is not None:
+            self._bars.update(self._task, postfix=postfix)
 
     def close(self) -> None:
         """Remove the bar."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav import __version__
+from airl_mav.core.clock import utc_now
 
 PACKAGES = (
     "filterpy",
@@ -40,6 +41,21 @@ def package_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+def provenance(command: str) -> dict[str, Any]:
+    """Return with what something is being made now, as plain values.
+
+    Args:
+        command: The command line.
+    """
+    return {
+        "created_utc": utc_now().isoformat(timespec="seconds"),
+        "command": command,
+        "versions": package_versions(),
+        "machine": describe_machine(),
+        "git": git_state(),
+    }
 
 
 def describe_machine() -> dict[str, Any]:

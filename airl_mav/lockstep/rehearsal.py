@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from airl_mav.lockstep.flight import LockstepPlan, Watching, fly
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
-from airl_mav.rehearsal.evaluation import Job
+from airl_mav.rehearsal.evaluation import PlannedEpisode
 from airl_mav.rehearsal.rehearsal import Observer
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.rehearsal.state import state_of
@@ -20,7 +20,7 @@ SHOW_EVERY = 125
 
 def rehearse(
     plan: LockstepPlan,
-    jobs: Sequence[Job],
+    jobs: Sequence[PlannedEpisode],
     fresh_policy: Callable[[int], Policy],
     folder: RunFolder,
     observer: Observer,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ LEAVES_RESULTS_ALONE = ("policy_path", "slots", "speed", "tlogs", "workers")
 
 
 @dataclass(frozen=True)
-class Job:
+class PlannedEpisode:
     """An episode to be flown."""
 
     index: int
@@ -37,22 +37,10 @@ class Evaluation:
     """Every setting, as plain values: what differs in any of them is another run, but for those
     of `LEAVES_RESULTS_ALONE`."""
 
-    def jobs(self, done: Iterable[EpisodeRecord] = ()) -> list[Job]:
+    def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
         """Return what is left to be flown when some episodes are done."""
         there = {record.index for record in done}
-        return [Job(index, seed) for index, seed in enumerate(self.seeds) if index not in there]
-
-
-@dataclass(frozen=True)
-class Watch:
-    """Who looks on while an evaluation flies."""
-
-    finished: Callable[[EpisodeRecord], None] = field(default=lambda _: None)
-    """Is told of each episode as it ends."""
-    say: Callable[[str], None] = field(default=lambda _: None)
-    """Is told, in words, what a person should know."""
-    stop: Callable[[], bool] = field(default=lambda: False)
-    """Asked again and again; True ends it all, with what has ended kept."""
+        return [PlannedEpisode(i, seed) for i, seed in enumerate(self.seeds) if i not in there]
 
 
 def open_folder(

@@ -10,7 +10,7 @@ from collections.abc import Collection, Sequence
 from typing import Protocol
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, Task, TruthSample, Verdict
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import (
@@ -30,7 +30,6 @@ from airl_mav.rehearsal.crew import COMPANION, FIRMWARE, Crew, LostError
 from airl_mav.rehearsal.episode import Episode, Plan, save_episode
 from airl_mav.rehearsal.following import TAKEOFF_LIMIT_S, Follower, Order
 from airl_mav.rehearsal.run_folder import RunFolder
-from airl_mav.rehearsal.workers import TRIES
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""
@@ -124,8 +123,10 @@ class Rehearsal:
             except LostError as error:
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
-                if len(notes) == TRIES:
-                    raise RehearsalError(f"{flight}: lost {TRIES} times; at last {error}") from None
+                if len(notes) == MAX_ATTEMPTS:
+                    raise RehearsalError(
+                        f"{flight}: lost {MAX_ATTEMPTS} times; at last {error}"
+                    ) from None
                 self._observer.lost(f"{flight} begins again: {error}")
             else:
                 return

@@ -1,0 +1,308 @@
+"""Campaigns: the evaluations of an experiment, flown by one executor, each into its run folder.
+
+The jobs of all cells go to the executor one after the other, so that no worker waits for the end of
+a cell. A folder is opened, and locked, when the first of its jobs is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+from airl_mav.core.progress import Progress, SilentProgress
+from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
+from airl_mav.experiments.store import CampaignStore
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.rehearsal.chunks import Saver
+from airl_mav.rehearsal.evaluation import Evaluation, PlannedEpisode, another_config, open_folder
+from airl_mav.rehearsal.lock import locked
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+
+FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
+
+
+class Flier(Protocol):
+    """How the episodes of a cell are flown. Goes to workers by pickle."""
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:
+        """Return how many episodes make a job, for an executor that does not stream results.
+
+        Args:
+            episodes: Number of those that are left.
+            workers: Number of jobs at a time.
+        """
+        ...
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
+        """Load everything once; return what flies episodes.
+
+        Args:
+            folder: Where logs go.
+            stop: Whether to leave flights unfinished; to be asked while several fly at a time.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One evaluation of a campaign: one policy in one arena, under one set of conditions."""
+
+    name: str
+    """Its run folder inside that of the campaign."""
+    title: str
+    """One line for people."""
+    evaluation: Evaluation
+    flier: Flier
+
+
+@dataclass(frozen=True)
+class CellRun:
+    """A cell as far as it has been flown."""
+
+    cell: Cell
+    path: Path
+    """Its run folder; cells with the same flights share that of the first."""
+    episodes: tuple[EpisodeRecord, ...]
+    """All that the folder holds, by index."""
+    new: int
+    """How many of them were flown now."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all episodes have been flown."""
+        return len(self.episodes) == len(self.cell.evaluation.seeds)
+
+
+@dataclass(frozen=True)
+class CampaignRun:
+    """What a campaign came to."""
+
+    cells: tuple[CellRun, ...]
+    """Those that were begun, now or before, in the order of the campaign."""
+    complete: bool
+    """Whether all episodes of all cells have been flown."""
+    error: str | None
+    """Why it was broken off: a job failed, or lost its worker too often."""
+
+
+def run_cell(
+    out: Path | None,
+    cell: Cell,
+    executor: Executor,
+    *,
+    progress: Progress | None = None,
+    stop: Stop = never,
+) -> CampaignRun:
+    """Fly what is left of one evaluation.
+
+    Args:
+        out: Its run folder; None makes `runs/<UTC time>-<name of the cell>`.
+        cell: The evaluation.
+        executor: Who flies.
+        progress: Where to say how far it is.
+        stop: Asked several times a second; True ends it all, with what has ended kept.
+
+    Raises:
+        UsageError: The folder holds another run; no arena can be made of a seed. What was flown
+            before is kept.
+    """
+    return _run({cell.name: out}, [cell], executor, progress or SilentProgress(), stop)
+
+
+def run_cells(
+    store: CampaignStore,
+    cells: Sequence[Cell],
+    executor: Executor,
+    *,
+    progress: Progress | None = None,
+    stop: Stop = never,
+    ended: Callable[[CellRun], None] = lambda _: None,
+) -> CampaignRun:
+    """Fly what is left of a campaign.
+
+    Args:
+        store: Its folder.
+        cells: The evaluations, in the order in which they begin; no two have the same name. Those
+            with the same flights share one run folder.
+        executor: Who flies.
+        progress: Where to say how far it is.
+        stop: Asked several times a second; True ends it all, with what has ended kept.
+        ended: Is told of each cell as it is complete, of one that was complete before, too.
+
+    Raises:
+        UsageError: See `run_cell`.
+    """
+    first_of = shared_flights(cells)
+    unique = [cell for cell in cells if first_of[cell.name] is cell]
+    paths = {cell.name: store.cell_path(cell.name) for cell in unique}
+    run = _run(paths, unique, executor, progress or SilentProgress(), stop, ended)
+    flown = {each.cell.name: each for each in run.cells}
+    shown = [
+        CellRun(cell, held.path, held.episodes, held.new)
+        for cell in cells
+        if (held := flown.get(first_of[cell.name].name)) is not None
+    ]
+    return CampaignRun(tuple(shown), run.complete, run.error)
+
+
+def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
+    """Return, by the name of each cell, the first cell that has the same flights: often itself."""
+    firsts: list[Cell] = []
+    first_of: dict[str, Cell] = {}
+    for cell in cells:
+        mine = cell.evaluation
+        for first in firsts:
+            theirs = first.evaluation
+            if theirs.seeds == mine.seeds and not another_config(theirs.config, mine.config):
+                first_of[cell.name] = first
+                break
+        else:
+            firsts.append(cell)
+            first_of[cell.name] = cell
+    return first_of
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Episodes of one cell."""
+
+    cell: str
+    folder: RunFolder
+    episodes: tuple[PlannedEpisode, ...]
+
+    def seeds(self) -> str:
+        """Return the seeds as messages name them."""
+        first, last = self.episodes[0].seed, self.episodes[-1].seed
+        return f"seed {first}" if len(self.episodes) == 1 else f"seeds {first} to {last}"
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What a worker is made of. A worker holds one cell at a time: the next one replaces it."""
+
+    fliers: Mapping[str, Flier]
+
+    def __call__(self, stop: Stop) -> Callable[[_Job], Iterable[FlownEpisode]]:
+        """Return what carries out a job."""
+        loaded: tuple[str, FlyEpisodes] | None = None
+
+        def fly(job: _Job) -> Iterable[FlownEpisode]:
+            nonlocal loaded
+            if loaded is None or loaded[0] != job.cell:
+                loaded = None  # Large networks of two cells might not fit into the memory.
+                loaded = job.cell, self.fliers[job.cell].start(job.folder, stop)
+            return loaded[1](job.episodes)
+
+        return fly
+
+
+class _OpenCell:
+    """A cell that is being flown: its folder locked, its flights saved as they come."""
+
+    def __init__(self, cell: Cell, out: Path | None, progress: Progress) -> None:
+        self.cell = cell
+        self.stack = ExitStack()
+        with ExitStack() as stack:
+            say = partial(progress.note, style="yellow")
+            stack.enter_context(nullcontext() if out is None else locked(out, say))
+            self.folder, self.done = open_folder(out, cell.name, cell.evaluation)
+            planned = len(cell.evaluation.seeds)
+            if self.done:
+                progress.note(
+                    f"{self.folder.path}: {len(self.done)} of {planned} episodes are there",
+                    "yellow",
+                )
+            self._saver = stack.enter_context(Saver(self.folder))
+            self._bar = progress.bar(cell.title, planned, completed=len(self.done), unit="episodes")
+            stack.callback(self._bar.close)
+            self.stack = stack.pop_all()
+        self.episodes = {record.index: record for record in self.done}
+        self._reached = sum(record.outcome is Outcome.SUCCESS for record in self.done)
+
+    def add(self, episode: FlownEpisode) -> None:
+        """Take an episode that has just ended."""
+        record = episode.record
+        self._saver.add(episode)
+        self.episodes[record.index] = record
+        self._reached += record.outcome is Outcome.SUCCESS
+        share = self._reached / len(self.episodes)
+        self._bar.advance()
+        self._bar.update(postfix=f"{share:.1%} reached the goal")
+
+    @property
+    def complete(self) -> bool:
+        """Whether all episodes have been flown."""
+        return len(self.episodes) == len(self.cell.evaluation.seeds)
+
+    def run(self) -> CellRun:
+        """Return what it has come to."""
+        episodes = tuple(self.episodes[index] for index in sorted(self.episodes))
+        return CellRun(self.cell, self.folder.path, episodes, len(episodes) - len(self.done))
+
+
+def _run(
+    paths: Mapping[str, Path | None],
+    cells: Sequence[Cell],
+    executor: Executor,
+    progress: Progress,
+    stop: Stop,
+    ended: Callable[[CellRun], None] = lambda _: None,
+) -> CampaignRun:
+    """Fly what is left of cells with different flights, each into its folder."""
+    opened: dict[str, _OpenCell] = {}
+    error: str | None = None
+    with ExitStack() as stack:
+
+        def open_cell(cell: Cell) -> _OpenCell:
+            new = opened[cell.name] = _OpenCell(cell, paths[cell.name], progress)
+            stack.push(new.stack)
+            return new
+
+        def close(cell: _OpenCell) -> None:
+            cell.stack.close()
+            ended(cell.run())
+
+        def jobs() -> Iterator[_Job]:
+            for cell in cells:
+                flying = opened.get(cell.name) or open_cell(cell)
+                left = cell.evaluation.left(flying.done)
+                if not left:
+                    close(flying)
+                    continue
+                size = len(left)
+                if not executor.streams:
+                    size = cell.flier.episodes_per_job(len(left), executor.workers)
+                folder = RunFolder(flying.folder.path.absolute())
+                for i in range(0, len(left), size):
+                    yield _Job(cell.name, folder, tuple(left[i : i + size]))
+
+        def name(job: _Job) -> str:
+            return job.seeds() if len(cells) == 1 else f"{job.cell}: {job.seeds()}"
+
+        if cells:
+            # Also when nothing is to be flown any more, what is there can be told.
+            open_cell(cells[0])
+        results = executor.run(
+            jobs(),
+            _Start({cell.name: cell.flier for cell in cells}),
+            name=name,
+            stop=stop,
+            lost=partial(progress.note, style="yellow"),
+        )
+        try:
+            with closing(results):
+                for job, episode in results:
+                    flying = opened[job.cell]
+                    flying.add(episode)
+                    if flying.complete:
+                        close(flying)
+        except WorkerError as problem:
+            error = str(problem)
+    runs = [opened[cell.name].run() for cell in cells if cell.name in opened]
+    complete = len(runs) == len(cells) and all(run.complete for run in runs)
+    return CampaignRun(tuple(runs), complete, error)

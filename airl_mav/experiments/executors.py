@@ -1,0 +1,211 @@
+"""Executors: who carries out the jobs of an experiment.
+
+The same job gives the same results whoever carries it out: this process, worker processes
+(`process_executor`) or the workers of a Ray cluster (`ray_executor`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Protocol, TypeVar
+
+from pydantic import Field
+
+from airl_mav.core.constants import MAX_ATTEMPTS
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import usable_cores
+from airl_mav.profiles.fields import ProfileModel, quantity
+
+J = TypeVar("J")
+R = TypeVar("R")
+
+Stop = Callable[[], bool]
+"""Asked again and again; True ends the work."""
+
+Work = Callable[[J], Iterable[R]]
+"""Carries out a job: gives its results, of which there may be several."""
+
+Start = Callable[[Stop], Work[J, R]]
+"""Called once in each worker, to load everything. Goes there by pickle. It is given what asks
+whether the work is to be stopped, for work in this process; other workers are ended instead."""
+
+Results = Generator[tuple[J, R], None, None]
+"""Results as they come, each with its job. Closing it ends the workers, whatever they do."""
+
+MAX_WORKERS = 256
+
+POLL_S = 0.2
+"""Interval at which `stop` is asked while results are awaited [wall s]."""
+
+ONE_THREAD = dict.fromkeys(
+    ("MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+)
+"""Environment of a worker: it has one core."""
+
+
+class WorkerError(Exception):
+    """A job cannot be carried out; the message names it and the reason."""
+
+
+def never() -> bool:
+    """Return False: nobody wants to stop."""
+    return False
+
+
+class Executor(Protocol):
+    """Carries out jobs, several at a time."""
+
+    @property
+    def workers(self) -> int:
+        """Number of jobs at a time."""
+        ...
+
+    @property
+    def streams(self) -> bool:
+        """Whether results are yielded while their job goes on, not at its end."""
+        ...
+
+    def run(
+        self,
+        jobs: Iterable[J],
+        start: Start[J, R],
+        *,
+        name: Callable[[J], str] = str,
+        stop: Stop = never,
+        lost: Callable[[str], None] = lambda _: None,
+    ) -> Results[J, R]:
+        """Carry out jobs, each by whoever is free, and yield their results in any order.
+
+        Args:
+            jobs: What is to be done; the next one is taken when a worker is free.
+            start: What a worker is made of.
+            name: What a job is called in messages.
+            stop: Asked several times a second; True ends it all, and jobs under way are given up.
+            lost: Is told, in one line, of each worker that was lost. Its job begins again: results
+                of an attempt that did not end are never yielded.
+
+        Raises:
+            UsageError: A job says that the input cannot be used.
+            WorkerError: A job failed, or its worker was lost `MAX_ATTEMPTS` times.
+        """
+        ...
+
+
+class InProcessExecutor:
+    """This process, one job after the other; results are yielded while a job goes on.
+
+    An error that is no UsageError is raised as it is.
+    """
+
+    workers: ClassVar[int] = 1
+    streams: ClassVar[bool] = True
+
+    def run(
+        self,
+        jobs: Iterable[J],
+        start: Start[J, R],
+        *,
+        name: Callable[[J], str] = str,
+        stop: Stop = never,
+        lost: Callable[[str], None] = lambda _: None,  # noqa: ARG002 (nobody is lost here)
+    ) -> Results[J, R]:
+        """Carry out jobs; see `Executor`."""
+        work: Work[J, R] | None = None
+        for job in jobs:
+            if stop():
+                return
+            try:
+                work = work or start(stop)
+                for result in work(job):
+                    yield job, result
+            except UsageError as error:
+                raise UsageError(f"{name(job)}: {error}") from None
+
+
+class ExecutorSettings(ProfileModel):
+    """Who carries out the jobs of an experiment; changes no result."""
+
+    executor: Literal["process", "ray"] = Field(
+        "process", description="processes of this machine, or Ray"
+    )
+    workers: int | None = quantity(
+        "jobs at a time, each on one core; none: one for each core, here or in the cluster",
+        "1",
+        ge=1,
+        le=MAX_WORKERS,
+        default=None,
+    )
+    ray_address: str = Field(
+        "local",
+        description="local starts a Ray on this machine, auto takes the one that runs here, else "
+        "HOST:PORT of a cluster's head",
+    )
+    ray_gpus: float = quantity("share of a GPU for each job", "1", ge=0.0, le=8.0, default=0.0)
+
+
+@contextmanager
+def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> Iterator[Executor]:
+    """Give the executor that was asked for.
+
+    Args:
+        settings: What was asked for.
+        in_process: Whether one worker may be this process; one is then the default, too.
+
+    Raises:
+        UsageError: Ray is not installed, or not to be reached.
+    """
+    cores = min(usable_cores(), MAX_WORKERS)
+    if settings.executor == "ray":
+        from airl_mav.experiments.ray_executor import connected
+
+        with connected(settings, cores) as executor:
+            yield executor
+        return
+    workers = settings.workers or (1 if in_process else cores)
+    if in_process and workers == 1:
+        yield InProcessExecutor()
+        return
+    from airl_mav.experiments.process_executor import ProcessExecutor
+
+    yield ProcessExecutor(workers)
+
+
+# --- what the executors with workers have in common
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A worker's answer when a job could not be carried out."""
+
+    message: str
+    usage: bool
+    """Whether the input cannot be used."""
+
+    def error(self, job: str) -> UsageError | WorkerError:
+        """Return what is raised for a job of that name."""
+        return (UsageError if self.usage else WorkerError)(f"{job}: {self.message}")
+
+
+def answer(work: Callable[[], Iterable[R]]) -> list[R] | Failure:
+    """Return a worker's answer: all results of a job, or why there are none."""
+    try:
+        return list(work())
+    except UsageError as error:
+        return Failure(str(error), usage=True)
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        return Failure(" ".join(text.split()), usage=False)
+
+
+def next_attempt(job: str, attempt: int, cause: str, lost: Callable[[str], None]) -> int:
+    """Return the number of the attempt that follows one whose worker was lost, and report it.
+
+    Raises:
+        WorkerError: It was the last one.
+    """
+    if attempt == MAX_ATTEMPTS:
+        raise WorkerError(f"{job}: lost {MAX_ATTEMPTS} workers, the last one by {cause}")
+    lost(f"a worker was lost by {cause}: {job} begins again")
+    return attempt + 1

@@ -1,0 +1,244 @@
+"""Worker processes of this machine: each takes one job after the other, a lost one is replaced.
+
+Nothing is shared but one pipe a worker, so that a worker that is killed, even half-way through an
+answer, cannot hold up the others. Workers are new processes ("spawn"), never forks: threads of
+MAVSDK and of ONNX Runtime do not survive one. A worker ends with its parent, however that ends.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, ClassVar, Generic
+
+from airl_mav.experiments.executors import (
+    ONE_THREAD,
+    POLL_S,
+    Failure,
+    J,
+    R,
+    Results,
+    Start,
+    Stop,
+    Work,
+    answer,
+    never,
+    next_attempt,
+)
+
+END_S = 5.0
+"""A worker without work ends by itself in so long, or is killed [wall s]."""
+
+
+@dataclass(frozen=True)
+class ProcessExecutor:
+    """Worker processes of this machine, at most `workers` at a time, one thread each."""
+
+    workers: int
+    streams: ClassVar[bool] = False
+
+    def run(
+        self,
+        jobs: Iterable[J],
+        start: Start[J, R],
+        *,
+        name: Callable[[J], str] = str,
+        stop: Stop = never,
+        lost: Callable[[str], None] = lambda _: None,
+    ) -> Results[J, R]:
+        """Carry out jobs; see `executors.Executor`. No process is started before it has a job."""
+        waiting = iter(jobs)
+        pool: _Pool[J] = _Pool(start)
+        try:
+            while len(pool.busy) < self.workers and not stop():
+                try:
+                    pool.hire(next(waiting))
+                except StopIteration:
+                    break
+            while pool.busy:
+                for connection in wait(list(pool.busy), POLL_S):
+                    assert isinstance(connection, Connection)  # noqa: S101 (as they went in)
+                    worker = pool.busy[connection]
+                    job = worker.job
+                    try:
+                        told = connection.recv()
+                    except (EOFError, OSError):
+                        cause = pool.bury(connection)
+                        pool.hire(job, next_attempt(name(job), worker.attempt, cause, lost))
+                        continue
+                    if isinstance(told, Failure):
+                        raise told.error(name(job))
+                    # The worker goes on before anything is done with its results.
+                    pool.give(connection, waiting)
+                    for result in told:
+                        yield job, result
+                if stop():
+                    return
+        finally:
+            pool.end()
+
+
+@dataclass
+class _Worker(Generic[J]):
+    """A worker as its parent sees it."""
+
+    process: BaseProcess
+    job: J
+    """What it does now."""
+    attempt: int
+    """Number of workers that this job has been given to."""
+
+
+class _Pool(Generic[J]):
+    """The worker processes of one run."""
+
+    def __init__(self, start: Start[J, Any]) -> None:
+        self._start = start
+        self.busy: dict[Connection, _Worker[J]] = {}
+        self._ending: list[BaseProcess] = []
+        """Those without work."""
+
+    def hire(self, job: J, attempt: int = 1) -> None:
+        """Start a worker with its first job."""
+        ours, process = _spawn(self._start)
+        self.busy[ours] = _Worker(process, job, attempt)
+        _send(ours, job)
+
+    def give(self, connection: Connection, waiting: Iterator[J]) -> None:
+        """Give a worker its next job, or let it go."""
+        worker = self.busy[connection]
+        try:
+            worker.job, worker.attempt = next(waiting), 1
+        except StopIteration:
+            del self.busy[connection]
+            connection.close()
+            self._ending.append(worker.process)
+        else:
+            _send(connection, worker.job)
+
+    def bury(self, connection: Connection) -> str:
+        """Remove a worker that was lost; return how it ended."""
+        process = self.busy.pop(connection).process
+        connection.close()
+        process.kill()
+        process.join()
+        cause = _cause(process.exitcode)
+        process.close()
+        return cause
+
+    def end(self) -> None:
+        """End all workers: those at work at once."""
+        for connection, worker in self.busy.items():
+            worker.process.kill()
+            connection.close()
+            self._ending.append(worker.process)
+        self.busy.clear()
+        for process in self._ending:
+            process.join(END_S)
+            if process.exitcode is None:
+                process.kill()
+                process.join()
+            process.close()
+        self._ending.clear()
+
+
+def _send(connection: Connection, job: Any) -> None:
+    # A worker that is lost shows when its answer is awaited.
+    with suppress(OSError):
+        connection.send(job)
+
+
+def _spawn(start: Start[Any, Any]) -> tuple[Connection, BaseProcess]:
+    """Start a worker; return the parent's end of its pipe, and the process."""
+    context = multiprocessing.get_context("spawn")
+    # Would be started with the first worker otherwise, and let Ctrl-C through again.
+    resource_tracker.ensure_running()
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve, args=(theirs, start), daemon=True)
+    with ExitStack() as stack:
+        stack.enter_context(theirs)
+        stack.enter_context(_environment(ONE_THREAD))
+        stack.enter_context(_interrupts_blocked())
+        process.start()
+    return ours, process
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """Set environment variables for a while: a new process reads them before it runs anything."""
+    before = {key: os.environ.get(key) for key in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for key, value in before.items():
+            if value is None:
+                del os.environ[key]
+            else:
+                os.environ[key] = value
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block Ctrl-C for a while: a process started meanwhile never gets it.
+
+    A terminal sends it to all processes; the parent decides what becomes of its workers.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _cause(exitcode: int | None) -> str:
+    if exitcode is not None and exitcode < 0:
+        with suppress(ValueError):
+            return signal.Signals(-exitcode).name
+    return f"exit status {exitcode}"
+
+
+# --- in the worker
+
+
+def _serve(connection: Connection, start: Start[Any, Any]) -> None:
+    """Carry out jobs until the pipe is closed."""
+    _end_with_parent()
+    work: Work[Any, Any] | None = None
+
+    def carry_out(job: Any) -> Iterable[Any]:
+        nonlocal work
+        work = work or start(never)
+        return work(job)
+
+    while True:
+        try:
+            job = connection.recv()
+        except EOFError:
+            return
+        told = answer(partial(carry_out, job))
+        try:
+            connection.send(told)
+        except OSError:  # The parent has gone.
+            return
+
+
+def _end_with_parent() -> None:
+    """Start the parent-death guard: it ends this process, in the middle of anything."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # noqa: S101 (this is a worker)
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, name="parent-death-guard", daemon=True).start()

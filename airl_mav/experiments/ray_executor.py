@@ -1,0 +1,183 @@
+"""Jobs as tasks of a Ray cluster, or of a Ray started on this machine.
+
+Ray places the tasks on its nodes. A task whose worker or node is lost begins again, here and not
+inside Ray, so that a person hears of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import pickle
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ClassVar
+
+from airl_mav.core.errors import UsageError
+from airl_mav.experiments.executors import (
+    ONE_THREAD,
+    POLL_S,
+    ExecutorSettings,
+    Failure,
+    J,
+    R,
+    Results,
+    Start,
+    Stop,
+    Work,
+    WorkerError,
+    answer,
+    never,
+    next_attempt,
+)
+
+LOCAL = "local"
+"""Address that starts a Ray of its own on this machine."""
+
+AUTO = "auto"
+"""Address of the Ray that runs on this machine."""
+
+MAX_PORT = 65_535
+
+CONNECT_S = 10.0
+"""Longest wait for a cluster's head to answer [wall s]."""
+
+
+@dataclass(frozen=True)
+class RayExecutor:
+    """Tasks of the Ray that `connected` has reached, one core each."""
+
+    workers: int
+    """Tasks given to Ray at a time; those without a free core wait there."""
+    gpus: float = 0.0
+    """Share of a GPU that Ray keeps for a task."""
+    streams: ClassVar[bool] = False
+
+    def run(
+        self,
+        jobs: Iterable[J],
+        start: Start[J, R],
+        *,
+        name: Callable[[J], str] = str,
+        stop: Stop = never,
+        lost: Callable[[str], None] = lambda _: None,
+    ) -> Results[J, R]:
+        """Carry out jobs; see `executors.Executor`."""
+        import ray
+
+        task = ray.remote(num_cpus=1, num_gpus=self.gpus, max_retries=0)(_carry_out)
+        pickled = pickle.dumps(start)
+        key, shared = hashlib.sha256(pickled).hexdigest(), ray.put(pickled)
+        waiting, busy = iter(jobs), dict[Any, tuple[J, int]]()
+
+        def begin(job: J, attempt: int = 1) -> None:
+            busy[task.remote(key, shared, job)] = job, attempt
+
+        def fill() -> None:
+            while len(busy) < self.workers:
+                try:
+                    begin(next(waiting))
+                except StopIteration:
+                    return
+
+        try:
+            fill()
+            while busy and not stop():
+                for ref in ray.wait(list(busy), timeout=POLL_S)[0]:
+                    job, attempt = busy.pop(ref)
+                    try:
+                        told = ray.get(ref)
+                    except ray.exceptions.RayTaskError as error:
+                        # Not the job, which answers for itself: it could not even begin.
+                        last = f"{error}".strip().splitlines()[-1]
+                        raise WorkerError(f"{name(job)}: {last}") from None
+                    except ray.exceptions.RayError as error:
+                        begin(job, next_attempt(name(job), attempt, type(error).__name__, lost))
+                        continue
+                    if isinstance(told, Failure):
+                        raise told.error(name(job))
+                    fill()
+                    for result in told:
+                        yield job, result
+        finally:
+            for ref in busy:
+                ray.cancel(ref, force=True)
+
+
+_started: dict[str, Work[Any, Any]] = {}
+"""What this worker of Ray has loaded, by its key: of one run at a time."""
+
+
+def _carry_out(key: str, pickled: bytes, job: Any) -> Any:
+    """Carry out a job, in a worker of Ray."""
+
+    def work() -> Iterable[Any]:
+        if key not in _started:
+            _started.clear()
+            # Before numba and its like are imported, which they are from here on.
+            os.environ.update(ONE_THREAD)
+            _started[key] = pickle.loads(pickled)(never)  # noqa: S301 (from the driver, by Ray)
+        results: Iterable[Any] = _started[key](job)
+        return results
+
+    return answer(work)
+
+
+def _check_reachable(address: str) -> None:
+    """Raise UsageError unless something listens at HOST:PORT: Ray itself would wait minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) <= MAX_PORT:
+        raise UsageError(
+            f"ray_address = {address}: accepted: local, auto, HOST:PORT or ray://HOST:PORT"
+        )
+    try:
+        socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
+    except OSError as error:
+        raise UsageError(f"ray_address = {address}: {error.strerror or error}") from None
+
+
+@contextmanager
+def connected(settings: ExecutorSettings, cores: int) -> Iterator[RayExecutor]:
+    """Be connected to a Ray for a while.
+
+    Args:
+        settings: Its address, and how much of it may be used.
+        cores: Usable cores of this machine.
+
+    Raises:
+        UsageError: Ray is not installed, or there is none at that address.
+    """
+    if find_spec("ray") is None:
+        raise UsageError("executor = ray: not installed: ray; pip install 'airl-mav[ray]'")
+    address, local = settings.ray_address, settings.ray_address == LOCAL
+    if address not in (LOCAL, AUTO):
+        _check_reachable(address)
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # A task without a GPU hides all GPUs from itself in any case.
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
+    if local:
+        # Its workers find this very package, installed or not.
+        here = f"{Path(__file__).resolve().parents[2]}"
+        known = os.environ.get("PYTHONPATH")
+        os.environ["PYTHONPATH"] = here if known is None else f"{here}{os.pathsep}{known}"
+    import ray
+
+    started: dict[str, Any] = {}
+    if local:
+        started = {"num_cpus": settings.workers or cores, "include_dashboard": False}
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **started)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        first = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise UsageError(f"ray_address = {address}: {first}") from None
+    try:
+        nodes = [node for node in ray.nodes() if node["Alive"]]
+        there = sum(int(node["Resources"].get("CPU", 0)) for node in nodes)
+        yield RayExecutor(settings.workers or max(there, 1), settings.ray_gpus)
+    finally:
+        ray.shutdown()

@@ -1,0 +1,170 @@
+"""The folder of a campaign: many evaluations or trainings that belong together, resumable.
+
+campaign.json   the declaration: the cells, what is compared with what, the settings
+<cell>/         the run folder of an evaluation, the training folder of a trial
+
+The declaration is written before anything begins, whole or not at all. What is done is known from
+the folders of the cells alone, so that a campaign that is killed at any moment goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import provenance
+from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.rehearsal.evaluation import another_config
+from airl_mav.rehearsal.lock import locked
+from airl_mav.rehearsal.run_folder import RUN_FILE
+
+SCHEMA = 1
+"""Version of `campaign.json`."""
+
+CAMPAIGN_FILE = "campaign.json"
+
+OTHERS = {RUN_FILE: "a single run", "train.json": "a training"}
+"""Files by which a folder is known that holds no campaign."""
+
+
+@dataclass(frozen=True)
+class DeclaredCell:
+    """One evaluation, or one trial."""
+
+    title: str
+    """One line for people."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What is done; a cell with other settings is another one."""
+    folder: str | None = None
+    """The cell that has the same flights; None: it has its own."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two cells that are compared flight by flight."""
+
+    baseline: str
+    candidate: str
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a campaign is made of."""
+
+    kind: str
+    """Which experiment: gap, ladder, sweep, ..."""
+    settings: dict[str, Any]
+    """What all cells have in common."""
+    cells: dict[str, DeclaredCell]
+    """By name: that of the cell's folder."""
+    comparisons: tuple[Comparison, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for a name that cannot be a folder's, or a comparison of no cells."""
+        for name in self.cells:
+            if Path(name).name != name or name in ("", "..", CAMPAIGN_FILE):
+                raise ValueError(f"cell {name!r}: accepted: the name of a folder")
+        for each in self.comparisons:
+            for name in (each.baseline, each.candidate):
+                if name not in self.cells:
+                    raise ValueError(f"comparison of {name!r}: accepted: {', '.join(self.cells)}")
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What `campaign.json` holds."""
+
+    declaration: Declaration
+    made: dict[str, Any]
+    """With what it was begun: `created_utc`, `command`, `versions`, `machine`, `git`."""
+    schema: int = SCHEMA
+
+
+_CAMPAIGN = TypeAdapter(Campaign)
+
+
+def load_campaign(path: Path) -> Campaign:
+    """Read the declaration of the campaign in a folder. Raises UsageError."""
+    return read_versioned(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
+
+
+@dataclass(frozen=True)
+class CampaignStore:
+    """A campaign on disk. Goes to other processes by pickle."""
+
+    path: Path
+    campaign: Campaign
+
+    def cell_path(self, name: str) -> Path:
+        """Return the folder of a cell."""
+        return self.path / name
+
+
+@contextmanager
+def open_campaign(
+    path: Path,
+    declaration: Declaration,
+    *,
+    command: str,
+    free: Collection[str] = (),
+    say: Callable[[str], None] = lambda _: None,
+) -> Iterator[CampaignStore]:
+    """Keep the folder of a campaign, new or to be gone on with, to this process.
+
+    Cells may be added to a campaign, and others left for later.
+
+    Args:
+        path: The folder; made when there is none.
+        declaration: What is asked for.
+        command: The command line, for a new campaign.
+        free: Settings that may differ when it goes on, a table of them by its name.
+        say: Is told when another process has the folder.
+
+    Raises:
+        UsageError: It holds something else or a campaign with other settings, or another process
+            works in it.
+    """
+    path = path.absolute()
+    with locked(path, say):
+        yield CampaignStore(path, _declare(path, declaration, command, free))
+
+
+def _declare(path: Path, declaration: Declaration, command: str, free: Collection[str]) -> Campaign:
+    """Write the declaration, unless it contradicts the one that is there."""
+    for file, what in OTHERS.items():
+        if (path / file).exists():
+            raise UsageError(f"--out {path}: holds {what}; accepted: another folder")
+    if not (path / CAMPAIGN_FILE).exists():
+        campaign = Campaign(declaration, provenance(command))
+    else:
+        held = load_campaign(path)
+        if difference := _difference(held.declaration, declaration, free):
+            raise UsageError(
+                f"--out {path}: holds a campaign with {difference}; accepted: another folder, or "
+                "the same settings to go on"
+            )
+        campaign = Campaign(declaration, held.made)
+        if campaign == held:
+            return held
+    write_json(path / CAMPAIGN_FILE, asdict(campaign))
+    return campaign
+
+
+def _difference(held: Declaration, asked: Declaration, free: Collection[str]) -> str | None:
+    """Return the first setting that differs, or None."""
+    if held.kind != asked.kind:
+        return f"kind = {held.kind!r}, not {asked.kind!r}"
+    if difference := another_config(held.settings, asked.settings, free):
+        return difference
+    for name, cell in asked.cells.items():
+        theirs = held.cells.get(name)
+        if theirs and (difference := another_config(theirs.settings, cell.settings, free)):
+            return f"another cell {name}: {difference}"
+    return None
