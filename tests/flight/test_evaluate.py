@@ -741,11 +741,11 @@ def test_level_lockstep_is_the_same_rehearsal_on_all_usable_cores(tmp_path: Path
         rehearsal = sitl_command(command, find_policy(str(folder)), str(folder), "no-obstacles")
         assert rehearsal.lockstep
         assert rehearsal.speed is None
-        run_, pilot = plan_lockstep(command, rehearsal)
-        assert run_.workers == wanted
-        assert run_.evaluation.seeds == tuple(range(11, 18))
+        evaluation, _, pilot = plan_lockstep(command, rehearsal)
+        assert evaluation.config["workers"] == wanted
+        assert evaluation.seeds == tuple(range(11, 18))
         assert (pilot.goal_radius_m, pilot.hold_s) == (2.5, 0.4)
-        assert run_.evaluation.config["watchdog"]["hover_after_s"] == 0.06
+        assert evaluation.config["watchdog"]["hover_after_s"] == 0.06
 
 
 @pytest.mark.slow
