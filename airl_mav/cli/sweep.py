@@ -4,45 +4,95 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Annotated, Literal
 
+from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.common import (
-    EXIT_BROKEN,
-    EXIT_INTERRUPTED,
-    GREATEST_SEED,
-    check_range,
-    check_train_installed,
-)
-from airl_mav.cli.episode_bar import stop_on_signals
-from airl_mav.cli.sweep_command import SweepCommand
-from airl_mav.cli.sweep_progress import SweepProgress
-from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import validated
-from airl_mav.core.provenance import usable_cores
+from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.core.fields import quantity, validated
+from airl_mav.core.progress import RichProgress
+from airl_mav.experiments.executors import ExecutorSettings, open_executor
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.workers import GREATEST_WORKERS, WorkerError
-from airl_mav.sweep.config import Examination, Grid, SweepConfig, load_sweep
-from airl_mav.sweep.executors import Executor, LocalExecutor, Work
-from airl_mav.sweep.store import SweepFolder
-from airl_mav.sweep.summary import Computer, estimated_ms, summarize, write_sweep
-from airl_mav.sweep.trial import trials
-
-GREATEST_SEEDS = 1000
-GREATEST_GPUS = 8.0
+from airl_mav.rehearsal.signals import stop_on_signals
+from airl_mav.report.sweep.page import build_page
+from airl_mav.report.sweep.terminal import print_plan, print_sweep
+from airl_mav.scenario.model import Workers
+from airl_mav.sweep.config import SweepConfig, load_sweep
+from airl_mav.sweep.run import run_sweep
+from airl_mav.sweep.summary import Computer, estimated_ms
 
 
-def run(command: SweepCommand, console: Console | None = None) -> int:
+class SweepOptions(Workers):
+    """Search for the network that flies best: train many, judge all, draw heat maps.
+
+    Air Learning's search over its template: layers x filters, several training seeds a cell. The
+    same --out goes on with what was interrupted, whoever was killed.
+
+    Examples:
+        airl sweep quick
+        airl sweep full --executor ray --ray-address 192.168.1.10:6379
+        airl sweep quick --dry-run
+    """
+
+    sweep: Annotated[str, POSITIONAL] = Field(
+        default="quick",
+        description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
+        " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
+    )
+    out: Path | None = Field(
+        default=None, description="folder of the sweep; by default runs/sweep-<name>"
+    )
+    seeds: int | None = quantity(
+        "training seeds of each cell, 1 to N; by default the sweep's",
+        "1",
+        ge=1,
+        le=1000,
+        default=None,
+    )
+    steps: int | None = Field(
+        default=None, description="decisions of each training; by default the sweep's"
+    )
+    episodes: int | None = Field(
+        default=None,
+        description="flights that judge each trained network; by default the sweep's",
+    )
+    seed: int | None = Field(
+        default=None,
+        description="seed of the first of these flights; flight i has seed + i, in every cell; by"
+        " default the sweep's",
+    )
+    computer: str | None = Field(
+        default=None,
+        description="computer profile: each cell then shows its decision latency t2 there, estimated"
+        " from multiply-accumulates; may change when a sweep goes on",
+    )
+    device: Literal["cpu", "cuda"] = Field(
+        default="cpu", description="what trains: cpu, one core a trial, or cuda"
+    )
+    ray_gpus: float | None = quantity(
+        "share of a GPU that Ray keeps for each trial; by default 1 with device cuda, else 0",
+        "1",
+        ge=0,
+        le=8,
+        default=None,
+    )
+    dry_run: bool = Field(
+        default=False,
+        description="say what would be done: trials, parameters, multiply-accumulates, decisions;"
+        " nothing is trained or written",
+    )
+
+
+OPTIONS = SweepOptions
+
+
+def run(options: SweepOptions, console: Console | None = None) -> int:
     """Carry out what is left of a sweep, and show what came out.
-
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
 
     Returns:
         Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
@@ -51,154 +101,72 @@ def run(command: SweepCommand, console: Console | None = None) -> int:
         UsageError: The input cannot be used.
     """
     console = console or Console()
-    config, computer = sweep_of(command), _computer(command)
-    name = Path(command.sweep).stem
-    path = (command.out or Path("runs") / f"sweep-{name}").absolute()
-    if command.dry_run:
-        from airl_mav.report.sweep.terminal import print_plan
-
+    config, settings = _config(options), _executor(options)
+    computer = None
+    if options.computer is not None:
+        computer = Computer(options.computer, load_computer(options.computer))
+        estimated_ms(computer.profile, 1)  # Raises for a computer without a workload.
+    name = Path(options.sweep).stem
+    path = (options.out or Path("runs") / f"sweep-{name}").absolute()
+    if options.dry_run:
         print_plan(name, config, computer, path, console)
         return 0
-    _check_installed(command)
-    folder = SweepFolder.at(path, config)
-    with folder.locked():
-        made = folder.made(shlex.join(["airl", *sys.argv[1:]]))
-        sweep = summarize(folder, made, computer)
-        write_sweep(sweep)
-        console.print(f"sweep      {name}: {config.description}", markup=False, highlight=False)
-        console.print(f"folder     {path}", soft_wrap=True, markup=False, highlight=False)
-        code = _carry_out(
-            command, folder, console, lambda: write_sweep(summarize(folder, made, computer))
-        )
-        sweep = summarize(folder, made, computer)
-        write_sweep(sweep)
-        if sweep.ended:
-            from airl_mav.report.sweep.page import build_page
-            from airl_mav.report.sweep.terminal import print_sweep
-
-            print_sweep(sweep, console, build_page(sweep))
-    if code:
-        told = "interrupted" if code == EXIT_INTERRUPTED else "not all trials have ended"
-        console.print(
-            f"{told}: the same command with --out {path} goes on",
-            style="yellow",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
-    return code
-
-
-def _carry_out(
-    command: SweepCommand, folder: SweepFolder, console: Console, ended: Callable[[], None]
-) -> int:
-    """Carry out the trials that are left; `ended` is called as each one ends."""
-    wanted = trials(folder.config)
-    waiting = [trial for trial in wanted if folder.result(trial) is None]
-    if not waiting:
+    check_installed("train")
+    with RichProgress(console) as progress, open_executor(settings) as executor:
+        progress.note(f"sweep      {name}: {config.description}\nfolder     {path}")
+        with stop_on_signals() as stop:
+            sweep, error = run_sweep(
+                path,
+                config,
+                executor,
+                command=shlex.join(["airl", *sys.argv[1:]]),
+                progress=progress,
+                device=options.device,
+                computer=computer,
+                stop=stop,
+            )
+        if error is not None:
+            progress.note(error, "yellow")
+    if sweep.ended:
+        print_sweep(sweep, console, build_page(sweep))
+    if sweep.ended == sweep.planned:
         return 0
-    # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
-    from airl_mav.sweep.work import TrialWork
-
-    work = TrialWork(folder, shlex.join(["airl", *sys.argv[1:]]), command.device)
-    progress = SweepProgress(console, folder, wanted, len(wanted) - len(waiting))
-    with ExitStack() as stack:
-        executor = stack.enter_context(_executor(command, work, progress.say))
-        stack.enter_context(progress)
-        progress.begin(waiting)
-        interrupted = stack.enter_context(stop_on_signals())
-
-        def stop() -> bool:
-            progress.look()
-            return interrupted()
-
-        try:
-            for result in executor.run(waiting, stop):
-                progress.finished(result)
-                ended()
-        except WorkerError as error:
-            progress.say(str(error))
-            return EXIT_BROKEN
-        return EXIT_INTERRUPTED if interrupted() else 0
+    told = "interrupted" if error is None else "not all trials have ended"
+    progress.note(f"{told}: the same command with --out {path} goes on", "yellow")
+    return EXIT_INTERRUPTED if error is None else EXIT_BROKEN
 
 
-@contextmanager
-def _executor(command: SweepCommand, work: Work, lost: Callable[[str], None]) -> Iterator[Executor]:
-    """Give whoever carries out the trials."""
-    cores = min(usable_cores(), GREATEST_WORKERS)
-    if command.ray is None:
-        yield LocalExecutor(work, command.workers or cores, lost)
-        return
-    from airl_mav.sweep.ray_executor import LOCAL, RayExecutor, connected
-
-    cores = command.workers or cores
-    most = cores if command.ray == LOCAL else command.workers
-    gpus = command.ray_gpus
-    if gpus is None:
-        gpus = 1.0 if command.device == "cuda" else 0.0
-    with connected(command.ray, cores):
-        yield RayExecutor(work, most, gpus, lost)
-
-
-def sweep_of(command: SweepCommand) -> SweepConfig:
+def _config(options: SweepOptions) -> SweepConfig:
     """Load the sweep, put the command line's values into it, and check it. Raises UsageError."""
-    if command.workers is not None:
-        check_range("--workers", command.workers, 1, GREATEST_WORKERS)
-    if command.ray_gpus is not None:
-        if command.ray is None:
-            raise UsageError(f"--ray-gpus {command.ray_gpus:g}: accepted: with --ray")
-        check_range("--ray-gpus", command.ray_gpus, 0.0, GREATEST_GPUS)
-    config = load_sweep(command.sweep)
-    changes: dict[str, object] = {}
-    if command.seeds is not None:
-        check_range("--seeds", command.seeds, 1, GREATEST_SEEDS)
-        changes["seeds"] = tuple(range(1, command.seeds + 1))
-    if command.steps is not None:
-        check_range("--steps", command.steps, 1, 10**10)
-        changes["training"] = config.training.model_copy(update={"steps": command.steps})
-    flights = config.evaluation.model_dump()
-    if command.episodes is not None:
-        check_range("--episodes", command.episodes, 1, 100_000)
-        flights["episodes"] = command.episodes
-    if command.seed is not None:
-        check_range("--seed", command.seed, 0, GREATEST_SEED)
-        flights["seed"] = command.seed
-    changes["evaluation"] = _examination(flights)
-    # Workers, and other machines, may have another working directory.
-    changes["grids"] = tuple(_found(grid) for grid in config.grids)
-    return config.model_copy(update=changes)
+    data = load_sweep(options.sweep).model_dump(exclude_unset=True)
+    if options.seeds is not None:
+        data["seeds"] = range(1, options.seeds + 1)
+    for table, field, value in (
+        ("training", "steps", options.steps),
+        ("evaluation", "episodes", options.episodes),
+        ("evaluation", "seed", options.seed),
+    ):
+        if value is not None:
+            data.setdefault(table, {})[field] = value
+    for grid in data["grids"]:
+        load_profile("arenas", grid["arena"], ArenaSpec)
+        if grid["arena"].endswith(".toml"):
+            # Workers, and other machines, may have another working directory.
+            grid["arena"] = f"{Path(grid['arena']).absolute()}"
+    return validated(SweepConfig, data)
 
 
-def _examination(flights: dict[str, int]) -> Examination:
-    return validated(Examination, flights, "--episodes, --seed")
-
-
-def _found(grid: Grid) -> Grid:
-    """Return a grid whose arena exists, by its full path if it has one. Raises UsageError."""
-    load_profile("arenas", grid.arena, ArenaSpec)
-    if not grid.arena.endswith(".toml"):
-        return grid
-    return grid.model_copy(update={"arena": f"{Path(grid.arena).absolute()}"})
-
-
-def _computer(command: SweepCommand) -> Computer | None:
-    """Return the computer whose latency is estimated. Raises UsageError."""
-    if command.computer is None:
-        return None
-    computer = Computer(command.computer, load_computer(command.computer))
-    estimated_ms(computer.profile, 1)
-    return computer
-
-
-def _check_installed(command: SweepCommand) -> None:
-    """Raise UsageError unless all that the trainings need is there."""
-    check_train_installed()
-    if command.ray is not None:
-        from airl_mav.sweep.ray_executor import check_ray_installed
-
-        check_ray_installed()
-    elif command.device == "cuda":
+def _executor(options: SweepOptions) -> ExecutorSettings:
+    """Return who carries out the trials. Raises UsageError."""
+    gpus = options.ray_gpus
+    if gpus is not None and options.executor != "ray":
+        raise FieldError("ray_gpus", gpus, "with executor ray")
+    if options.device == "cuda" and options.executor == "process":
+        check_installed("train")
         import torch
 
         if not torch.cuda.is_available():
-            raise UsageError("--device cuda: torch finds no GPU here; accepted: cpu")
+            raise FieldError("device", "cuda", "cpu: torch finds no GPU here")
+    data = {name: getattr(command, name) for name in ("executor", "workers", "ray_address")}
+    default = 1.0 if options.device == "cuda" else 0.0
+    return validated(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})

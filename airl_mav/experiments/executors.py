@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, TypeVar
-
-from pydantic import Field
+from typing import ClassVar, Protocol, TypeVar
 
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import quantity
 from airl_mav.core.provenance import usable_cores
+from airl_mav.scenario.model import GREATEST_WORKERS, Workers
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -33,8 +32,6 @@ whether the work is to be stopped, for work in this process; other workers are e
 
 Results = Generator[tuple[J, R], None, None]
 """Results as they come, each with its job. Closing it ends the workers, whatever they do."""
-
-MAX_WORKERS = 256
 
 POLL_S = 0.2
 """Interval at which `stop` is asked while results are awaited [wall s]."""
@@ -124,24 +121,9 @@ class InProcessExecutor:
                 raise UsageError(f"{name(job)}: {error}") from None
 
 
-class ExecutorSettings(ProfileModel):
-    """Who carries out the jobs of an experiment; changes no result."""
+class ExecutorSettings(Workers):
+    """Who carries out the jobs of an experiment, and what a job takes."""
 
-    executor: Literal["process", "ray"] = Field(
-        "process", description="processes of this machine, or Ray"
-    )
-    workers: int | None = quantity(
-        "jobs at a time, each on one core; none: one for each core, here or in the cluster",
-        "1",
-        ge=1,
-        le=MAX_WORKERS,
-        default=None,
-    )
-    ray_address: str = Field(
-        "local",
-        description="local starts a Ray on this machine, auto takes the one that runs here, else "
-        "HOST:PORT of a cluster's head",
-    )
     ray_gpus: float = quantity("share of a GPU for each job", "1", ge=0.0, le=8.0, default=0.0)
 
 
@@ -156,7 +138,7 @@ def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> It
     Raises:
         UsageError: Ray is not installed, or not to be reached.
     """
-    cores = min(usable_cores(), MAX_WORKERS)
+    cores = min(usable_cores(), GREATEST_WORKERS)
     if settings.executor == "ray":
         from airl_mav.experiments.ray_executor import connected
 

@@ -28,7 +28,7 @@ from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.rehearsal.signals import stop_on_signals, terminated_as_interrupted
-from airl_mav.scenario.model import Flights, Scenario
+from airl_mav.scenario.model import Flights, Scenario, Workers
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.external.compose import check_program
@@ -158,10 +158,8 @@ def fly_scenario(
 
 def executor_of(asked: Flights) -> AbstractContextManager[Executor]:
     """Give the executor that was asked for. Raises UsageError if Ray cannot be reached."""
-    settings = ExecutorSettings(
-        executor=asked.executor, workers=asked.workers, ray_address=asked.ray_address
-    )
-    return open_executor(settings, in_process=asked.level == "gym")
+    shared = {name: getattr(asked, name) for name in Workers.model_fields}
+    return open_executor(ExecutorSettings(**shared), in_process=asked.level == "gym")
 
 
 def run_name(scenario: ResolvedScenario) -> str:

@@ -291,7 +291,29 @@ class Lateness(ProfileModel):
     )
 
 
-class Flights(ProfileModel):
+class Workers(ProfileModel):
+    """Who carries out the jobs of an experiment; changes no result."""
+
+    executor: Annotated[Literal["process", "ray"], FREE] = Field(
+        default="process",
+        description="who carries out the jobs: processes of this machine, or a Ray cluster",
+    )
+    workers: Annotated[int | None, FREE] = quantity(
+        "jobs at a time, each on one core; decides the pace, not the results; by default one for"
+        " each core, here or in the cluster (at level gym one; level sitl flies one at a time)",
+        "1",
+        ge=1,
+        le=GREATEST_WORKERS,
+        default=None,
+    )
+    ray_address: Annotated[str, FREE] = Field(
+        default="local",
+        description="with executor ray: local starts a Ray on this machine, auto takes the one that"
+        " runs here, else HOST:PORT of the head of a cluster whose machines all see the folder",
+    )
+
+
+class Flights(Workers):
     """Which episodes are flown, and how."""
 
     level: LevelName = Field(
@@ -317,25 +339,6 @@ class Flights(ProfileModel):
         "1",
         ge=0.01,
         le=1000,
-        default=None,
-    )
-    executor: Annotated[Literal["process", "ray"], FREE] = Field(
-        default="process",
-        description="levels gym and lockstep: who carries out the flights, processes of this"
-        " machine"
-        " or a Ray cluster; decides the pace, not the results",
-    )
-    ray_address: Annotated[str, FREE] = Field(
-        default="local",
-        description="with executor ray: local starts a Ray on this machine, auto takes the one that"
-        " runs here, else HOST:PORT of a cluster's head",
-    )
-    workers: Annotated[int | None, FREE] = quantity(
-        "levels gym and lockstep: jobs at a time, each on one core; decides the pace, not the"
-        " results; by default 1 at level gym, at lockstep as many as there are usable cores",
-        "1",
-        ge=1,
-        le=GREATEST_WORKERS,
         default=None,
     )
     slots: Annotated[int, FREE] = quantity(

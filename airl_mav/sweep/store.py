@@ -1,8 +1,9 @@
-"""The folder of a sweep: what is in it, and how it is written.
+"""The folder of a sweep: a campaign (`experiments.store`) whose cells are the trials.
 
-sweep.json              the sweep, what it was made with, every result and cell so far
+campaign.json           what was asked for
+sweep.json              every result and network so far
 sweep.md, .html, .png   the same for people
-trials/<trial>/         a training folder (`training.store`), and of the sweep:
+<trial>/                a training folder (`training.store`), and of the sweep:
     progress.json       how far the training is, while it runs
     result.json         what came out: its being there is what ends a trial
 
@@ -12,40 +13,48 @@ folder, and goes on where the last one was cut off.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter
 
-from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.provenance import describe_machine, git_state, package_versions
-from airl_mav.core.versioned import read_json
+from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.experiments.store import Declaration, DeclaredCell
 from airl_mav.sweep.config import SweepConfig
-from airl_mav.sweep.result import TrialResult, read_result, write_result
-from airl_mav.sweep.trial import Trial
+from airl_mav.sweep.trial import Trial, TrialResult, trials
 
 SCHEMA = 1
-"""Version of `sweep.json`; docs/sweep.md describes it."""
+"""Version of `sweep.json` and of `result.json`; docs/sweep.md describes them."""
 
 SWEEP_FILE = "sweep.json"
 RESULT_FILE = "result.json"
 PROGRESS_FILE = "progress.json"
-LOCK_FILE = ".lock"
-TRIALS = "trials"
 
 MAY_CHANGE = ("description", "grids", "seeds")
 """Fields with which a sweep can go on changed: they add trials, or leave some for later."""
 
 
 @dataclass(frozen=True)
-class Progress:
+class _ResultFile:
+    """What `result.json` holds."""
+
+    evaluation: dict[str, Any]
+    """The flights that the figures rest on."""
+    result: TrialResult
+    schema: int = SCHEMA
+
+
+_RESULT_FILE = TypeAdapter(_ResultFile)
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
     """How far a training is."""
 
     steps: int
@@ -56,66 +65,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class SweepFolder:
-    """A sweep on disk. Goes to other processes by pickle."""
+    """The trials of a sweep on disk. Goes to other processes by pickle."""
 
     path: Path
     config: SweepConfig
 
-    @classmethod
-    def at(cls, path: Path, config: SweepConfig) -> SweepFolder:
-        """Return the folder of a sweep, old or new.
-
-        Raises:
-            UsageError: It cannot be made, or holds a sweep with other trainings or flights.
-        """
-        try:
-            (path / TRIALS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"--out {path}: {error.strerror}") from None
-        if (path / SWEEP_FILE).exists():
-            theirs = config_of(read_data(path))
-            changed = [
-                name
-                for name in SweepConfig.model_fields
-                if name not in MAY_CHANGE and getattr(theirs, name) != getattr(config, name)
-            ]
-            if changed:
-                raise UsageError(
-                    f"--out {path}: holds a sweep with another {' and '.join(changed)}; "
-                    "accepted: the same, or another folder"
-                )
-        return cls(path, config)
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Keep the folder to this command. Raises UsageError when another one is at it."""
-        with (self.path / LOCK_FILE).open("wb") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise UsageError(f"--out {self.path}: another sweep is at work here") from None
-            yield
-
-    def made(self, command: str) -> dict[str, Any]:
-        """Return what the sweep was made with: as it was begun, or as of now.
-
-        Args:
-            command: The words of the command line.
-        """
-        if (self.path / SWEEP_FILE).exists():
-            made: dict[str, Any] = read_data(self.path)["made"]
-            return made
-        return {
-            "created_utc": utc_now().isoformat(timespec="seconds"),
-            "command": command,
-            "versions": package_versions(),
-            "machine": describe_machine(),
-            "git": git_state(),
-        }
-
     def trial_path(self, trial: Trial) -> Path:
         """Return the folder of a trial."""
-        return self.path / TRIALS / trial.name
+        return self.path / trial.name
 
     @property
     def evaluation(self) -> dict[str, Any]:
@@ -123,8 +80,20 @@ class SweepFolder:
         return self.config.evaluation.model_dump(mode="json")
 
     def result(self, trial: Trial) -> TrialResult | None:
-        """Return what a trial came to; None while it has not ended. Raises UsageError."""
-        return read_result(self.trial_path(trial) / RESULT_FILE, trial, self.evaluation)
+        """Return what a trial came to; None while it has not ended.
+
+        Raises:
+            UsageError: The file is not what was written, or of another trial or other flights.
+        """
+        path = self.trial_path(trial) / RESULT_FILE
+        if not path.exists():
+            return None
+        held = read_versioned(path, _RESULT_FILE, SCHEMA, "result")
+        if held.result.trial != trial or held.evaluation != self.evaluation:
+            raise UsageError(
+                f"{path}: of another trial or of other flights; accepted: another --out"
+            )
+        return held.result
 
     def results(self, wanted: Sequence[Trial]) -> list[TrialResult]:
         """Return the results that are there, in the order of the trials. Raises UsageError."""
@@ -132,23 +101,25 @@ class SweepFolder:
 
     def finish(self, result: TrialResult, checkpoints: Path) -> None:
         """End a trial; what was only there to go on with is removed."""
-        write_result(self.trial_path(result.trial) / RESULT_FILE, result, self.evaluation)
+        folder = self.trial_path(result.trial)
+        held = _ResultFile(self.evaluation, result)
+        write_json(folder / RESULT_FILE, _RESULT_FILE.dump_python(held, mode="json"))
         shutil.rmtree(checkpoints, ignore_errors=True)
-        (self.trial_path(result.trial) / PROGRESS_FILE).unlink(missing_ok=True)
+        (folder / PROGRESS_FILE).unlink(missing_ok=True)
 
-    def note_progress(self, trial: Trial, progress: Progress) -> None:
+    def note_progress(self, trial: Trial, progress: TrainingProgress) -> None:
         """Say how far a trial is, to whoever looks on. Lost by a power cut, and no loss."""
         path = self.trial_path(trial) / PROGRESS_FILE
         partial = path.with_name(path.name + ".partial")
-        data = {"steps": progress.steps, "success": progress.success}
-        partial.write_text(json.dumps(data), encoding="utf-8")
+        partial.write_text(json.dumps(asdict(progress)), encoding="utf-8")
         partial.replace(path)
 
-    def progress(self, trial: Trial) -> Progress | None:
+    def progress(self, trial: Trial) -> TrainingProgress | None:
         """Return how far a trial is; None when it has not begun, or has ended."""
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            data = json.loads((self.trial_path(trial) / PROGRESS_FILE).read_bytes())
-            return Progress(int(data["steps"]), data["success"])
+        with suppress(OSError, ValueError, TypeError):
+            return TrainingProgress(
+                **json.loads((self.trial_path(trial) / PROGRESS_FILE).read_bytes())
+            )
         return None
 
 
@@ -161,14 +132,10 @@ def as_data(config: SweepConfig) -> dict[str, Any]:
     return data
 
 
-def read_data(path: Path) -> dict[str, Any]:
-    """Return what `sweep.json` in a folder holds. Raises UsageError."""
-    return read_json(path / SWEEP_FILE, SCHEMA, "sweep")
-
-
-def config_of(data: dict[str, Any]) -> SweepConfig:
-    """Return the sweep that `sweep.json` holds. Raises UsageError."""
-    try:
-        return SweepConfig.model_validate(data["config"])
-    except (KeyError, ValidationError) as error:
-        raise UsageError(f"{SWEEP_FILE}: config: {str(error).splitlines()[0]}") from None
+def declaration(config: SweepConfig) -> Declaration:
+    """Return a sweep as a campaign: its cells are the trials."""
+    return Declaration(
+        kind="sweep",
+        settings={key: value for key, value in as_data(config).items() if key not in MAY_CHANGE},
+        cells={trial.name: DeclaredCell(trial.title, asdict(trial)) for trial in trials(config)},
+    )

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 from scipy import stats
 
 from airl_mav.core.errors import UsageError
@@ -15,11 +16,11 @@ from airl_mav.flight.paper import BEST_OF_SWEEP
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
 from airl_mav.profiles.computer import ComputerProfile, Latency
-from airl_mav.sweep import result as results_module
 from airl_mav.sweep.config import SweepConfig
-from airl_mav.sweep.result import TrialResult
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
-from airl_mav.sweep.trial import Trial, size_of, trials
+from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
+
+_RESULT = TypeAdapter(TrialResult)
 
 
 @dataclass(frozen=True)
@@ -241,5 +242,5 @@ def _cell_data(cell: Cell) -> dict[str, Any]:
     )
     data = {key: getattr(cell, key) for key in keys}
     data["success_rate"] = asdict(cell.success_rate)
-    data["trials"] = [results_module.as_data(result) for result in cell.results]
+    data["trials"] = [_RESULT.dump_python(result, mode="json") for result in cell.results]
     return data

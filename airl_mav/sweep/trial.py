@@ -1,11 +1,16 @@
-"""One trial of a sweep: one network, one arena, one seed."""
+"""A trial of a sweep: one network, one arena, one seed; and what came out of it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
+import numpy as np
+
+from airl_mav.envs.evaluation import OUTCOMES, Flown
+from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
 from airl_mav.policy.template import Size, template_size
 from airl_mav.sweep.config import SweepConfig
@@ -39,21 +44,23 @@ class Trial:
         """Name of its folder, unique in a sweep."""
         return f"{self.arena_name}-{self.network}-seed{self.seed}"
 
+    @property
+    def title(self) -> str:
+        """One line for people."""
+        return f"template {self.network} in {self.arena_name}, seed {self.seed}"
+
 
 def trials(config: SweepConfig) -> list[Trial]:
     """Return all trials: the first seed of all cells, then the second, and so on.
 
     So that a sweep that is looked at early has something to show in every cell.
     """
-    return list(_trials(config))
-
-
-def _trials(config: SweepConfig) -> Iterator[Trial]:
-    for seed in config.seeds:
-        for grid in config.grids:
-            for layers in grid.layers:
-                for filters in grid.filters:
-                    yield Trial(grid.arena, layers, filters, seed)
+    return [
+        Trial(grid.arena, layers, filters, seed)
+        for seed in config.seeds
+        for grid in config.grids
+        for layers, filters in product(grid.layers, grid.filters)
+    ]
 
 
 def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
@@ -62,7 +69,7 @@ def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
     network = NetworkSpec(kind="template", layers=trial.layers, filters=trial.filters)
     return base.model_copy(
         update={
-            "description": f"template {trial.network} in {trial.arena_name}, seed {trial.seed}",
+            "description": trial.title,
             "seed": trial.seed,
             "environment": base.environment.model_copy(update={"arena": trial.arena}),
             "network": network,
@@ -79,4 +86,69 @@ def size_of(config: SweepConfig, trial: Trial) -> Size:
         environment.image_height_px,
         environment.image_width_px,
         outputs_of(environment.action_spec),
+    )
+
+
+@dataclass(frozen=True)
+class Trained:
+    """How the training went."""
+
+    steps: int
+    """Decisions after which it ended."""
+    best_steps: int
+    """Decisions after which the weights were best; those fly."""
+    selection_success: float
+    """Success rate of the best weights on the selection seeds, 0 to 1."""
+    seconds: float
+    """Wall time of the training, evaluations left out [s]."""
+
+
+@dataclass(frozen=True)
+class TrialResult:
+    """A trained network in figures. Means are over the flights that reached the goal."""
+
+    trial: Trial
+    parameters: int
+    macs: int
+    trained: Trained
+    episodes: int
+    successes: int
+    outcomes: dict[Outcome, int]
+    """Flights by how they ended."""
+    flight_time_s: float | None
+    """None: no flight reached the goal."""
+    distance_m: float | None
+    energy_j: float | None
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the flights that reached the goal, 0 to 1."""
+        return self.successes / self.episodes
+
+
+def result_of(
+    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[Flown]
+) -> TrialResult:
+    """Return the figures of a trial's flights, at least one."""
+    # Flights end in an order of their own: sums must not depend on it.
+    flights = sorted(flown, key=lambda flight: flight.seed)
+    outcomes = dict.fromkeys(OUTCOMES.values(), 0)
+    for flight in flights:
+        outcomes[OUTCOMES[flight.verdict]] += 1
+    good = [f for f in flights if OUTCOMES[f.verdict] is Outcome.SUCCESS]
+    means = {
+        name: float(np.mean([getattr(flight, name) for flight in good])) if good else None
+        for name in ("flight_time_s", "distance_m", "energy_j")
+    }
+    return TrialResult(
+        trial=trial,
+        parameters=parameters,
+        macs=macs,
+        trained=trained,
+        episodes=len(flights),
+        successes=len(good),
+        outcomes=outcomes,
+        flight_time_s=means["flight_time_s"],
+        distance_m=means["distance_m"],
+        energy_j=means["energy_j"],
     )

@@ -33,12 +33,13 @@ from airl_mav.cli.evaluate_task import sitl_command
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules
+from airl_mav.experiments import gym_flier
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal import chunks, evaluation_gym, run_folder
+from airl_mav.rehearsal import chunks, run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import html
 from airl_mav.report.rebuild import rebuild
@@ -515,7 +516,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run_, text = greedy
-    monkeypatch.setattr(evaluation_gym, "fly_seeds", None)
+    monkeypatch.setattr(gym_flier, "fly_seeds", None)
     before = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
     code, again = evaluate("greedy", page=True, slots=3, out=run_.path, **DENSE)
     assert code == 0
@@ -673,16 +674,16 @@ def test_a_table_goes_on_where_it_was_left(
     out = tmp_path / "matrix"
     options = {"arena": ("no-obstacles", "static-obstacles"), "episodes": 5, "out": out}
     flights = []
-    real = evaluate_task.EpisodeBar.finished
+    real = chunks.Saver.add
 
-    def interrupted(bar: evaluate_task.EpisodeBar, record: Any) -> None:
-        real(bar, record)
-        flights.append(record)
+    def interrupted(saver: chunks.Saver, episode: FlownEpisode) -> None:
+        real(saver, episode)
+        flights.append(episode)
         if len(flights) == 8:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patched:
-        patched.setattr(evaluate_task.EpisodeBar, "finished", interrupted)
+        patched.setattr(chunks.Saver, "add", interrupted)
         code, text = evaluate("greedy", linear, slots=2, **options)
     assert code == 130
     assert "interrupted" in text
@@ -740,11 +741,11 @@ def test_level_lockstep_is_the_same_rehearsal_on_all_usable_cores(tmp_path: Path
         rehearsal = sitl_command(command, find_policy(str(folder)), str(folder), "no-obstacles")
         assert rehearsal.lockstep
         assert rehearsal.speed is None
-        run_, pilot = plan_lockstep(command, rehearsal)
-        assert run_.workers == wanted
-        assert run_.evaluation.seeds == tuple(range(11, 18))
+        evaluation, _, pilot = plan_lockstep(command, rehearsal)
+        assert evaluation.config["workers"] == wanted
+        assert evaluation.seeds == tuple(range(11, 18))
         assert (pilot.goal_radius_m, pilot.hold_s) == (2.5, 0.4)
-        assert run_.evaluation.config["watchdog"]["hover_after_s"] == 0.06
+        assert evaluation.config["watchdog"]["hover_after_s"] == 0.06
 
 
 @pytest.mark.slow

@@ -28,7 +28,6 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card
 from airl_mav.rehearsal.evaluation import Evaluation
-from airl_mav.rehearsal.evaluation_lockstep import LockstepRun
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
 from airl_mav.report import html
 from tests.flight.test_evaluate import Page, same_runs
@@ -329,7 +328,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     reference: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:
     one, text = reference
-    with patch("airl_mav.rehearsal.workers._spawn", side_effect=AssertionError):
+    with patch("airl_mav.experiments.process_executor._spawn", side_effect=AssertionError):
         code, again = evaluate("greedy", workers=7, speed=100.0, out=one.path)
     assert code == 0
     assert again.splitlines()[-1] == text.splitlines()[-1]
@@ -368,11 +367,11 @@ def test_a_flight_that_kills_its_workers_ends_the_run_with_one_line(
         for e in one.episodes
     }
     evaluation = Evaluation(one.info.setup, one.info.seeds, one.info.config)
-    paper = LockstepRun(evaluation, PaperFlier(flown, deadly or -1), 1, tlogs=False)
+    paper = PaperFlier(flown, deadly or -1)
     real = evaluate_task.plan_lockstep
 
     def plan(*words: Any) -> Any:
-        return paper, real(*words)[1]
+        return evaluation, paper, real(*words)[2]
 
     with patch.object(evaluate_task, "plan_lockstep", plan):
         code, text = evaluate("greedy", workers=1, out=tmp_path / "run")

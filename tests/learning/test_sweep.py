@@ -15,9 +15,10 @@ from matplotlib.colors import to_rgb
 from rich.console import Console
 from scipy import stats
 
-from airl_mav.cli.sweep import run
-from airl_mav.cli.sweep_command import SweepCommand
+from airl_mav.cli.sweep import SweepCommand, run
 from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import provenance
+from airl_mav.experiments.store import load_campaign, open_campaign
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.runtime import OnnxRuntime
@@ -27,14 +28,16 @@ from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_map
 from airl_mav.report.sweep.page import build_page
 from airl_mav.report.theme import new_figure, render_png
-from airl_mav.sweep.config import load_sweep
+from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.size_fit import fit_times, neighbours
-from airl_mav.sweep.store import SweepFolder
+from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
 from airl_mav.sweep.trial import size_of, training_of, trials
 from airl_mav.training.networks import count_parameters
 from airl_mav.training.spec import NetworkSpec
 from tests.support.sweep_kit import TINY, fake_results, write_sweep_file
+
+MADE = provenance("airl sweep")
 
 BARE = """description = "never timed"
 cpu = "none"
@@ -115,11 +118,13 @@ def test_a_wrong_sweep_gets_one_line(tmp_path: Path, old: str, new: str, message
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"workers": 0}, "--workers 0: accepted: 1 <= value <= 256"),
+        ({"workers": 0}, "workers = 0: accepted: 1 <= value <= 256"),
         ({"seeds": 0}, "--seeds 0"),
-        ({"episodes": 0}, "--episodes 0"),
-        ({"seed": 499_999}, "--episodes, --seed"),
-        ({"ray_gpus": 1.0}, "--ray-gpus 1: accepted: with --ray"),
+        ({"episodes": 0}, "evaluation.episodes = 0: accepted: 1 <= value"),
+        ({"steps": 0}, "training.steps = 0: accepted: 1 <= value"),
+        ({"seed": 499_999}, "evaluation: seed . episodes = 500019: accepted: <= 500000"),
+        ({"ray_gpus": 1.0}, "--ray-gpus 1: accepted: with --executor ray"),
+        ({"ray_gpus": 9.0, "executor": "ray"}, "ray_gpus = 9.0: accepted: 0 <= value <= 8"),
         ({"computer": "bare.toml"}, "no workload to estimate from"),
         ({"computer": "nowhere"}, "no computer profile 'nowhere'"),
         ({"sweep": "huge"}, "no sweep profile 'huge'; shipped: full, paper, quick, tiny"),
@@ -244,14 +249,14 @@ def test_the_interval_over_seeds_is_the_wider_of_students_and_wilsons(tmp_path: 
 
 def test_the_best_of_equals_is_the_smaller_network(tmp_path: Path) -> None:
     config = load_sweep("quick")
-    folder = SweepFolder.at(tmp_path, config)
+    folder = SweepFolder(tmp_path, config)
     every = trials(config)
     # All alike, but for the smallest network, which is worse.
     counts = [100 if t.network == "2x8" else 290 for t in every]
     for result in fake_results(config, every, counts):
         folder.trial_path(result.trial).mkdir(parents=True)
         folder.finish(result, tmp_path / "none")
-    sweep = summarize(folder, folder.made("airl sweep"))
+    sweep = summarize(folder, MADE)
     best = sweep.best("static-obstacles")
     assert best is not None
     known = [c for c in sweep.cells if c.network != "2x8"]
@@ -289,7 +294,7 @@ def test_fit_of_times_that_follow_a_line_exactly() -> None:
 
 def test_a_result_is_read_as_it_was_written_and_no_other_is_taken(tmp_path: Path) -> None:
     config = load_sweep("tiny")
-    folder = SweepFolder.at(tmp_path, config)
+    folder = SweepFolder(tmp_path, config)
     first, second = trials(config)[:2]
     (result,) = fake_results(config, [first], [7])
     path = folder.trial_path(first)
@@ -304,27 +309,32 @@ def test_a_result_is_read_as_it_was_written_and_no_other_is_taken(tmp_path: Path
     with pytest.raises(UsageError, match="of another trial or of other flights"):
         folder.result(second)
     (path / "result.json").write_text(text[: len(text) // 2])
-    with pytest.raises(UsageError, match="not a result"):
+    with pytest.raises(UsageError, match="not JSON"):
         folder.result(first)
 
 
 def test_a_sweep_goes_on_with_more_cells_and_seeds_but_not_with_another_training(
     tmp_path: Path,
 ) -> None:
+    def begun(config: SweepConfig) -> dict[str, Any]:
+        with open_campaign(tmp_path, declaration(config), command="airl sweep") as store:
+            return store.campaign.made
+
     config = load_sweep("tiny")
-    folder = SweepFolder.at(tmp_path, config)
-    made = folder.made("airl sweep tiny")
-    write_sweep(summarize(folder, made))
-    assert SweepFolder.at(tmp_path, config).made("another") == made
-    more = config.model_copy(update={"seeds": (1, 2, 3)})
-    assert len(trials(SweepFolder.at(tmp_path, more).config)) == 6
-    training = config.training.model_copy(update={"steps": 2_000})
-    for name, value in (
-        ("training", training),
-        ("evaluation", config.evaluation.model_copy(update={"episodes": 5})),
+    made = begun(config)
+    assert begun(config) == made
+    more = config.model_copy(update={"seeds": (1, 2, 3), "description": "other words"})
+    assert begun(more) == made
+    assert len(load_campaign(tmp_path).declaration.cells) == 6
+    for name, changed in (
+        ("training.steps = 1000, not 2000", {"training": {"steps": 2_000}}),
+        ("evaluation.episodes = 20, not 5", {"evaluation": {"episodes": 5}}),
     ):
-        with pytest.raises(UsageError, match=f"holds a sweep with another {name}"):
-            SweepFolder.at(tmp_path, config.model_copy(update={name: value}))
+        data = config.model_dump(exclude_unset=True)
+        for table, values in changed.items():
+            data[table] |= values
+        with pytest.raises(UsageError, match=f"holds a campaign with {name}; accepted"):
+            begun(SweepConfig.model_validate(data))
 
 
 # --- how it is shown
@@ -369,14 +379,14 @@ def test_the_page_holds_every_cell_and_names_the_best_and_the_papers(
     tmp_path: Path, computer: str | None
 ) -> None:
     config = load_sweep("full").model_copy(update={"seeds": (1, 2)})
-    folder = SweepFolder.at(tmp_path, config)
+    folder = SweepFolder(tmp_path, config)
     every = trials(config)[:-1]  # One has not ended.
     counts = [int(600 + 399 * math.sin(i) ** 2) for i in range(len(every))]
     for result in fake_results(config, every, counts, episodes=1000):
         folder.trial_path(result.trial).mkdir(parents=True)
         folder.finish(result, tmp_path / "none")
     asked = None if computer is None else Computer(computer, load_computer(computer))
-    sweep = summarize(folder, folder.made("airl sweep full"), asked)
+    sweep = summarize(folder, MADE, asked)
     write_sweep(sweep)
     page = build_page(sweep).read_text(encoding="utf-8")
     data = json.loads((tmp_path / "sweep.json").read_text(encoding="utf-8"))

@@ -27,9 +27,9 @@ from airl_mav.cli.evaluate_task import Result, Task
 from airl_mav.cli.ladder import run
 from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments import gym_flier
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
-from airl_mav.rehearsal import evaluation_gym
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.report import html
 from airl_mav.report.ladder import page as ladder_page
@@ -558,7 +558,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     whole: tuple[Path, str], stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, text = whole
-    monkeypatch.setattr(evaluation_gym, "fly_seeds", None)
+    monkeypatch.setattr(gym_flier, "fly_seeds", None)
     stand_ins.flown.clear()
     code, again = climb(out=out)
     assert code == 0

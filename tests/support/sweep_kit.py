@@ -8,8 +8,7 @@ from pathlib import Path
 from airl_mav.flight.judge import Outcome
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.sweep.config import SweepConfig
-from airl_mav.sweep.result import Trained, TrialResult
-from airl_mav.sweep.trial import Trial, size_of
+from airl_mav.sweep.trial import Trained, Trial, TrialResult, size_of
 
 TINY = (profiles_dir() / "sweeps" / "tiny.toml").read_text(encoding="utf-8")
 

@@ -6,9 +6,8 @@ is done again in seconds, and the result appears whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,9 +17,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import SLOTS, Flown, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.policy.learned import load_learned
-from airl_mav.sweep.result import Trained, TrialResult, judged
-from airl_mav.sweep.store import Progress, SweepFolder
-from airl_mav.sweep.trial import Trial, size_of, training_of
+from airl_mav.sweep.store import SweepFolder, TrainingProgress
+from airl_mav.sweep.trial import Trained, Trial, TrialResult, result_of, size_of, training_of
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.result import export_best
 from airl_mav.training.run import nominal, train
@@ -32,48 +30,40 @@ NOTE_US = 2 * US_PER_S
 PATIENCE_US = 30 * US_PER_S
 """Longest wait for a process that is just ending to let go of a trial [wall µs]."""
 
-LOOK_US = US_PER_S // 5
+POLL_US = US_PER_S // 5
 
 
-@dataclass(frozen=True)
-class TrialWork:
-    """What a worker is made of; goes there by pickle."""
+def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
+    """Carry out a trial from wherever it is, or return what it came to.
 
-    folder: SweepFolder
-    command: str
-    """Words of the command line, for the policies' cards."""
-    device: str = "cpu"
-    """What trains: cpu or cuda."""
+    Args:
+        folder: The sweep's.
+        trial: Which one.
+        command: The command line, for the policy's card.
+        device: What trains: cpu or cuda.
 
-    def __call__(self) -> Callable[[Trial], TrialResult]:
-        """Return what carries out a trial."""
-        return self.carry_out
-
-    def carry_out(self, trial: Trial) -> TrialResult:
-        """Carry out a trial from wherever it is, or return what it came to.
-
-        Raises:
-            UsageError: It cannot be trained, or another process is at it.
-        """
-        config = training_of(self.folder.config, trial)
-        path = self.folder.trial_path(trial)
-        if (path / CONFIG_FILE).exists():
-            training = TrainingFolder.open(path, config)
-        else:
-            training = TrainingFolder.create(path, config, self.command)
-        with _held(training):
-            # Looked at under the lock: whoever had it may have ended the trial.
-            if (done := self.folder.result(trial)) is not None:
-                return done
-            best = train(config, training, _Note(self.folder, trial), self.device)
-            export_best(training, config, trial.name)
-            size, evaluation = size_of(self.folder.config, trial), self.folder.config.evaluation
-            flown = fly_best(
-                training, config, range(evaluation.seed, evaluation.seed + evaluation.episodes)
-            )
-            result = judged(trial, size.parameters, size.macs, _trained(training, best), flown)
-            self.folder.finish(result, training.checkpoints)
-        return result
+    Raises:
+        UsageError: It cannot be trained, or another process is at it.
+    """
+    config, path = training_of(folder.config, trial), folder.trial_path(trial)
+    if (path / CONFIG_FILE).exists():
+        training = TrainingFolder.open(path, config)
+    else:
+        training = TrainingFolder.create(path, config, command)
+    with _held(training):
+        # Looked at under the lock: whoever had it may have ended the trial.
+        if (done := folder.result(trial)) is not None:
+            return done
+        best = train(config, training, _Watcher(folder, trial), device)
+        export_best(training, config, trial.name)
+        seeds = folder.config.evaluation
+        flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))
+        last = training.evaluations()[-1]
+        trained = Trained(last.steps, best.steps, best.success_rate, last.seconds)
+        size = size_of(folder.config, trial)
+        result = result_of(trial, size.parameters, size.macs, trained, flown)
+        folder.finish(result, training.checkpoints)
+    return result
 
 
 def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[Flown]:
@@ -82,11 +72,6 @@ def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> 
     navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))
     pilots = LearnedPilots(policy, lambda seed: np.random.default_rng(seed))
     return [flown for _, flown in fly_seeds(navigation, pilots, seeds)]
-
-
-def _trained(training: TrainingFolder, best: Evaluation) -> Trained:
-    last = training.evaluations()[-1]
-    return Trained(last.steps, best.steps, best.success_rate, last.seconds)
 
 
 @contextmanager
@@ -100,7 +85,7 @@ def _held(training: TrainingFolder) -> Iterator[None]:
         except UsageError:
             if clock.time_us() > PATIENCE_US:
                 raise
-            clock.sleep_until(clock.time_us() + LOOK_US)
+            clock.sleep_until(clock.time_us() + POLL_US)
             continue
         break
     try:
@@ -109,7 +94,7 @@ def _held(training: TrainingFolder) -> Iterator[None]:
         lock.__exit__(None, None, None)
 
 
-class _Note:
+class _Watcher:
     """Leaves a note of the progress now and then. A `training.run.Watcher`."""
 
     def __init__(self, folder: SweepFolder, trial: Trial) -> None:
@@ -122,7 +107,7 @@ class _Note:
         """Training goes on."""
         if self._clock.time_us() >= self._due_us:
             self._due_us = self._clock.time_us() + NOTE_US
-            self._folder.note_progress(self._trial, Progress(steps, self._success))
+            self._folder.note_progress(self._trial, TrainingProgress(steps, self._success))
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:  # noqa: ARG002
         """An evaluation is done."""

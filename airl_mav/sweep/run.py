@@ -1,0 +1,154 @@
+"""Carry out a sweep: the trials that are left, by any executor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.progress import Bar, Progress
+from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
+from airl_mav.experiments.store import open_campaign
+from airl_mav.sweep.config import SweepConfig
+from airl_mav.sweep.store import SweepFolder, declaration
+from airl_mav.sweep.summary import Computer, Sweep, summarize, write_sweep
+from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
+
+LOOK_US = US_PER_S
+"""Interval at which the notes of the trainings are read [wall µs]."""
+
+MOST_BARS = 12
+"""Trials under way that get a bar of their own."""
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What a worker is made of."""
+
+    folder: SweepFolder
+    command: str
+    device: str
+
+    def __call__(self, stop: Stop) -> Callable[[Trial], list[TrialResult]]:  # noqa: ARG002
+        """Return what carries out a trial. `stop`: a worker is ended, and loses no checkpoint."""
+        # Imported late: the learner takes two seconds to load, and only a worker needs it.
+        from airl_mav.sweep.run_trial import run_trial
+
+        return lambda trial: [run_trial(self.folder, trial, self.command, self.device)]
+
+
+def run_sweep(
+    path: Path,
+    config: SweepConfig,
+    executor: Executor,
+    *,
+    command: str,
+    progress: Progress,
+    device: str = "cpu",
+    computer: Computer | None = None,
+    stop: Stop = never,
+) -> tuple[Sweep, str | None]:
+    """Carry out the trials that are left; `sweep.json` is written as each one ends.
+
+    Args:
+        path: The sweep's folder, new or to be gone on with; all workers see it under this path.
+        config: What is searched.
+        executor: Who trains.
+        command: The command line, for the records.
+        progress: Where to say how far it is.
+        device: What trains: cpu or cuda.
+        computer: For which each network's decision latency is estimated; None: for none.
+        stop: Asked several times a second; True ends it all, with what has ended kept.
+
+    Returns:
+        The sweep as far as it is, and why it was broken off, if it was.
+
+    Raises:
+        UsageError: The input cannot be used, or the folder holds something else.
+    """
+    say = partial(progress.note, style="yellow")
+    with open_campaign(path, declaration(config), command=command, say=say) as store:
+        folder = SweepFolder(store.path, config)
+
+        def summary() -> Sweep:
+            sweep = summarize(folder, store.campaign.made, computer)
+            write_sweep(sweep)
+            return sweep
+
+        sweep, wanted = summary(), trials(config)
+        waiting = [trial for trial in wanted if folder.result(trial) is None]
+        bars = _TrialBars(progress, folder, len(wanted), waiting)
+
+        def stopped() -> bool:
+            bars.look()
+            return stop()
+
+        results = executor.run(
+            waiting,
+            _Start(folder, command, device),
+            name=lambda trial: trial.name,
+            stop=stopped,
+            lost=say,
+        )
+        try:
+            with closing(results):
+                for _, result in results:
+                    bars.finished(result)
+                    sweep = summary()
+        except WorkerError as error:
+            return sweep, str(error)
+        return sweep, None
+
+
+class _TrialBars:
+    """A bar over the sweep, one for each trial under way, and a line for each that has ended."""
+
+    def __init__(
+        self, progress: Progress, folder: SweepFolder, total: int, waiting: Sequence[Trial]
+    ) -> None:
+        self._progress, self._folder = progress, folder
+        self._total, self._steps = total, folder.config.training.steps
+        # Measured on one core, a decision's cost grows more slowly than its multiply-accumulates.
+        self._left = {trial: size_of(folder.config, trial).macs ** 0.75 for trial in waiting}
+        self._bar = progress.bar("sweep", sum(self._left.values()) or 1.0)
+        self._bars: dict[Trial, Bar] = {}
+        self._done = 0.0
+        self._clock, self._due_us = WallClock(), 0
+
+    def finished(self, result: TrialResult) -> None:
+        """Count a trial that has just ended."""
+        trial, trained = result.trial, result.trained
+        self._done += self._left.pop(trial)
+        if trial in self._bars:
+            self._bars.pop(trial).close()
+        self._progress.note(
+            f"{self._total - len(self._left):>{len(str(self._total))}}/{self._total}  "
+            f"{trial.arena_name}  {trial.network:>6}  seed {trial.seed}  success "
+            f"{result.success_rate:6.1%} of {result.episodes}, best after "
+            f"{trained.best_steps:,} of {trained.steps:,} decisions, {trained.seconds:,.0f} s"
+        )
+        self._due_us = 0
+        self.look()
+
+    def look(self) -> None:
+        """Look how far the trainings are; cheap, to be called often."""
+        if self._clock.time_us() < self._due_us:
+            return
+        self._due_us = self._clock.time_us() + LOOK_US
+        done = self._done
+        for trial, work in self._left.items():
+            now = self._folder.progress(trial)
+            if now is None:
+                continue
+            done += work * min(now.steps / self._steps, 1.0)
+            if trial not in self._bars and len(self._bars) < MOST_BARS:
+                self._bars[trial] = self._progress.bar(trial.name, self._steps, unit="decisions")
+            if trial in self._bars:
+                success = None if now.success is None else f"success {now.success:.0%}"
+                self._bars[trial].update(completed=now.steps, postfix=success)
+        ended = self._total - len(self._left)
+        self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")

@@ -1,0 +1,279 @@
+"""Campaigns: what is flown once, shared, spread over workers, and gone on with after a kill."""
+
+from __future__ import annotations
+
+import json
+import signal
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.progress import SilentProgress
+from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
+from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
+from airl_mav.experiments.store import (
+    CAMPAIGN_FILE,
+    Comparison,
+    Declaration,
+    DeclaredCell,
+    load_campaign,
+    open_campaign,
+)
+from airl_mav.rehearsal import lock
+from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
+from tests.flight.test_evaluate import same_runs
+from tests.support.campaign_kit import cells, declared, gym_cell
+from tests.support.processes import ROOT, is_running, running, wait_until
+from tests.support.worker_jobs import PaperFlier
+
+
+class Notes(SilentProgress):
+    """Keeps what was noted."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str, style: str | None = None) -> None:
+        self.lines.append(text)
+
+
+def fly(
+    root: Path, flown: list[Cell], workers: int = 1, **options: Any
+) -> tuple[CampaignRun, list[str]]:
+    notes = Notes()
+    with (
+        open_campaign(root, declared(flown), command="a test") as store,
+        open_executor(ExecutorSettings(workers=workers), in_process=True) as executor,
+    ):
+        run = run_cells(store, flown, executor, progress=notes, **options)
+    return run, notes.lines
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("reference") / "root"
+    run, _ = fly(root, cells())
+    assert run.complete
+    return root
+
+
+def same(root: Path, reference: Path) -> bool:
+    return all(same_runs(load(root / name), load(reference / name)) for name in ("a", "b"))
+
+
+# --- what is flown
+
+
+def test_flights_do_not_depend_on_who_flies_them(tmp_path: Path, reference: Path) -> None:
+    # Two slots and two workers: blocks of four episodes instead of all eight at once.
+    run, _ = fly(tmp_path, cells(), workers=2)
+    assert run.complete and run.error is None
+    assert [(each.cell.name, each.path, each.new) for each in run.cells] == [
+        ("a", tmp_path / "a", 8),
+        ("b", tmp_path / "b", 8),
+    ]
+    assert same(tmp_path, reference)
+
+
+def test_cells_with_the_same_flights_share_them(tmp_path: Path, reference: Path) -> None:
+    ended: list[CellRun] = []
+    twin = replace(gym_cell("c"), title="the same again")
+    run, _ = fly(tmp_path, [*cells(), twin], ended=ended.append)
+    assert [each.cell.name for each in ended] == ["a", "b"]
+    assert [each.cell.name for each in run.cells] == ["a", "b", "c"]
+    assert run.cells[2].path == tmp_path / "a"
+    assert run.cells[2].cell is twin
+    assert run.cells[2].episodes == run.cells[0].episodes
+    assert not (tmp_path / "c").exists()
+    assert same(tmp_path, reference)
+
+
+def test_what_is_finished_is_told_and_not_flown_again(tmp_path: Path) -> None:
+    before, _ = fly(tmp_path, cells())
+    files = {path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path.is_file()}
+    ended: list[CellRun] = []
+    run, notes = fly(tmp_path, cells(), ended=ended.append)
+    assert run.complete
+    assert [each.new for each in run.cells] == [each.new for each in ended] == [0, 0]
+    assert [each.episodes for each in run.cells] == [each.episodes for each in before.cells]
+    assert notes == [f"{tmp_path / name}: 8 of 8 episodes are there" for name in ("a", "b")]
+    assert files == {
+        path: path.read_bytes() for path in sorted(tmp_path.rglob("*")) if path in files
+    }
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_campaign_that_is_stopped_goes_on(tmp_path: Path, reference: Path, workers: int) -> None:
+    flown = cells()
+    first = load(reference / "a").episodes[0]
+    seen: list[CellRun] = []
+    # As soon as the first cell is complete.
+    run, _ = fly(tmp_path, flown, workers, ended=seen.append, stop=lambda: bool(seen))
+    assert not run.complete and run.error is None
+    assert run.cells[0].episodes[0] == first
+    assert sum(each.new for each in run.cells) < 16
+    run, _ = fly(tmp_path, flown, 3 - workers)
+    assert run.complete
+    assert same(tmp_path, reference)
+
+
+@pytest.mark.slow
+def test_a_campaign_that_is_killed_leaves_nobody_behind_and_goes_on(tmp_path: Path) -> None:
+    root, episodes = tmp_path / "root", 400
+    words = ["-m", "tests.support.campaign_kit", f"{root}", f"{episodes}"]
+    with running(words, tmp_path, path=ROOT) as parent:
+
+        def saved() -> int:
+            file = root / "a" / "episodes.jsonl"
+            return len(file.read_bytes().splitlines()) if file.exists() else 0
+
+        wait_until(saved, "an episode to be saved")
+        workers = [pid for pid in children(parent.pid) if pid != parent.pid]
+        parent.process.send_signal(signal.SIGKILL)
+        parent.process.wait()
+        for pid in workers:
+            wait_until(lambda pid=pid: not is_running(pid), "an orphan to end", 30.0)
+    assert load_campaign(root).declaration == declared(cells(episodes))
+    held = len(load(root / "a").episodes)
+    run, _ = fly(root, cells(episodes))
+    assert run.complete
+    assert 0 < sum(each.new for each in run.cells) <= 2 * episodes - held
+    whole, _ = fly(tmp_path / "whole", cells(episodes))
+    assert [each.episodes for each in run.cells] == [each.episodes for each in whole.cells]
+
+
+def children(parent: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError, IndexError):
+            ppid = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            if ppid == parent:
+                found.append(int(entry.name))
+    return found
+
+
+def paper(run: LoadedRun, cell: Cell, deadly: int, per_job: int) -> Cell:
+    flown = {
+        e.index: FlownEpisode(e, run.trajectories[e.index], run.latency[e.index])
+        for e in run.episodes
+    }
+    return replace(cell, flier=PaperFlier(flown, deadly, per_job))
+
+
+def test_a_job_that_loses_its_workers_ends_the_campaign_with_one_line(
+    tmp_path: Path, reference: Path
+) -> None:
+    whole = load(reference / "a")
+    broken = [paper(whole, cells()[0], 8, 2), cells()[1]]
+    with open_executor(ExecutorSettings(workers=1)) as executor:
+        notes = Notes()
+        with open_campaign(tmp_path, declared(broken), command="a test") as store:
+            run = run_cells(store, broken, executor, progress=notes)
+    assert not run.complete
+    assert run.error == "a: seeds 7 to 8: lost 3 workers, the last one by SIGKILL"
+    assert notes.lines == ["a worker was lost by SIGKILL: a: seeds 7 to 8 begins again"] * 2
+    # Nothing of an attempt that did not end: neither seed 7, nor anything twice.
+    assert [each.seed for each in load(tmp_path / "a").episodes] == [5, 6]
+    assert [each.cell.name for each in run.cells] == ["a"]
+
+
+def test_one_evaluation_needs_no_campaign(tmp_path: Path, reference: Path) -> None:
+    cell = gym_cell("alone")
+    run = run_cell(tmp_path / "run", cell, InProcessExecutor())
+    assert run.complete
+    assert same_runs(load(tmp_path / "run"), load(reference / "a"))
+    assert not (tmp_path / "run" / CAMPAIGN_FILE).exists()
+    run = run_cell(tmp_path / "other", cell, InProcessExecutor(), stop=lambda: True)
+    assert [(each.path, each.episodes) for each in run.cells] == [(tmp_path / "other", ())]
+
+
+# --- the folder
+
+
+def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
+    tmp_path: Path,
+) -> None:
+    flown = cells()
+    asked = replace(declared(flown), comparisons=(Comparison("a", "b", "shorter hold"),))
+    with open_campaign(tmp_path, asked, command="the first command") as store:
+        held = load_campaign(tmp_path)
+        assert held == store.campaign
+        assert held.declaration == asked
+        assert held.made["command"] == "the first command"
+    more = replace(asked, cells=asked.cells | {"c": DeclaredCell("one more")})
+    with open_campaign(tmp_path, more, command="another command"):
+        assert load_campaign(tmp_path).made == held.made
+        assert list(load_campaign(tmp_path).declaration.cells) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"kind": "gap"}, "kind = 'test', not 'gap'"),
+        ({"settings": {"policy": "other"}}, "policy = 'greedy', not 'other'"),
+        (
+            {"cells": {"a": DeclaredCell("the cell a", {"hold_s": 0.7})}},
+            "another cell a: hold_s = 0.5, not 0.7",
+        ),
+    ],
+)
+def test_another_campaign_is_not_mixed_in(
+    tmp_path: Path, changed: dict[str, Any], named: str
+) -> None:
+    asked = declared(cells())
+    with open_campaign(tmp_path, asked, command="a test"):
+        pass
+    before = (tmp_path / CAMPAIGN_FILE).read_bytes()
+    with (
+        pytest.raises(UsageError, match=f"holds a campaign with {named}; accepted"),
+        open_campaign(tmp_path, replace(asked, **changed), command="a test"),
+    ):
+        pass
+    assert (tmp_path / CAMPAIGN_FILE).read_bytes() == before
+    if "settings" in changed:
+        other = replace(asked, **changed)
+        with open_campaign(tmp_path, other, command="a test", free=("policy",)):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("file", "what"), [("run.json", "a single run"), ("train.json", "a train")]
+)
+def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, what: str) -> None:
+    (tmp_path / file).write_text(json.dumps({"schema": 1}))
+    with (
+        pytest.raises(UsageError, match=r"holds a .*accepted: another folder"),
+        open_campaign(tmp_path, declared(cells()), command="a test"),
+    ):
+        pass
+    assert not (tmp_path / CAMPAIGN_FILE).exists()
+
+
+def test_a_campaign_belongs_to_one_process_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    told: list[str] = []
+    asked = declared(cells())
+    with (
+        open_campaign(tmp_path, asked, command="a test"),
+        pytest.raises(UsageError, match="another run flies into it"),
+        open_campaign(tmp_path, asked, command="a test", say=told.append),
+    ):
+        pass
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", CAMPAIGN_FILE])
+def test_a_cell_is_named_as_a_folder_can_be(name: str) -> None:
+    with pytest.raises(ValueError, match="the name of a folder"):
+        Declaration("test", {}, {name: DeclaredCell("")})
+
+
+def test_only_declared_cells_are_compared() -> None:
+    with pytest.raises(ValueError, match=r"comparison of 'b': accepted: a"):
+        Declaration("test", {}, {"a": DeclaredCell("")}, (Comparison("a", "b"),))
