@@ -9,7 +9,7 @@ import tyro
 
 from airl_mav.cli.arena_command import ArenaCommand
 from airl_mav.cli.common import check_installed, run_command
-from airl_mav.cli.conformance_command import ConformanceCommand
+from airl_mav.cli.conformance import Conformance
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.export_command import ExportCommand
 from airl_mav.cli.gap_command import GapCommand
@@ -36,7 +36,7 @@ class Subcommand(NamedTuple):
 SUBCOMMANDS: dict[str, Subcommand] = {
     # To add one: write cli/<name>_command.py and cli/<name>.py, and a line here.
     "arena": Subcommand(ArenaCommand, "airl_mav.cli.arena"),
-    "conformance": Subcommand(ConformanceCommand, "airl_mav.cli.conformance", needs=()),
+    "conformance": Subcommand(Conformance, "airl_mav.cli.conformance", needs=()),
     "evaluate": Subcommand(EvaluateCommand, "airl_mav.cli.evaluate"),
     "export": Subcommand(ExportCommand, "airl_mav.cli.export"),
     "gap": Subcommand(GapCommand, "airl_mav.cli.gap"),
