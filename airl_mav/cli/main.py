@@ -11,14 +11,14 @@ from airl_mav.cli.arena_command import ArenaCommand
 from airl_mav.cli.common import check_installed, run_command
 from airl_mav.cli.conformance import Conformance
 from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.export_command import ExportCommand
+from airl_mav.cli.export import Export
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.cli.sweep_command import SweepCommand
-from airl_mav.cli.train_command import TrainCommand
+from airl_mav.cli.train import Train
 
 
 class Subcommand(NamedTuple):
@@ -38,14 +38,14 @@ SUBCOMMANDS: dict[str, Subcommand] = {
     "arena": Subcommand(ArenaCommand, "airl_mav.cli.arena"),
     "conformance": Subcommand(Conformance, "airl_mav.cli.conformance", needs=()),
     "evaluate": Subcommand(EvaluateCommand, "airl_mav.cli.evaluate"),
-    "export": Subcommand(ExportCommand, "airl_mav.cli.export"),
+    "export": Subcommand(Export, "airl_mav.cli.export"),
     "gap": Subcommand(GapCommand, "airl_mav.cli.gap"),
     "ladder": Subcommand(LadderCommand, "airl_mav.cli.ladder"),
     "parameters": Subcommand(ParametersCommand, "airl_mav.cli.parameters"),
     "profile": Subcommand(ProfileCommand, "airl_mav.cli.profile", needs=()),
     "report": Subcommand(ReportCommand, "airl_mav.cli.report"),
     "sweep": Subcommand(SweepCommand, "airl_mav.cli.sweep"),
-    "train": Subcommand(TrainCommand, "airl_mav.cli.train"),
+    "train": Subcommand(Train, "airl_mav.cli.train"),
 }
 
 

@@ -22,8 +22,7 @@ from airl_mav.sweep.result import Trained, TrialResult, judged
 from airl_mav.sweep.store import Progress, SweepFolder
 from airl_mav.sweep.trial import Trial, size_of, training_of
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.result import export_best
-from airl_mav.training.run import nominal, train
+from airl_mav.training.run import export_best, fit, nominal
 from airl_mav.training.store import CONFIG_FILE, Evaluation, TrainingFolder
 
 NOTE_US = 2 * US_PER_S
@@ -65,7 +64,7 @@ class TrialWork:
             # Looked at under the lock: whoever had it may have ended the trial.
             if (done := self.folder.result(trial)) is not None:
                 return done
-            best = train(config, training, _Note(self.folder, trial), self.device)
+            best = fit(config, training, _Note(self.folder, trial), self.device)
             export_best(training, config, trial.name)
             size, evaluation = size_of(self.folder.config, trial), self.folder.config.evaluation
             flown = fly_best(
@@ -110,7 +109,7 @@ def _held(training: TrainingFolder) -> Iterator[None]:
 
 
 class _Note:
-    """Leaves a note of the progress now and then. A `training.run.Watcher`."""
+    """Leaves a note of the progress now and then. A `training.run.TrainingProgress`."""
 
     def __init__(self, folder: SweepFolder, trial: Trial) -> None:
         self._folder, self._trial = folder, trial
@@ -118,7 +117,7 @@ class _Note:
         self._due_us = 0
         self._success: float | None = None
 
-    def progress(self, steps: int, success: float | None, zone: int | None) -> None:  # noqa: ARG002
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:  # noqa: ARG002
         """Training goes on."""
         if self._clock.time_us() >= self._due_us:
             self._due_us = self._clock.time_us() + NOTE_US

@@ -31,8 +31,8 @@ from airl_mav.policy.card import load_card, open_model, read_card
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.learned import decide, load_learned
 from airl_mav.profiles.computer import load_computer
-from airl_mav.training import export
-from airl_mav.training.sb3_export import export_sb3, network_of
+from airl_mav.training import onnx_export as export
+from airl_mav.training.export import export_sb3, network_of
 from tests.support.policy_kit import SPEC, Eye, export_tiny, facts, make_model, noise
 from tests.support.processes import ROOT
 
@@ -339,7 +339,7 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         ("text.zip", ["--algorithm", "DQN"], ["text.zip: not a .zip"]),
         ("empty.zip", ["--algorithm", "DQN"], ["empty.zip: not a model of DQN"]),
         ("sac.zip", ["--algorithm", "DQN"], ["sac.zip: not a model of DQN"]),
-        ("dqn.zip", ["--algorithm", "oracle"], ["--algorithm 'oracle'", "DQN", "PPO", "QRDQN"]),
+        ("dqn.zip", ["--algorithm", "oracle"], ["algorithm 'oracle'", "DQN", "PPO", "QRDQN"]),
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--image", "64x48"],
@@ -407,5 +407,5 @@ def test_out_that_is_a_file_is_refused(
     out.write_text("mine")
     code = airl(monkeypatch, "export", zips / "dqn.zip", "--algorithm", "DQN", "--out", out)
     assert code == 2
-    assert f"--out {out}: not a folder" in capsys.readouterr().err
+    assert f"{out}: not a folder" in capsys.readouterr().err
     assert out.read_text() == "mine"
