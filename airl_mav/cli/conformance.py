@@ -6,67 +6,80 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
 from rich.console import Console
 
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.errors import UsageError
 
 
-@dataclass(frozen=True)
-class Conformance:
+class ConformanceOptions(BaseModel):
     """Fly any flight controller through checks and step responses: airl-firmware, PX4, ArduPilot.
 
     SITL or a board. It takes off. Once through it needs 60 m to the north, 20 m to the east and
     15 m above the take-off altitude; Ctrl-C lands. Exit status 1: a check failed.
 
     Examples:
-      airl-firmware --arena open-field
-      airl conformance --connect udpin://127.0.0.1:14540 --out result.json
+        airl-firmware --arena open-field
+        airl conformance --connect udpin://127.0.0.1:14540 --out result.json
     """
 
-    connect: str = "udpin://127.0.0.1:14540"
-    """MAVSDK connection to the flight controller: udpin://HOST:PORT or serial://DEVICE:BAUD."""
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    reference: str = Field(
+        default="auto",
+        description="stored step responses to compare with: auto (by the autopilot that is heard),"
+        " px4, ardupilot, or a path to a .toml",
+    )
+    speed: float = Field(
+        default=1.0,
+        description="simulated seconds per wall second of the vehicle; 1 for a real one",
+    )
+    altitude: float = Field(
+        default=10.0,
+        description="take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down"
+        " while it waits for setpoints",
+    )
+    repeat: int = Field(
+        default=1,
+        description="how often the steps are flown, 1 to 20: the table has the median; every other"
+        " time they are mirrored, so that the vehicle comes back",
+    )
+    steps: tuple[str, ...] | None = Field(
+        default=None,
+        description="names of the steps to fly, as north-2 yaw-90 (docs/conformance.md); by default"
+        " all",
+    )
+    skip_steps: bool = Field(default=False, description="fly no step responses")
+    steps_only: bool = Field(
+        default=False,
+        description="check neither refusals nor frames, offboard loss or hold: fly the steps",
+    )
+    connect_timeout: float = Field(
+        default=30.0,
+        description="how long a flight controller is waited for, 1 to 3600 s of wall time",
+    )
+    out: Path | None = Field(
+        default=None, description="write everything to this .json; by default nothing"
+    )
 
-    reference: str = "auto"
-    """Stored step responses to compare with: auto (by the autopilot that is heard), px4,
-    ardupilot, or a path to a .toml."""
 
-    speed: float = 1.0
-    """Simulated seconds per wall second of the vehicle; 1 for a real one."""
-
-    altitude: float = 10.0
-    """Take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down while it waits for
-    setpoints."""
-
-    repeat: int = 1
-    """How often the steps are flown, 1 to 20: the table has the median. Every other time they are
-    mirrored, so that the vehicle comes back."""
-
-    steps: tuple[str, ...] | None = None
-    """Names of the steps to fly, as north-2 yaw-90 (docs/conformance.md). None: all."""
-
-    skip_steps: bool = False
-    """Fly no step responses."""
-
-    steps_only: bool = False
-    """Check neither refusals nor frames, offboard loss or hold: fly the steps."""
-
-    connect_timeout: float = 30.0
-    """How long a flight controller is waited for, 1 to 3600 s of wall time."""
-
-    out: Path | None = None
-    """Write everything to this .json. None: nothing."""
+OPTIONS = ConformanceOptions
+RENAMED_OPTIONS: dict[str, tuple[str, ...]] = {}
+EXTRAS = ()
 
 
-def run(command: Conformance, console: Console | None = None) -> int:
+def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result.
 
     Args:
-        command: The options.
+        options: What is asked for.
         console: Where to print; None means standard output.
 
     Returns:
@@ -81,24 +94,24 @@ def run(command: Conformance, console: Console | None = None) -> int:
     from airl_mav.conformance.steps import STEP_NAMES
 
     console = console or Console()
-    if command.out is not None and not command.out.parent.is_dir():
-        raise UsageError(f"--out {command.out}: no folder {command.out.parent}")
-    if command.skip_steps and (command.steps_only or command.steps):
-        other = "--steps-only" if command.steps_only else "--steps"
+    if options.out is not None and not options.out.parent.is_dir():
+        raise UsageError(f"--out {options.out}: no folder {options.out.parent}")
+    if options.skip_steps and (options.steps_only or options.steps):
+        other = "--steps-only" if options.steps_only else "--steps"
         raise UsageError(f"--skip-steps: accepted: without {other}")
-    if command.steps == ():
+    if options.steps == ():
         raise UsageError("--steps: accepted: one name or more")
-    steps: Any = () if command.skip_steps else command.steps or STEP_NAMES
+    steps: Any = () if options.skip_steps else options.steps or STEP_NAMES
     with _sigterm_as_ctrl_c():
         result = check_conformance(
-            command.connect,
-            reference=command.reference,
-            speed=command.speed,
-            altitude_m=command.altitude,
+            options.connect,
+            reference=options.reference,
+            speed=options.speed,
+            altitude_m=options.altitude,
             steps=steps,
-            repeat=command.repeat,
-            steps_only=command.steps_only,
-            connect_timeout_s=command.connect_timeout,
+            repeat=options.repeat,
+            steps_only=options.steps_only,
+            connect_timeout_s=options.connect_timeout,
             progress=lambda line: console.print(line_text(line), soft_wrap=True),
         )
     if result.steps and result.reference is not None:
@@ -106,8 +119,8 @@ def run(command: Conformance, console: Console | None = None) -> int:
     console.print(check_table(result))
     style = "bold green" if result.passed else "bold red"
     console.print(result.verdict, style=style, markup=False, soft_wrap=True)
-    if command.out is not None:
-        result.write(command.out)
+    if options.out is not None:
+        result.write(options.out)
     if result.interrupted:
         return EXIT_INTERRUPTED
     return 0 if result.passed else EXIT_BROKEN

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from airl_mav.cli.cells import Cell
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.gap_command import (
@@ -18,11 +16,11 @@ from airl_mav.cli.gap_command import (
     GapCommand,
 )
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.envs.spec import Delay
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import explain
 from airl_mav.report.gap.build import Role
 
 TRAINING_LATENCY_SEED = 1
@@ -183,10 +181,7 @@ def _training(
             "compared with that.",
         )
     delay = environment.get("delay", {})
-    try:
-        found = Delay.model_validate(delay)
-    except ValidationError as error:
-        raise UsageError(f"{mitigated.name}: environment.delay: {explain(error, Delay)}") from None
+    found = validated(Delay, delay, f"{mitigated.name}: environment.delay")
     remarks: tuple[str, ...] = ()
     extra = environment.get("randomisation", {}).get("extra_delay_ms", (0.0, 0.0))
     if any(extra):

@@ -9,16 +9,16 @@ import tyro
 
 from airl_mav.cli.arena_command import ArenaCommand
 from airl_mav.cli.common import check_installed, run_command
-from airl_mav.cli.conformance import Conformance
+from airl_mav.cli.conformance import ConformanceOptions
 from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.export import Export
+from airl_mav.cli.export import ExportOptions
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.cli.sweep_command import SweepCommand
-from airl_mav.cli.train import Train
+from airl_mav.cli.train import TrainOptions
 
 
 class Subcommand(NamedTuple):
@@ -36,16 +36,16 @@ class Subcommand(NamedTuple):
 SUBCOMMANDS: dict[str, Subcommand] = {
     # To add one: write cli/<name>_command.py and cli/<name>.py, and a line here.
     "arena": Subcommand(ArenaCommand, "airl_mav.cli.arena"),
-    "conformance": Subcommand(Conformance, "airl_mav.cli.conformance", needs=()),
+    "conformance": Subcommand(ConformanceOptions, "airl_mav.cli.conformance", needs=()),
     "evaluate": Subcommand(EvaluateCommand, "airl_mav.cli.evaluate"),
-    "export": Subcommand(Export, "airl_mav.cli.export"),
+    "export": Subcommand(ExportOptions, "airl_mav.cli.export"),
     "gap": Subcommand(GapCommand, "airl_mav.cli.gap"),
     "ladder": Subcommand(LadderCommand, "airl_mav.cli.ladder"),
     "parameters": Subcommand(ParametersCommand, "airl_mav.cli.parameters"),
     "profile": Subcommand(ProfileCommand, "airl_mav.cli.profile", needs=()),
     "report": Subcommand(ReportCommand, "airl_mav.cli.report"),
     "sweep": Subcommand(SweepCommand, "airl_mav.cli.sweep"),
-    "train": Subcommand(Train, "airl_mav.cli.train"),
+    "train": Subcommand(TrainOptions, "airl_mav.cli.train"),
 }
 
 

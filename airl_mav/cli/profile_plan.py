@@ -12,13 +12,13 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.common import GREATEST_SEED, check_installed, check_ports, check_range
 from airl_mav.cli.companion_command import GREATEST_THREADS
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
@@ -27,7 +27,7 @@ from airl_mav.policy.registry import DEFAULT_POLICY, find_policy
 from airl_mav.policy.template import write_template
 from airl_mav.profiles.computer import ComputerProfile, Network
 from airl_mav.profiles.computer_file import existing_profile
-from airl_mav.profiles.loading import explain, list_profiles
+from airl_mav.profiles.loading import list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from companion.pilot import PilotSettings
 
@@ -237,16 +237,14 @@ def _random_network(
 def _observation(
     option: str, layout: LayoutName, width: int, height: int, vehicle: VehicleProfile
 ) -> ObservationSpec:
-    try:
-        return ObservationSpec(
-            layout=layout,
-            width_px=width,
-            height_px=height,
-            horizontal_fov_deg=vehicle.camera.horizontal_fov_deg,
-            range_m=vehicle.camera.range_m,
-        )
-    except ValidationError as error:
-        raise UsageError(f"--image {option}: {explain(error, ObservationSpec)}") from None
+    fields = {
+        "layout": layout,
+        "width_px": width,
+        "height_px": height,
+        "horizontal_fov_deg": vehicle.camera.horizontal_fov_deg,
+        "range_m": vehicle.camera.range_m,
+    }
+    return validated(ObservationSpec, fields, f"--image {option}")
 
 
 def _vehicle_for(card: PolicyCard, asked: str | None) -> str:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from pydantic import ValidationError
 from rich.console import Console
 
 from airl_mav.cli.common import (
@@ -22,10 +21,11 @@ from airl_mav.cli.episode_bar import stop_on_signals
 from airl_mav.cli.sweep_command import SweepCommand
 from airl_mav.cli.sweep_progress import SweepProgress
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.core.provenance import usable_cores
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import explain, load_profile
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.workers import GREATEST_WORKERS, WorkerError
 from airl_mav.sweep.config import Examination, Grid, SweepConfig, load_sweep
 from airl_mav.sweep.executors import Executor, LocalExecutor, Work
@@ -170,11 +170,7 @@ def sweep_of(command: SweepCommand) -> SweepConfig:
 
 
 def _examination(flights: dict[str, int]) -> Examination:
-    try:
-        return Examination.model_validate(flights)
-    except ValidationError as error:
-        told = explain(error, Examination)
-        raise UsageError(f"--episodes, --seed: {told}") from None
+    return validated(Examination, flights, "--episodes, --seed")
 
 
 def _found(grid: Grid) -> Grid:

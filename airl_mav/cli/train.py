@@ -5,72 +5,87 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+from pydantic import BaseModel, Field
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from airl_mav.cli.common import EXIT_INTERRUPTED, check_train_installed
+from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.loading import load_profile
 
 if TYPE_CHECKING:
     from airl_mav.training.store import Evaluation
 
 
-@dataclass(frozen=True)
-class Train:
+class TrainOptions(BaseModel):
     """Train a policy; the best weights are exported as policy.onnx with their card.
 
     Examples:
-      airl train static-obstacles --out runs/mine
-      airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
+        airl train static-obstacles --out runs/mine
+        airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
     """
 
-    config: tyro.conf.Positional[str] = "static-obstacles"
-    """Training configuration: a shipped name, or a path to a .toml."""
+    config: Annotated[str, tyro.conf.Positional, "positional"] = Field(
+        default="static-obstacles",
+        description="training configuration: a shipped name, or a path to a .toml",
+    )
+    out: Path | None = Field(
+        default=None, description="folder of the run; by default runs/train-<config>"
+    )
+    seed: int | None = Field(
+        default=None,
+        description="seed of weights, exploration and episodes; by default the configuration's",
+    )
+    computer: str | None = Field(
+        default=None,
+        description="decide as late as this computer in training: a shipped profile, or a path to"
+        " a .toml; takes --workload; by default the configuration's",
+    )
+    workload: str | None = Field(
+        default=None,
+        description="workload of that computer whose latency t2 is drawn in every decision",
+    )
+    latency: tuple[str, ...] = Field(
+        default=(),
+        description="sources of t2 in place of computer and workload, as airl evaluate takes them:"
+        " 150ms, lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE; of several, each episode draws one",
+    )
+    sensing_distance: float | None = Field(
+        default=None,
+        description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
+        " longest latency, stops within so many metres; by default the configuration's, or not",
+    )
+    max_acceleration: float | None = Field(
+        default=None,
+        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance;"
+        " by default what the vehicle's tilt limit and thrust permit",
+    )
+    steps: int | None = Field(
+        default=None,
+        description="decisions of all vehicles together; by default the configuration's",
+    )
+    name: str | None = Field(
+        default=None,
+        description="name of the policy on its card; by default the configuration's",
+    )
+    resume: bool = Field(
+        default=False,
+        description="continue the run in --out from its newest checkpoint; start it if there is"
+        " none",
+    )
 
-    out: Path | None = None
-    """Folder of the run. None: runs/train-<config>."""
 
-    seed: int | None = None
-    """Seed of weights, exploration and episodes. None: the configuration's."""
-
-    computer: str | None = None
-    """Decide as late as this computer in training: a shipped profile, or a path to a .toml; takes
-    --workload. None: the configuration's."""
-
-    workload: str | None = None
-    """Workload of that computer whose latency t2 is drawn in every decision; estimate is not
-    accepted: the network is not there yet. None: the configuration's."""
-
-    latency: tuple[str, ...] = ()
-    """Sources of t2 in place of computer and workload, as airl evaluate takes them: 150ms,
-    lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE. Of several, each episode draws one: latency
-    randomisation over several computers. None given: the configuration's."""
-
-    sensing_distance: float | None = None
-    """Scale the actions to the safe velocity: the vehicle, deciding as late as its longest latency,
-    stops within so many metres. None: the configuration's, or no scaling."""
-
-    max_acceleration: float | None = None
-    """Greatest deceleration for the safe velocity, m/s²; takes --sensing-distance. None: what the
-    vehicle's tilt limit and thrust permit."""
-
-    steps: int | None = None
-    """Decisions of all vehicles together. None: the configuration's."""
-
-    name: str | None = None
-    """Name of the policy on its card. None: the configuration's."""
-
-    resume: bool = False
-    """Go on with the run in --out from its newest checkpoint; begin it when there is none."""
+OPTIONS = TrainOptions
+EXTRAS = ("sim", "train")
 
 
-def run(command: Train, console: Console | None = None, *, command_line: str | None = None) -> int:
+def run(
+    options: TrainOptions, console: Console | None = None, *, command_line: str | None = None
+) -> int:
     """Train, export, and print the result; `command_line` is noted on the card.
 
     Returns the exit status: 0 trained to the end, 130 Ctrl-C. Raises UsageError as
@@ -82,14 +97,14 @@ def run(command: Train, console: Console | None = None, *, command_line: str | N
     console = console or Console()
     show = partial(console.print, soft_wrap=True, highlight=False)
     config = configured(
-        load_profile("training", command.config, TrainingConfig),
-        seed=command.seed,
-        steps=command.steps,
-        computer=command.computer,
-        workload=command.workload,
-        latency=command.latency,
-        sensing_distance_m=command.sensing_distance,
-        max_acceleration_m_s2=command.max_acceleration,
+        load_profile("training", options.config, TrainingConfig),
+        seed=options.seed,
+        steps=options.steps,
+        computer=options.computer,
+        workload=options.workload,
+        latency=options.latency,
+        sensing_distance_m=options.sensing_distance,
+        max_acceleration_m_s2=options.max_acceleration,
     )
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     check_train_installed()
@@ -97,8 +112,8 @@ def run(command: Train, console: Console | None = None, *, command_line: str | N
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
     from airl_mav.training.run import train
 
-    stem = Path(command.config).stem
-    out = command.out or Path("runs") / f"train-{stem}"
+    stem = Path(options.config).stem
+    out = options.out or Path("runs") / f"train-{stem}"
     show(f"training   {stem}: {config.description}")
     for source in injections:
         show(f"latency    {source.label}")
@@ -107,17 +122,17 @@ def run(command: Train, console: Console | None = None, *, command_line: str | N
     show(f"folder     {out}")
     show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
     try:
-        with TrainingBar(console, config.steps) as bar:
+        with RichProgress(console) as progress:
             result = train(
                 config,
                 out,
-                name=command.name or stem,
-                resume=command.resume,
-                progress=bar,
+                name=options.name or stem,
+                resume=options.resume,
+                progress=TrainingBar(progress, config.steps),
                 command=command_line or shlex.join(["airl", *sys.argv[1:]]),
             )
     except KeyboardInterrupt:
-        show(f"interrupted: airl train {command.config} --out {out} --resume continues")
+        show(f"interrupted: airl train {options.config} --out {out} --resume continues")
         return EXIT_INTERRUPTED
     best, policy = result.best, result.folder.policy
     rate = f"{best.success_rate:.1%} of {best.episodes} selection episodes"
@@ -130,43 +145,23 @@ def run(command: Train, console: Console | None = None, *, command_line: str | N
 class TrainingBar:
     """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
 
-    def __init__(self, console: Console, steps: int) -> None:
-        self._console = console
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-            console=console,
-            transient=True,
-        )
-        self._task = self._bar.add_task("decisions", total=steps, note="")
-
-    def __enter__(self) -> TrainingBar:
-        """Start drawing."""
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop drawing."""
-        self._bar.stop()
+    def __init__(self, progress: RichProgress, steps: int) -> None:
+        self._progress = progress
+        self._bar = progress.bar("training", steps, unit="decisions")
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
         """Draw the bar."""
-        note = "" if success is None else f"success {success:.0%} in training"
-        note += "" if zone is None else f", zone {zone}"
-        self._bar.update(self._task, completed=steps, note=note)
+        text = "" if success is None else f"success {success:.0%} in training"
+        text += "" if zone is None else f", zone {zone}"
+        self._bar.update(completed=steps, postfix=text)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
         """Print a line."""
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
         zone = "" if evaluation.zone is None else f"  zone {evaluation.zone}"
-        self._console.print(
+        self._progress.note(
             f"{evaluation.steps:>11,} decisions {evaluation.seconds:7.0f} s  success "
-            f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}",
-            highlight=False,
+            f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
         )
 
     def checkpointed(self, steps: int) -> None:

@@ -12,7 +12,7 @@ from airl_mav.conformance.checklist import CheckFailedError, require
 from airl_mav.conformance.step_response import StepResponse
 from airl_mav.conformance.steps import MeasuredStep, StepName
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile
 
 AUTO = "auto"

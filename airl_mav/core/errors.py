@@ -2,6 +2,73 @@
 
 from __future__ import annotations
 
+import reprlib
+
+MISSING = object()
+"""Value of a field that nobody gave."""
+
+LONGEST_VALUE = 80
+"""Characters of a value that a message shows."""
+
 
 class UsageError(Exception):
     """Input that cannot be used. The message names the file, field, value and accepted range."""
+
+
+class FieldError(UsageError):
+    """A field of a scenario or a file that cannot be used.
+
+    The field is kept apart from the rest, so that each front end can name it in its own way: as an
+    option of a command, as a key of a file.
+    """
+
+    def __init__(
+        self, field: str, value: object = MISSING, accepted: str = "", problem: str = ""
+    ) -> None:
+        """Describe a field.
+
+        Args:
+            field: Dotted path of the field; "" for the whole.
+            value: What was given, `MISSING` when nothing was or when it would not help.
+            accepted: What would have been accepted: "0 < value <= 10 s".
+            problem: What is wrong, where that says more than what is accepted.
+        """
+        # All arguments, so that the error can be pickled between processes.
+        super().__init__(field, value, accepted, problem)
+        self.field = field
+        self.value = value
+        self.accepted = accepted
+        self.problem = problem
+
+    def line(self, name: str | None = None, sign: str = " ") -> str:
+        """Return the message in one line: "NAME VALUE: accepted: RANGE".
+
+        Args:
+            name: What to call the field; None: its dotted path.
+            sign: What stands between name and value; " = " in messages about files.
+        """
+        where = self.field if name is None else name
+        if self.value is not MISSING:
+            where = f"{where}{sign}{shown(self.value)}" if where else shown(self.value)
+        what = self.problem or f"accepted: {self.accepted}"
+        return f"{where}: {what}" if where else what
+
+    def __str__(self) -> str:
+        """Return the message in one line."""
+        return self.line()
+
+
+def shown(value: object) -> str:
+    """Return a value as a message shows it: numbers as a person writes them, never too long."""
+    if isinstance(value, float) and float(f"{value:g}") == value:
+        return f"{value:g}"
+    try:
+        # reprlib stops early in containers; a plain repr of a long list or number takes ages.
+        text = _REPR.repr(value)
+    except ValueError:  # A whole number with more digits than Python turns into text.
+        return "a number of too many digits"
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
+
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = LONGEST_VALUE

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.envs.rewards import RewardName
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import LayoutName
 from airl_mav.profiles.arena import Each
-from airl_mav.profiles.fields import ProfileModel, quantity
-from airl_mav.profiles.loading import explain
 
 
 class EpisodeRules(ProfileModel):
@@ -204,7 +203,4 @@ def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> Environme
         if knobs:
             raise UsageError(f"spec and {', '.join(knobs)}: accepted: one or the other")
         return spec
-    try:
-        return EnvironmentSpec.model_validate(dict(knobs))
-    except ValidationError as error:
-        raise UsageError(explain(error, EnvironmentSpec)) from None
+    return validated(EnvironmentSpec, dict(knobs))

@@ -11,12 +11,11 @@ import math
 import re
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.latency.injection import Injection, choose_injection, moments
 from airl_mav.profiles.computer import LONGEST_MS, Latency, load_computer, read_samples
-from airl_mav.profiles.loading import explain, list_profiles
+from airl_mav.profiles.loading import list_profiles
 
 ACCEPTED = (
     "150ms, lognormal:396ms,20ms, normal:396ms,20ms, COMPUTER/WORKLOAD, "
@@ -117,10 +116,7 @@ def _parametric(kind: str, values: str, text: str, option: str) -> Injection:
 
 
 def _latency(fields: dict[str, object], text: str, option: str) -> Latency:
-    try:
-        return Latency.model_validate(fields)
-    except ValidationError as error:
-        raise UsageError(f"{option} {text}: {explain(error, Latency)}") from None
+    return validated(Latency, fields, f"{option} {text}")
 
 
 def _milliseconds(text: str) -> float | None:

@@ -13,8 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.policy.actions import Action
-from airl_mav.profiles.fields import ProfileModel, quantity
 
 ActionSetName = Literal["arc-25", "paper-25", "velocity"]
 

@@ -11,17 +11,16 @@ import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, Strict, ValidationError, model_validator
+from pydantic import Field, Strict, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.versioned import write_json
 from airl_mav.flight.setup import Level
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
 from airl_mav.policy.runtime import OnnxRuntime
-from airl_mav.profiles.fields import ProfileModel, quantity
-from airl_mav.profiles.loading import explain
 from airl_mav.profiles.vehicle import Camera
 
 SCHEMA = 1
@@ -135,10 +134,7 @@ def read_card(folder: Path) -> PolicyCard:
     schema = data.pop("schema", None) if isinstance(data, dict) else None
     if schema != SCHEMA:
         raise UsageError(f"{path}: schema = {schema!r}: accepted: {SCHEMA}")
-    try:
-        return PolicyCard.model_validate(data)
-    except ValidationError as error:
-        raise UsageError(f"{path}: {explain(error, PolicyCard)}") from None
+    return validated(PolicyCard, data, path)
 
 
 def read_model(folder: Path, card: PolicyCard) -> bytes:

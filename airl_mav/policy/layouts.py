@@ -21,9 +21,9 @@ from pydantic import model_validator
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import heading_to_ned
 from airl_mav.policy.observation import Observation
-from airl_mav.profiles.fields import ProfileModel, quantity
 
 LayoutName = Literal["body", "paper"]
 Encoded = dict[str, NDArray[Any]]

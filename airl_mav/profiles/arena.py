@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 from pydantic import Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 Numbers = TypeVar("Numbers", bound="tuple[float, ...]")

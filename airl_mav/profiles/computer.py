@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
 LONGEST_MS = 60_000.0

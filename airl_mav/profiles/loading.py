@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import range_of
+from airl_mav.core.fields import validated
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -55,10 +54,7 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """
     path = _path(kind, name)
     data = _read(kind, path, ())
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise UsageError(f"{path}: {explain(error, model)}") from None
+    return validated(model, data, path)
 
 
 def _path(kind: Kind, name: str) -> Path:
@@ -98,62 +94,3 @@ def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
         else:
             merged[key] = value
     return merged
-
-
-def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return a validation error's first finding as one line: field, value, accepted range."""
-    # A misspelt field also goes missing: its misspelling says more.
-    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    path = first["loc"]
-    field = ".".join(str(part) for part in path)
-    rest = error.error_count() - 1
-    tail = f" (and {rest} more)" if rest else ""
-    if first["type"] == "missing":
-        return f"{field}: missing{tail}"
-    if first["type"] == "extra_forbidden":
-        owner = _model_at(model, path[:-1])
-        names = list(owner.model_fields) if owner else []
-        near = difflib.get_close_matches(str(path[-1]), names, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"fields: {', '.join(names)}"
-        return f"{field}: unknown field; {hint}{tail}"
-    accepted = _accepted(model, path) or first["msg"]
-    table = _model_at(model, path) if first["type"] == "model_type" else None
-    if table is not None:
-        accepted = f"a table with the fields {', '.join(table.model_fields)}"
-    value = first["input"]
-    where = f"{field} = {value!r}" if field else "invalid"
-    if first["type"] == "value_error":
-        return f"{field + ': ' if field else ''}{first['msg'].removeprefix('Value error, ')}{tail}"
-    return f"{where}: accepted: {accepted}{tail}"
-
-
-def _model_at(model: type[BaseModel], path: tuple[Any, ...]) -> type[BaseModel] | None:
-    """Return the model that a location inside `model` points at."""
-    here: type[BaseModel] | None = model
-    for part in path:
-        if here is None:
-            return None
-        field = here.model_fields.get(str(part))
-        if field is not None:
-            here = _model_in(field.annotation)
-    return here
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the model an annotation holds, looking into unions and containers."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in get_args(annotation):
-        if (found := _model_in(inner)) is not None:
-            return found
-    return None
-
-
-def _accepted(model: type[BaseModel], path: tuple[Any, ...]) -> str:
-    """Return the declared range of the field at a location."""
-    for depth in range(len(path), 0, -1):
-        owner = _model_at(model, path[: depth - 1])
-        field = owner.model_fields.get(str(path[depth - 1])) if owner else None
-        if field is not None:
-            return range_of(field)
-    return ""

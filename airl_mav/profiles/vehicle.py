@@ -8,7 +8,7 @@ from pydantic import Field, Strict, model_validator
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
 

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from airl_mav.cli import train
 from airl_mav.cli.cells import Cell
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.flight.paper import ABLATION
 from airl_mav.flight.statistics import Aggregate
-from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.report.bars import Bar, Group, bars_picture
 from airl_mav.report.tables import NONE, Column, TableView
 from airl_mav.studies.parts import (
@@ -95,8 +95,8 @@ def prepare(config: AblationConfig, root: Path, console: Console) -> int:
         folder = each.trained_at(root)
         if each.training is None or (folder / "policy" / "card.json").exists():
             continue
-        command = train.Train(
-            each.training, out=folder, steps=each.steps, name=folder.name, resume=True
+        command = train.TrainOptions(
+            config=each.training, out=folder, steps=each.steps, name=folder.name, resume=True
         )
         words = ["airl", "train", each.training, "--out", f"{folder}", "--name", folder.name]
         words += [] if each.steps is None else ["--steps", f"{each.steps}"]

@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import Any, Generic, Literal, TypeVar
 
 import tyro
-from pydantic import Field, ValidationError
+from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.cells import Cell, FlownCell, check_root, fly_cells
 from airl_mav.cli.common import run_command
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import pool, stage_samples
-from airl_mav.profiles.fields import ProfileModel, quantity
-from airl_mav.profiles.loading import explain, load_profile
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.studies.sheet import DATA_FILE, Sheet, print_sheet, write_sheet
 
@@ -115,10 +115,7 @@ def load_config(study: Study[Config], path: Path, changes: Mapping[str, Any]) ->
     """Load a configuration with values put over it. Raises UsageError."""
     config = load_profile("studies", str(path), study.model)
     merged = _overlaid(config.model_dump(exclude_unset=True), changes)
-    try:
-        return study.model.model_validate(merged)
-    except ValidationError as error:
-        raise UsageError(f"{path}: {explain(error, study.model)}") from None
+    return validated(study.model, merged, path)
 
 
 def _overlaid(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,9 +8,9 @@ from pathlib import Path
 from pydantic import Field, model_validator
 
 from airl_mav.cli.cells import Cell
+from airl_mav.core.fields import ProfileModel
 from airl_mav.flight.gap import HardwareGap, hardware_gap, relative_gap
 from airl_mav.flight.paper import SYSTEM_EVALUATION, PaperFigures, SystemEvaluation, gap_of
-from airl_mav.profiles.fields import ProfileModel
 from airl_mav.report.tables import NONE, Column, TableView
 from airl_mav.studies.parts import (
     AGGREGATE,

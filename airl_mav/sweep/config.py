@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.arena import Each
-from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import discrete_actions
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.fields import ProfileModel, quantity
-from airl_mav.profiles.loading import explain
 
 SELECTION_SEED = 500_000
 """First seed of the episodes that choose the best checkpoint: neither those of training, which
@@ -193,7 +192,4 @@ def configured(
             "sensing_distance_m": sensing_distance_m,
             "max_acceleration_m_s2": max_acceleration_m_s2,
         }
-    try:
-        return TrainingConfig.model_validate(values)
-    except ValidationError as error:
-        raise UsageError(explain(error, TrainingConfig)) from None
+    return validated(TrainingConfig, values)

@@ -29,6 +29,7 @@ from rich.progress import Progress
 from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import MIN_SAMPLES, percentile
@@ -37,7 +38,6 @@ from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.arena import Each
-from airl_mav.profiles.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.cli.conformance import Conformance, run
+from airl_mav.cli.conformance import ConformanceOptions, run
 from airl_mav.conformance import vehicle_clock
 from airl_mav.conformance.checklist import (
     CheckDefinition,
@@ -411,14 +411,14 @@ def test_columns_say_where_they_come_from() -> None:
 )
 def test_input_that_cannot_be_used(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        run(Conformance(**options), Console(file=io.StringIO()))
+        run(ConformanceOptions(**options), Console(file=io.StringIO()))
     assert message in str(error.value)
 
 
 @pytest.mark.parametrize("url", ["nonsense", "udpin://127.0.0.1:not-a-port"])
 def test_a_connection_that_cannot_be(url: str) -> None:
     with pytest.raises(UsageError, match=re.escape(f"--connect {url}: ")):
-        run(Conformance(connect=url), Console(file=io.StringIO()))
+        run(ConformanceOptions(connect=url), Console(file=io.StringIO()))
 
 
 # --- what is heard

@@ -366,9 +366,9 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         ("dqn.zip", ["--algorithm", "DQN", "--fov", "200"], ["horizontal_fov_deg = 200", "< 170"]),
         ("dqn.zip", ["--algorithm", "DQN", "--range", "100"], ["range_m = 100", "<= 65 m"]),
         ("dqn.zip", ["--algorithm", "DQN", "--max-speed", "0"], ["max_speed_m_s = 0", "m/s"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--hold", "-1"], ["hold_s = -1", "0 <= value <= 10 s"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["epsilon = 1.5", "value <= 1"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["name = 'a b'"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--hold", "-1"], ["hold_s -1", "0 <= value <= 10 s"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["epsilon 1.5", "value <= 1"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["name 'a b'"]),
         (
             "sac.zip",
             ["--algorithm", "SAC", "--actions", "velocity", "--epsilon", "0.1"],

@@ -64,9 +64,9 @@ def test_the_sensing_distance() -> None:
             "one of them",
         ),
         ({"max_acceleration_m_s2": 4.0}, "with sensing_distance"),
-        ({"seed": -1}, "seed = -1"),
-        ({"steps": 0}, "steps = 0"),
-        ({"sensing_distance_m": 0.0}, "safe_velocity.sensing_distance_m = 0.0"),
+        ({"seed": -1}, "seed -1"),
+        ({"steps": 0}, "steps 0"),
+        ({"sensing_distance_m": 0.0}, "safe_velocity.sensing_distance_m 0"),
     ],
 )
 def test_what_does_not_go_together_gets_one_line(asked: dict[str, Any], told: str) -> None:

@@ -10,8 +10,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import range_of, unit_of
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.fields import range_of, unit_of
 from airl_mav.profiles.loading import load_profile
 
 
@@ -91,7 +91,7 @@ def test_every_number_has_meaning_unit_and_range() -> None:
         ),
         (
             "[static]\nshapes = ['cone']",
-            "static.shapes.0 = 'cone': accepted: Input should be 'box'",
+            "static.shapes.0 = 'cone': accepted: 'box'",
         ),
         ("[static]\nshapes = []", "static.shapes = []: accepted: "),
         (

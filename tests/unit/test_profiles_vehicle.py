@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from airl_mav.core.errors import UsageError
-from airl_mav.profiles.fields import ProfileModel, quantity, range_of, unit_of
+from airl_mav.core.errors import UsageError, shown
+from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.loading import list_profiles, load_profile, profiles_dir
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -140,7 +140,7 @@ def test_a_number_out_of_range_is_refused_with_its_range(tmp_path: Path, path: s
         value: float = bound + step * max(1.0, abs(bound))
         value = int(value) if whole else float(value)
         message = refusal(tmp_path, edit(path, f"{name} = {value!r}"))
-        assert message == f"{path} = {value!r}: accepted: {range_of(field)}"
+        assert message == f"{path} = {shown(value)}: accepted: {range_of(field)}"
 
 
 @pytest.mark.parametrize("path", REQUIRED)

@@ -1,0 +1,199 @@
+"""Fields of profiles, cards and scenarios: a value with a meaning, a unit and a range.
+
+Declared once with `quantity`; `validated` reads input as a model, `field_error` turns what pydantic
+says of wrong input into one line.
+"""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticUndefined
+
+from airl_mav.core.errors import FieldError, UsageError, shown
+
+Model = TypeVar("Model", bound=BaseModel)
+
+MOST_NAMES = 40
+"""Names of fields that a message lists."""
+
+TYPES = {
+    "bool_parsing": "true or false",
+    "bool_type": "true or false",
+    "dict_type": "a table",
+    "finite_number": "a finite number",
+    "float_parsing": "a number",
+    "float_type": "a number",
+    "int_from_float": "a whole number",
+    "int_parsing": "a whole number",
+    "int_type": "a whole number",
+    "list_type": "a list",
+    "none_required": "none",
+    "string_type": "a text",
+    "tuple_type": "a list",
+}
+"""What is accepted, by pydantic's names of errors of type."""
+
+
+class ProfileModel(BaseModel):
+    """Base of all profile models: immutable, unknown fields refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def quantity(
+    description: str,
+    unit: str,
+    *,
+    ge: float | None = None,
+    gt: float | None = None,
+    le: float | None = None,
+    lt: float | None = None,
+    default: Any = PydanticUndefined,
+) -> Any:
+    """Declare a number, an optional number or a list of numbers, with its unit and range.
+
+    Args:
+        description: What the number means.
+        unit: Its unit, "1" when it has none.
+        ge: Least value allowed.
+        gt: Value that it must exceed.
+        le: Greatest value allowed.
+        lt: Value that it must stay below.
+        default: Value when it is left out; none means that it is required.
+    """
+    scalar = any(bound is not None for bound in (ge, gt, le, lt))
+    return Field(
+        default=default,
+        description=description,
+        # Strict, or true and "1.5" would pass for numbers; a tuple in strict mode refuses lists.
+        strict=True if scalar else None,
+        ge=ge,
+        gt=gt,
+        le=le,
+        lt=lt,
+        json_schema_extra={"unit": unit},
+    )
+
+
+def unit_of(field: FieldInfo) -> str | None:
+    """Return the unit a field was declared with."""
+    extra = field.json_schema_extra
+    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else None
+
+
+def range_of(field: FieldInfo) -> str:
+    """Return the accepted range of a field as text: "0 < value <= 10 kg", or "" when unbounded."""
+    low = high = ""
+    for bound in field.metadata:
+        for sign, name in (("<", "gt"), ("<=", "ge")):
+            if getattr(bound, name, None) is not None:
+                low = f"{shown(getattr(bound, name))} {sign} "
+        for sign, name in (("<", "lt"), ("<=", "le")):
+            if getattr(bound, name, None) is not None:
+                high = f" {sign} {shown(getattr(bound, name))}"
+    unit = unit_of(field)
+    if not low and not high:
+        return ""
+    return f"{low}value{high}" + (f" {unit}" if unit and unit != "1" else "")
+
+
+def validated(model: type[Model], data: object, source: object = None) -> Model:
+    """Return data as a model.
+
+    Args:
+        model: The model.
+        data: What was read or given.
+        source: The file, or the options, that it comes from, for messages about it.
+
+    Raises:
+        UsageError: A field is missing, unknown, of the wrong type or out of range; a `FieldError`
+            where there is no source to name.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        found = field_error(error, model)
+        if source is None:
+            raise found from None
+        raise UsageError(f"{source}: {found.line(sign=' = ')}") from None
+
+
+def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> FieldError:
+    """Return the first finding of a failed validation as an error of one line.
+
+    Args:
+        error: What pydantic raised.
+        model: The model that was validated, whose fields say their ranges and names; None for
+            anything else that pydantic validates, a dataclass above all.
+    """
+    findings = error.errors(include_url=False)
+    # A misspelt field also goes missing: its misspelling says more.
+    first = min(findings, key=lambda finding: finding["type"] != "extra_forbidden")
+    tail = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
+    path, kind = first["loc"], first["type"]
+    field = ".".join(str(part) for part in path)
+    if kind == "missing":
+        return FieldError(field, problem=f"missing{tail}")
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        names = _field_names(model, path[:-1])
+        near = difflib.get_close_matches(str(path[-1])[:100], names, n=1)
+        listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
+        hint = f"; did you mean {near[0]!r}?" if near else f"; fields: {listed}" if names else ""
+        return FieldError(field, problem=f"unknown field{hint}{tail}")
+    if kind == "value_error":
+        return FieldError(field, problem=first["msg"].removeprefix("Value error, ") + tail)
+    return FieldError(field, first["input"], _accepted(first, model) + tail)
+
+
+def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:
+    """Return what would have been accepted in place of a wrong value."""
+    path, kind = finding["loc"], finding["type"]
+    if kind in ("model_type", "dataclass_type", "model_attributes_type"):
+        names = _field_names(model, path)
+        return f"a table with the fields {', '.join(names)}" if names else "a table"
+    if kind in ("literal_error", "enum"):
+        return str(finding["ctx"]["expected"])
+    if kind == "string_pattern_mismatch":
+        return f"a text that matches {finding['ctx']['pattern']}"
+    return _declared_range(model, path) or TYPES.get(kind) or finding["msg"]
+
+
+def _declared_range(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
+    """Return the declared range of the innermost field on the way to a location, "" for none."""
+    for depth in range(len(path), 0, -1):
+        owner = _model_at(model, path[: depth - 1])
+        field = owner.model_fields.get(str(path[depth - 1])) if owner else None
+        if field is not None:
+            return range_of(field)
+    return ""
+
+
+def _field_names(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> list[str]:
+    owner = _model_at(model, path)
+    return list(owner.model_fields) if owner else []
+
+
+def _model_at(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> type[BaseModel] | None:
+    """Return the model that a location inside `model` points at."""
+    here = model
+    for part in path:
+        if here is None:
+            return None
+        field = here.model_fields.get(str(part))
+        if field is not None:
+            here = _model_in(field.annotation)
+    return here
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the model an annotation holds, looking into unions and containers."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for inner in get_args(annotation):
+        if (found := _model_in(inner)) is not None:
+            return found
+    return None
