@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 from rich.console import Console
 
 from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 
 
 class ConformanceOptions(BaseModel):
@@ -41,7 +41,7 @@ class ConformanceOptions(BaseModel):
         default=1.0,
         description="simulated seconds per wall second of the vehicle; 1 for a real one",
     )
-    altitude: float = Field(
+    altitude_m: float = Field(
         default=10.0,
         description="take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down"
         " while it waits for setpoints",
@@ -61,7 +61,7 @@ class ConformanceOptions(BaseModel):
         default=False,
         description="check neither refusals nor frames, offboard loss or hold: fly the steps",
     )
-    connect_timeout: float = Field(
+    connect_timeout_s: float = Field(
         default=30.0,
         description="how long a flight controller is waited for, 1 to 3600 s of wall time",
     )
@@ -71,7 +71,10 @@ class ConformanceOptions(BaseModel):
 
 
 OPTIONS = ConformanceOptions
-RENAMED_OPTIONS: dict[str, tuple[str, ...]] = {}
+RENAMED_OPTIONS = {
+    "--altitude": ("--altitude-m",),
+    "--connect-timeout": ("--connect-timeout-s",),
+}
 EXTRAS = ()
 
 
@@ -95,23 +98,23 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
 
     console = console or Console()
     if options.out is not None and not options.out.parent.is_dir():
-        raise UsageError(f"--out {options.out}: no folder {options.out.parent}")
+        raise FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
     if options.skip_steps and (options.steps_only or options.steps):
         other = "--steps-only" if options.steps_only else "--steps"
-        raise UsageError(f"--skip-steps: accepted: without {other}")
+        raise FieldError("skip_steps", accepted=f"without {other}")
     if options.steps == ():
-        raise UsageError("--steps: accepted: one name or more")
+        raise FieldError("steps", accepted="one name or more")
     steps: Any = () if options.skip_steps else options.steps or STEP_NAMES
     with _sigterm_as_ctrl_c():
         result = check_conformance(
             options.connect,
             reference=options.reference,
             speed=options.speed,
-            altitude_m=options.altitude,
+            altitude_m=options.altitude_m,
             steps=steps,
             repeat=options.repeat,
             steps_only=options.steps_only,
-            connect_timeout_s=options.connect_timeout,
+            connect_timeout_s=options.connect_timeout_s,
             progress=lambda line: console.print(line_text(line), soft_wrap=True),
         )
     if result.steps and result.reference is not None:

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from airl_mav.cli.common import check_train_installed
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.core.provenance import package_versions
 from airl_mav.flight.judge import GOAL_RADIUS_M
@@ -55,21 +55,23 @@ class ExportOptions(BaseModel):
         description="width x height of the image that the network sees, px; `paper`: with its"
         " strip",
     )
-    fov: float = Field(default=90.0, description="horizontal field of view of the camera, deg")
-    range: float = Field(default=20.0, description="depth from which on everything looks far, m")
+    horizontal_fov_deg: float = Field(
+        default=90.0, description="horizontal field of view of the camera, deg"
+    )
+    range_m: float = Field(default=20.0, description="depth from which on everything looks far, m")
     actions: ActionSetName = Field(
         default="arc-25", description="action set that the model was trained with"
     )
-    max_speed: float = Field(default=PAPER_SPEED_M_S, description="fastest action, m/s")
-    hold: float = Field(
+    max_speed_m_s: float = Field(default=PAPER_SPEED_M_S, description="fastest action, m/s")
+    hold_s: float = Field(
         default=PilotSettings.hold_s,
         description="t3: how long an action is held before the next observation, s",
     )
-    goal_radius: float = Field(default=GOAL_RADIUS_M, description="radius of the goal, m")
-    altitude: float = Field(
+    goal_radius_m: float = Field(default=GOAL_RADIUS_M, description="radius of the goal, m")
+    altitude_m: float = Field(
         default=PilotSettings.altitude_m, description="height above the start that is flown, m"
     )
-    hover_after: float | None = Field(
+    hover_after_s: float | None = Field(
         default=None,
         description="age of a command at which the vehicle hovered in training, s; by default the"
         " last one flew on",
@@ -84,7 +86,15 @@ class ExportOptions(BaseModel):
 
 
 OPTIONS = ExportOptions
-RENAMED_OPTIONS: dict[str, tuple[str, ...]] = {}
+RENAMED_OPTIONS = {
+    "--fov": ("--horizontal-fov-deg",),
+    "--range": ("--range-m",),
+    "--max-speed": ("--max-speed-m-s",),
+    "--hold": ("--hold-s",),
+    "--goal-radius": ("--goal-radius-m",),
+    "--altitude": ("--altitude-m",),
+    "--hover-after": ("--hover-after-s",),
+}
 EXTRAS = ("train",)
 
 
@@ -115,26 +125,17 @@ def _facts(options: ExportOptions) -> PolicyFacts:
     """Return what the options say about the policy. Raises UsageError."""
     size = re.fullmatch(r"(\d{1,4})x(\d{1,4})", options.image)
     if size is None:
-        raise UsageError(f"--image {options.image!r}: accepted: WIDTHxHEIGHT in px, as 32x24")
-    image = {
-        "layout": options.layout,
-        "width_px": int(size[1]),
-        "height_px": int(size[2]),
-        "horizontal_fov_deg": options.fov,
-        "range_m": options.range,
-    }
-    speed = {"set": options.actions, "max_speed_m_s": options.max_speed}
-    facts = {
+        raise FieldError("image", options.image, "WIDTHxHEIGHT in px, as 32x24")
+    image = {"layout": options.layout, "width_px": int(size[1]), "height_px": int(size[2])}
+    camera = options.model_dump(include={"horizontal_fov_deg", "range_m"})
+    speed = {"set": options.actions, "max_speed_m_s": options.max_speed_m_s}
+    facts = options.model_dump(
+        include={"description", "hold_s", "goal_radius_m", "altitude_m", "hover_after_s"}
+        | {"algorithm", "epsilon"}
+    ) | {
         "name": options.name if options.name is not None else options.out.resolve().name,
-        "description": options.description,
-        "observation": validated(ObservationSpec, image, "--image, --fov, --range"),
-        "actions": validated(ActionSpec, speed, "--max-speed"),
-        "hold_s": options.hold,
-        "goal_radius_m": options.goal_radius,
-        "altitude_m": options.altitude,
-        "hover_after_s": options.hover_after,
-        "algorithm": options.algorithm,
-        "epsilon": options.epsilon,
+        "observation": validated(ObservationSpec, image | camera),
+        "actions": validated(ActionSpec, speed),
         "training": Training(
             command=shlex.join(["airl", *sys.argv[1:]]),
             versions=package_versions(),

@@ -54,14 +54,14 @@ class TrainOptions(BaseModel):
         description="sources of t2 in place of computer and workload, as airl evaluate takes them:"
         " 150ms, lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE; of several, each episode draws one",
     )
-    sensing_distance: float | None = Field(
+    sensing_distance_m: float | None = Field(
         default=None,
         description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
         " longest latency, stops within so many metres; by default the configuration's, or not",
     )
-    max_acceleration: float | None = Field(
+    max_acceleration_m_s2: float | None = Field(
         default=None,
-        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance;"
+        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance-m;"
         " by default what the vehicle's tilt limit and thrust permit",
     )
     steps: int | None = Field(
@@ -80,6 +80,10 @@ class TrainOptions(BaseModel):
 
 
 OPTIONS = TrainOptions
+RENAMED_OPTIONS = {
+    "--sensing-distance": ("--sensing-distance-m",),
+    "--max-acceleration": ("--max-acceleration-m-s2",),
+}
 EXTRAS = ("sim", "train")
 
 
@@ -103,8 +107,8 @@ def run(
         computer=options.computer,
         workload=options.workload,
         latency=options.latency,
-        sensing_distance_m=options.sensing_distance,
-        max_acceleration_m_s2=options.max_acceleration,
+        sensing_distance_m=options.sensing_distance_m,
+        max_acceleration_m_s2=options.max_acceleration_m_s2,
     )
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     check_train_installed()

@@ -13,7 +13,7 @@ from airl_mav.conformance.step_response import StepResponse
 from airl_mav.conformance.steps import STEP_NAMES, MeasuredStep, StepName
 from airl_mav.conformance.telemetry import Fields
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.versioned import write_json
 
 SCHEMA = 1
@@ -43,10 +43,10 @@ class Settings:
             ("connect_timeout_s", self.connect_timeout_s, 1.0, 3600.0),
         ):
             if not low <= value <= high:
-                raise UsageError(f"{name} {value:.10g}: accepted: {low:g} <= value <= {high:g}")
+                raise FieldError(name, value, f"{low:g} <= value <= {high:g}")
         for step in self.steps:
             if step not in STEP_NAMES:
-                raise UsageError(f"steps {step}: accepted: {', '.join(STEP_NAMES)}")
+                raise FieldError("steps", step, ", ".join(STEP_NAMES))
 
 
 @dataclass

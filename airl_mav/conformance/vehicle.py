@@ -88,7 +88,7 @@ class Vehicle:
         if system is None:
             raise UsageError(
                 f"--connect {self.url}: no flight controller heard in {timeout_s:g} s "
-                "(--connect-timeout)"
+                "(--connect-timeout-s)"
             )
         self._target = system.get_system_id()
         self._direct = MavlinkDirect(system)

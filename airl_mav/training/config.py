@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import discrete_actions
@@ -172,13 +172,13 @@ def configured(
     """
     if computer is not None and workload is None:
         known = ", ".join(load_computer(computer).workloads)
-        raise UsageError(f"computer {computer}: takes workload: {known}")
+        raise FieldError("computer", computer, problem=f"takes workload: {known}")
     if computer is None and workload is not None:
-        raise UsageError(f"workload {workload}: accepted: with computer")
+        raise FieldError("workload", workload, "with computer")
     if computer is not None and latency:
-        raise UsageError("latency with computer: accepted: one of them")
+        raise FieldError("latency", latency, "without computer")
     if max_acceleration_m_s2 is not None and sensing_distance_m is None:
-        raise UsageError("max_acceleration: accepted: with sensing_distance")
+        raise FieldError("max_acceleration_m_s2", max_acceleration_m_s2, "with sensing_distance_m")
     values: dict[str, Any] = config.model_dump(exclude_unset=True)
     values |= {k: v for k, v in {"seed": seed, "steps": steps}.items() if v is not None}
     environment = values.setdefault("environment", {})

@@ -395,18 +395,18 @@ def test_columns_say_where_they_come_from() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": ("north-3",)}, "steps north-3: accepted: north-2, "),
-        ({"steps": ()}, "--steps: accepted: one name or more"),
+        ({"steps": ("north-3",)}, "steps 'north-3': accepted: north-2, "),
+        ({"steps": ()}, "steps: accepted: one name or more"),
         ({"speed": 0.0}, "speed 0: accepted: 0.01 <= value <= 100"),
         ({"speed": math.nan}, "speed nan: accepted: 0.01 <= value <= 100"),
-        ({"altitude": 7.0}, "altitude_m 7: accepted: 8 <= value <= 100"),
-        ({"altitude": 1.0, "steps_only": True}, "altitude_m 1: accepted: 2 <= value <= 100"),
+        ({"altitude_m": 7.0}, "altitude_m 7: accepted: 8 <= value <= 100"),
+        ({"altitude_m": 1.0, "steps_only": True}, "altitude_m 1: accepted: 2 <= value <= 100"),
         ({"repeat": 0}, "repeat 0: accepted: 1 <= value <= 20"),
-        ({"connect_timeout": 0.0}, "connect_timeout_s 0: accepted: 1 <= value <= 3600"),
+        ({"connect_timeout_s": 0.0}, "connect_timeout_s 0: accepted: 1 <= value <= 3600"),
         ({"reference": "betaflight"}, "'betaflight'; shipped: ardupilot, ardupilot-own-model, px4"),
-        ({"out": Path("no/such/folder/x.json")}, "--out no/such/folder/x.json: no folder"),
-        ({"skip_steps": True, "steps_only": True}, "--skip-steps: accepted: without --steps-only"),
-        ({"skip_steps": True, "steps": ("yaw-90",)}, "--skip-steps: accepted: without --steps"),
+        ({"out": Path("no/such/folder/x.json")}, "out 'no/such/folder/x.json': no folder"),
+        ({"skip_steps": True, "steps_only": True}, "skip_steps: accepted: without --steps-only"),
+        ({"skip_steps": True, "steps": ("yaw-90",)}, "skip_steps: accepted: without --steps"),
     ],
 )
 def test_input_that_cannot_be_used(options: dict[str, Any], message: str) -> None:

@@ -61,9 +61,9 @@ def test_the_sensing_distance() -> None:
         ({"workload": "template-5x32"}, "with computer"),
         (
             {"computer": "ras-pi-4", "workload": "template-5x32", "latency": ("150ms",)},
-            "one of them",
+            "without computer",
         ),
-        ({"max_acceleration_m_s2": 4.0}, "with sensing_distance"),
+        ({"max_acceleration_m_s2": 4.0}, "with sensing_distance_m"),
         ({"seed": -1}, "seed -1"),
         ({"steps": 0}, "steps 0"),
         ({"sensing_distance_m": 0.0}, "safe_velocity.sensing_distance_m 0"),
