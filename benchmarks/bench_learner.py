@@ -20,9 +20,9 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.training.algorithms import BATCH, make_model
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import count_parameters
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 SIZES = ((32, 24), (64, 48))
 NETWORKS = {"small": NetworkSpec(), "appendix": NetworkSpec(kind="appendix")}

@@ -28,8 +28,8 @@ from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import DEFAULT_POLICY
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.export import random_inputs
-from airl_mav.training.sb3_export import network_of
+from airl_mav.training.export import network_of
+from airl_mav.training.onnx_export import random_inputs
 
 CALLS = 5000
 WARM_UP = 200

@@ -1,36 +1,84 @@
-"""`airl conformance`: one script against any flight controller."""
+"""`airl conformance`: check any flight controller."""
 
 from __future__ import annotations
 
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
+from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.cli.common import EXIT_BROKEN, EXIT_INTERRUPTED, check_range
-from airl_mav.cli.conformance_command import ConformanceCommand
-from airl_mav.conformance.checks import Checklist
-from airl_mav.conformance.reference import AUTO, load_reference
-from airl_mav.conformance.report import as_data, check_table, line_text, step_table, verdict
-from airl_mav.conformance.sequence import Examination, Findings, examine
-from airl_mav.conformance.session import Session
-from airl_mav.conformance.steps import STEP_NAMES, StepName
-from airl_mav.conformance.transcript import Line, Transcript
-from airl_mav.core.clock import WallClock
-from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import write_json
-
-STYLES = {"sent": "cyan", "heard": "", "check": "bold", "note": "dim"}
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
+from airl_mav.rehearsal.signals import terminated_as_interrupted
 
 
-def run(command: ConformanceCommand, console: Console | None = None) -> int:
-    """Examine a vehicle and say what came out.
+class ConformanceOptions(BaseModel):
+    """Fly any flight controller through checks and step responses: airl-firmware, PX4, ArduPilot.
+
+    SITL or a board. It takes off. Once through it needs 60 m to the north, 20 m to the east and
+    15 m above the take-off altitude; Ctrl-C lands. Exit status 1: a check failed.
+
+    Examples:
+        airl-firmware --arena open-field
+        airl conformance --connect udpin://127.0.0.1:14540 --out result.json
+    """
+
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    reference: str = Field(
+        default="auto",
+        description="stored step responses to compare with: auto (by the autopilot that is heard),"
+        " px4, ardupilot, or a path to a .toml",
+    )
+    speed: float = Field(
+        default=1.0,
+        description="simulated seconds per wall second of the vehicle; 1 for a real one",
+    )
+    altitude_m: float = Field(
+        default=10.0,
+        description="take-off altitude, 8 to 100 m, with --steps-only from 2 m: PX4 comes down"
+        " while it waits for setpoints",
+    )
+    repeat: int = Field(
+        default=1,
+        description="how often the steps are flown, 1 to 20: the table has the median; every other"
+        " time they are mirrored, so that the vehicle comes back",
+    )
+    steps: tuple[str, ...] | None = Field(
+        default=None,
+        description="names of the steps to fly, as north-2 yaw-90 (docs/conformance.md); by default"
+        " all",
+    )
+    skip_steps: bool = Field(default=False, description="fly no step responses")
+    steps_only: bool = Field(
+        default=False,
+        description="check neither refusals nor frames, offboard loss or hold: fly the steps",
+    )
+    connect_timeout_s: float = Field(
+        default=30.0,
+        description="how long a flight controller is waited for, 1 to 3600 s of wall time",
+    )
+    out: Path | None = Field(
+        default=None, description="write everything to this .json; by default nothing"
+    )
+
+
+OPTIONS = ConformanceOptions
+RENAMED_OPTIONS = {
+    "--altitude": ("--altitude-m",),
+    "--connect-timeout": ("--connect-timeout-s",),
+}
+EXTRAS = ()
+
+
+def run(options: ConformanceOptions, console: Console | None = None) -> int:
+    """Check a vehicle and print the result.
 
     Args:
-        command: What was asked for.
+        options: What is asked for.
         console: Where to print; None means standard output.
 
     Returns:
@@ -38,88 +86,40 @@ def run(command: ConformanceCommand, console: Console | None = None) -> int:
         Ctrl-C, after landing.
 
     Raises:
-        UsageError: The input cannot be used, or nobody is heard.
+        UsageError: As `check_conformance`, or --out cannot be written.
     """
+    from airl_mav.conformance.report import check_table, line_text, step_table
+    from airl_mav.conformance.run import check_conformance
+    from airl_mav.conformance.steps import STEP_NAMES
+
     console = console or Console()
-    asked = examination(command)
-
-    def show(line: Line) -> None:
-        console.print(
-            line_text(line), style=STYLES[line.kind], markup=False, highlight=False, soft_wrap=True
+    if options.out is not None and not options.out.parent.is_dir():
+        raise FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
+    if options.skip_steps and (options.steps_only or options.steps):
+        other = "--steps-only" if options.steps_only else "--steps"
+        raise FieldError("skip_steps", accepted=f"without {other}")
+    if options.steps == ():
+        raise FieldError("steps", accepted="one name or more")
+    steps: Any = () if options.skip_steps else options.steps or STEP_NAMES
+    with terminated_as_interrupted():
+        result = check_conformance(
+            options.connect,
+            reference=options.reference,
+            speed=options.speed,
+            altitude_m=options.altitude_m,
+            steps=steps,
+            repeat=options.repeat,
+            steps_only=options.steps_only,
+            connect_timeout_s=options.connect_timeout_s,
+            progress=lambda line: console.print(line_text(line), soft_wrap=True),
         )
-
-    transcript = Transcript(WallClock(command.speed), show)
-    findings = Findings(Checklist(transcript))
-    with closing(Session(command.connect, command.speed, transcript)) as session, _ended_gently():
-        transcript.say("note", f"waiting for a flight controller on {command.connect}")
-        session.connect(command.connect_timeout)
-        examine(session, asked, findings)
-        data = as_data(session, asked, findings)
-    if findings.flown and findings.reference is not None:
-        console.print(step_table(findings, findings.reference))
-    console.print(check_table(findings.checklist.checks))
-    passed = data["passed"]
-    console.print(
-        verdict(findings),
-        style="bold green" if passed else "bold red",
-        markup=False,
-        soft_wrap=True,
-    )
-    if command.out is not None:
-        try:
-            write_json(command.out, data)
-        except OSError as error:
-            raise UsageError(f"--out {command.out}: {error.strerror}") from None
-    if findings.interrupted:
+    if result.steps and result.reference is not None:
+        console.print(step_table(result, result.reference))
+    console.print(check_table(result))
+    style = "bold green" if result.passed else "bold red"
+    console.print(result.verdict, style=style, markup=False, soft_wrap=True)
+    if options.out is not None:
+        result.write(options.out)
+    if result.interrupted:
         return EXIT_INTERRUPTED
-    return 0 if passed else EXIT_BROKEN
-
-
-def examination(command: ConformanceCommand) -> Examination:
-    """Check the command and return what it asks for. Raises UsageError."""
-    check_range("--speed", command.speed, 0.01, 100.0)
-    check_range("--altitude", command.altitude, 2.0 if command.steps_only else 8.0, 100.0)
-    check_range("--repeat", command.repeat, 1, 20)
-    check_range("--connect-timeout", command.connect_timeout, 1.0, 3600.0)
-    if command.out is not None and not command.out.parent.is_dir():
-        raise UsageError(f"--out {command.out}: no folder {command.out.parent}")
-    if command.reference != AUTO:
-        load_reference(command.reference, 0)
-    if command.skip_steps and (command.steps_only or command.steps):
-        other = "--steps-only" if command.steps_only else "--steps"
-        raise UsageError(f"--skip-steps: accepted: without {other}")
-    return Examination(
-        reference=command.reference,
-        altitude_m=command.altitude,
-        steps=() if command.skip_steps else _steps(command),
-        repeat=command.repeat,
-        behaviour=not command.steps_only,
-    )
-
-
-def _steps(command: ConformanceCommand) -> tuple[StepName, ...]:
-    if command.steps is None:
-        return STEP_NAMES
-    for name in command.steps:
-        if name not in STEP_NAMES:
-            raise UsageError(f"--steps {name}: accepted: {', '.join(STEP_NAMES)}")
-    if not command.steps:
-        raise UsageError("--steps: accepted: one name or more")
-    return cast(tuple[StepName, ...], command.steps)
-
-
-@contextmanager
-def _ended_gently() -> Iterator[None]:
-    """Let SIGTERM do what Ctrl-C does: land."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(_signal: int, _frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    old = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, old)
+    return 0 if result.passed else EXIT_BROKEN

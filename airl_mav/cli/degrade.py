@@ -24,8 +24,7 @@ from airl_mav.scenario.model import (
 
 
 class DegradeOptions(Flights, Lateness, Decisions, Aircraft):
-    """Fly policies at growing latencies on the same seeds: success, time, distance, energy as
-    curves.
+    """Fly policies at growing latencies on the same seeds: what every step costs, as curves.
 
     The same --out goes on with what was interrupted.
 

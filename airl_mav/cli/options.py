@@ -70,11 +70,8 @@ def read_options(
     if takes_file and words and words[0].endswith(".toml"):
         file, words = Path(words[0]), words[1:]
         held = read_scenario_file(file)
-    try:
-        defaults = validated(model, held)
-    except FieldError as error:
-        raise UsageError(f"{file}: {error.line(sign=' = ')}") from None
-    parsed = tyro.cli(_arguments(model, defaults), prog=prog, description=model.__doc__, args=words)
+        validated(model, held, file)
+    parsed = tyro.cli(_arguments(model, held), prog=prog, description=model.__doc__, args=words)
     try:
         return validated(model, dataclasses.asdict(parsed))
     except FieldError as error:
@@ -130,7 +127,7 @@ def _positionals(model: type[BaseModel]) -> list[str]:
     return [name for name, field in model.model_fields.items() if POSITIONAL in field.metadata]
 
 
-def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
+def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
     """Return the dataclass that tyro reads into: the model's types and defaults without its
     ranges.
     """
@@ -140,10 +137,10 @@ def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
         model.model_fields, key=lambda name: POSITIONAL not in model.model_fields[name].metadata
     )
     for name in names:
-        field, default = model.model_fields[name], getattr(defaults, name)
+        field = model.model_fields[name]
         kind: Any = field.annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel):
-            inner = _arguments(kind, default)
+            inner = _arguments(kind, held.get(name, {}))
             prefix = name in PREFIXED
             kind = inner if prefix else Annotated[(inner, tyro.conf.OmitArgPrefixes)]
             fields.append((name, kind, dataclasses.field(default_factory=inner)))
@@ -154,10 +151,23 @@ def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
                 tyro.conf.Positional,
                 tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
             ]
-        fields.append((name, Annotated[(kind, *marks)], dataclasses.field(default=default)))
+        fields.append(
+            (
+                name,
+                Annotated[(kind, *marks)],
+                dataclasses.field(default=_default(field, held.get(name))),
+            )
+        )
     made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)
     made.__doc__ = model.__doc__
     return made
+
+
+def _default(field: FieldInfo, held: Any) -> Any:
+    """Return what an option is when it is not given: as the file says, else as the model says."""
+    if held is not None:
+        return tuple(held) if isinstance(held, list) else held
+    return tyro.MISSING if field.is_required() else field.get_default(call_default_factory=True)
 
 
 def _metavar(name: str, kind: Any) -> str:

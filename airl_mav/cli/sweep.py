@@ -167,6 +167,6 @@ def _executor(options: SweepOptions) -> ExecutorSettings:
 
         if not torch.cuda.is_available():
             raise FieldError("device", "cuda", "cpu: torch finds no GPU here")
-    data = {name: getattr(command, name) for name in ("executor", "workers", "ray_address")}
+    data = {name: getattr(options, name) for name in Workers.model_fields}
     default = 1.0 if options.device == "cuda" else 0.0
     return validated(ExecutorSettings, data | {"ray_gpus": default if gpus is None else gpus})

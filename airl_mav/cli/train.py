@@ -5,146 +5,168 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
+from functools import partial
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, Annotated
 
+from pydantic import BaseModel, Field
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from airl_mav.cli.common import (
-    EXIT_INTERRUPTED,
-    GREATEST_SEED,
-    check_range,
-    check_train_installed,
-)
-from airl_mav.cli.train_command import TrainCommand
-from airl_mav.cli.train_environment import environment_of
-from airl_mav.envs.delay import bounded, injections_of, speed_bound
+from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.errors import EXIT_INTERRUPTED
+from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.loading import load_profile
-from airl_mav.training.config import TrainingConfig
-from airl_mav.training.store import Evaluation, TrainingFolder
+
+if TYPE_CHECKING:
+    from airl_mav.training.store import Evaluation
 
 
-def run(command: TrainCommand, console: Console | None = None, *, words: str | None = None) -> int:
-    """Train, export, and say what came out.
+class TrainOptions(BaseModel):
+    """Train a policy; the best weights are exported as policy.onnx with their card.
 
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
-        words: The command line that makes the policy, for its card; None: that of this process.
-
-    Returns:
-        Exit status: 0 trained to the end, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used; nothing was trained.
+    Examples:
+        airl train static-obstacles --out runs/mine
+        airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
     """
+
+    config: Annotated[str, POSITIONAL] = Field(
+        default="static-obstacles",
+        description="training configuration: a shipped name, or a path to a .toml",
+    )
+    out: Path | None = Field(
+        default=None, description="folder of the run; by default runs/train-<config>"
+    )
+    seed: int | None = Field(
+        default=None,
+        description="seed of weights, exploration and episodes; by default the configuration's",
+    )
+    computer: str | None = Field(
+        default=None,
+        description="decide as late as this computer in training: a shipped profile, or a path to"
+        " a .toml; takes --workload; by default the configuration's",
+    )
+    workload: str | None = Field(
+        default=None,
+        description="workload of that computer whose latency t2 is drawn in every decision",
+    )
+    latency: tuple[str, ...] = Field(
+        default=(),
+        description="sources of t2 in place of computer and workload, as airl evaluate takes them:"
+        " 150ms, lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE; of several, each episode draws one",
+    )
+    sensing_distance_m: float | None = Field(
+        default=None,
+        description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
+        " longest latency, stops within so many metres; by default the configuration's, or not",
+    )
+    max_acceleration_m_s2: float | None = Field(
+        default=None,
+        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance-m;"
+        " by default what the vehicle's tilt limit and thrust permit",
+    )
+    steps: int | None = Field(
+        default=None,
+        description="decisions of all vehicles together; by default the configuration's",
+    )
+    name: str | None = Field(
+        default=None,
+        description="name of the policy on its card; by default the configuration's",
+    )
+    resume: bool = Field(
+        default=False,
+        description="continue the run in --out from its newest checkpoint; start it if there is"
+        " none",
+    )
+
+
+OPTIONS = TrainOptions
+RENAMED_OPTIONS = {
+    "--sensing-distance": ("--sensing-distance-m",),
+    "--max-acceleration": ("--max-acceleration-m-s2",),
+}
+EXTRAS = ("sim", "train")
+
+
+def run(
+    options: TrainOptions, console: Console | None = None, *, command_line: str | None = None
+) -> int:
+    """Train, export, and print the result; `command_line` is noted on the card.
+
+    Returns the exit status: 0 trained to the end, 130 Ctrl-C. Raises UsageError as
+    `airl_mav.training.run.train`.
+    """
+    from airl_mav.envs.delay import injections_of, speed_bound
+    from airl_mav.training.config import TrainingConfig, configured
+
     console = console or Console()
-    config = _config(command)
-    bound = speed_bound(config.environment)
-    config = config.model_copy(update={"environment": bounded(config.environment)})
-    check_train_installed()
-    stem = Path(command.config).stem
-    path = command.out or Path("runs") / f"train-{stem}"
-    signal.signal(signal.SIGTERM, _interrupt)
-    words = shlex.join(["airl", *sys.argv[1:]]) if words is None else words
+    show = partial(console.print, soft_wrap=True, highlight=False)
+    config = configured(
+        load_profile("training", options.config, TrainingConfig),
+        seed=options.seed,
+        steps=options.steps,
+        computer=options.computer,
+        workload=options.workload,
+        latency=options.latency,
+        sensing_distance_m=options.sensing_distance_m,
+        max_acceleration_m_s2=options.max_acceleration_m_s2,
+    )
+    bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
+    check_installed("train")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
     from airl_mav.training.run import train
 
-    if command.resume and (path / "train.json").exists():
-        folder = TrainingFolder.open(path, config)
-    else:
-        folder = TrainingFolder.create(path, config, words)
-    console.print(f"training   {stem}: {config.description}", highlight=False)
-    for source in injections_of(config.environment.delay):
-        console.print(f"latency    {source.label}", soft_wrap=True, highlight=False)
+    stem = Path(options.config).stem
+    out = options.out or Path("runs") / f"train-{stem}"
+    show(f"training   {stem}: {config.description}")
+    for source in injections:
+        show(f"latency    {source.label}")
     if bound is not None:
-        console.print(f"speed      {bound.in_words()}", soft_wrap=True, highlight=False)
-    console.print(f"folder     {path}", soft_wrap=True, highlight=False)
-    console.print(f"curves     tensorboard --logdir {folder.tensorboard}", soft_wrap=True)
+        show(f"speed      {bound.describe()}")
+    show(f"folder     {out}")
+    show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
     try:
-        with folder.locked(), TrainingProgress(console, config.steps) as progress:
-            best = train(config, folder, progress)
+        with RichProgress(console) as progress:
+            result = train(
+                config,
+                out,
+                name=options.name or stem,
+                resume=options.resume,
+                progress=TrainingBar(progress, config.steps),
+                command=command_line or shlex.join(["airl", *sys.argv[1:]]),
+            )
     except KeyboardInterrupt:
-        console.print(
-            f"interrupted: airl train {command.config} --out {path} --resume goes on",
-            style="yellow",
-            soft_wrap=True,
-        )
+        show(f"interrupted: airl train {options.config} --out {out} --resume continues")
         return EXIT_INTERRUPTED
-    from airl_mav.training.result import export_best
-
-    export_best(folder, config, command.name or stem)
-    console.print(
-        f"best       {best.success_rate:.1%} of {best.episodes} selection episodes after "
-        f"{best.steps:,} decisions"
-    )
-    console.print(f"policy     {folder.policy}", soft_wrap=True, highlight=False)
-    console.print(f"fly it     airl-sitl --policy {folder.policy}", soft_wrap=True, highlight=False)
+    best, policy = result.best, result.folder.policy
+    rate = f"{best.success_rate:.1%} of {best.episodes} selection episodes"
+    show(f"best       {rate} after {best.steps:,} decisions")
+    show(f"policy     {policy}")
+    show(f"fly it     airl-sitl --policy {policy}")
     return 0
 
 
-def _config(command: TrainCommand) -> TrainingConfig:
-    """Load the configuration and put the command line's values into it."""
-    config = load_profile("training", command.config, TrainingConfig)
-    config = config.model_copy(update={"environment": environment_of(command, config.environment)})
-    changes: dict[str, int] = {}
-    if command.seed is not None:
-        check_range("--seed", command.seed, 0, GREATEST_SEED)
-        changes["seed"] = command.seed
-    if command.steps is not None:
-        check_range("--steps", command.steps, 1, 10**10)
-        changes["steps"] = command.steps
-    return config.model_copy(update=changes)
+class TrainingBar:
+    """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
 
+    def __init__(self, progress: RichProgress, steps: int) -> None:
+        self._progress = progress
+        self._bar = progress.bar("training", steps, unit="decisions")
 
-class TrainingProgress:
-    """A bar with the success rate, a line for every evaluation. A `Watcher`."""
-
-    def __init__(self, console: Console, steps: int) -> None:
-        self._console = console
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=24),
-            TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[state]}"),
-            console=console,
-            transient=True,
-        )
-        self._task = self._bar.add_task("decisions", total=steps, state="")
-
-    def __enter__(self) -> TrainingProgress:
-        """Start drawing."""
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Stop drawing."""
-        self._bar.stop()
-
-    def progress(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Training goes on."""
-        state = "" if success is None else f"success {success:.0%} in training"
-        if zone is not None:
-            state += f", zone {zone}"
-        self._bar.update(self._task, completed=steps, state=state)
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        """Draw the bar."""
+        text = "" if success is None else f"success {success:.0%} in training"
+        text += "" if zone is None else f", zone {zone}"
+        self._bar.update(completed=steps, postfix=text)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """An evaluation is done."""
+        """Print a line."""
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
         zone = "" if evaluation.zone is None else f"  zone {evaluation.zone}"
-        self._console.print(
+        self._progress.note(
             f"{evaluation.steps:>11,} decisions {evaluation.seconds:7.0f} s  success "
-            f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}",
-            highlight=False,
+            f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
         )
 
     def checkpointed(self, steps: int) -> None:
-        """A checkpoint lies on the disk."""
-
-
-def _interrupt(*_: object) -> NoReturn:
-    """Treat SIGTERM like Ctrl-C."""
-    raise KeyboardInterrupt
+        """Print nothing."""

@@ -1,6 +1,10 @@
-"""Does a flight controller do on the wire what it is counted on to do: one script for any firmware.
+"""Does a flight controller behave on the wire as the rehearsal assumes? One run for any firmware.
 
-`session` talks to it (MAVSDK, and raw messages through MAVSDK), `ground`, `air`, `frames`,
-`stepping` and `loss` each ask for something and judge the answer, `sequence` puts them in order
-and lands whatever happens. `step_response` and `reference` know nothing of any link.
+`check_conformance` makes the checks of `ground_checks` and `flight_checks` on a `Vehicle` in their
+order, flies the step responses of `steps`, and lands whatever happens.
 """
+
+from airl_mav.conformance.result import ConformanceResult
+from airl_mav.conformance.run import check_conformance
+
+__all__ = ["ConformanceResult", "check_conformance"]

@@ -1,4 +1,4 @@
-"""Stored step responses of real firmware, and how near to them is near enough."""
+"""Stored step responses of real firmware, their tolerances, and the comparison with a vehicle."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from airl_mav.conformance.checklist import CheckFailedError, require
 from airl_mav.conformance.step_response import StepResponse
-from airl_mav.conformance.steps import StepName
+from airl_mav.conformance.steps import MeasuredStep, StepName
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile
 
 AUTO = "auto"
-"""The stored column of the autopilot that is heard; of several the first by name."""
-
+"""The stored column of the vehicle's autopilot; of several the first by name."""
 
 JUDGED = ("latency_s", "rise_s", "overshoot_percent")
-"""What a verdict hangs on; the other figures follow from these, or are noise."""
+"""Figures with a tolerance; the others follow from these, or are noise."""
 
 
 class Tolerance(ProfileModel):
@@ -48,18 +48,18 @@ class StoredStep(ProfileModel):
 class Reference(ProfileModel):
     """One firmware's column."""
 
-    title: str = Field(description="whose figures these are, in a word or two")
+    title: str = Field(description="name of the firmware")
     source: str = Field(description="where the figures come from")
     autopilot: int = Field(description="HEARTBEAT.autopilot, a MAV_AUTOPILOT")
-    tolerance: Tolerance = Field(default_factory=Tolerance, description="what is near enough")
+    tolerance: Tolerance = Field(default_factory=Tolerance, description="tolerances")
     streams_hz: Mapping[str, float] = Field(
-        description="what a fresh link over UDP carries unasked [Hz]"
+        description="messages that a fresh UDP link carries unasked [Hz]"
     )
     steps: Mapping[StepName, StoredStep] = Field(description="step responses")
 
 
-class Miss(NamedTuple):
-    """A figure that lies outside its tolerance."""
+class Deviation(NamedTuple):
+    """A figure outside its tolerance."""
 
     figure: str
     measured: float
@@ -67,26 +67,56 @@ class Miss(NamedTuple):
     allowed: float
     """Greatest difference allowed, in the figure's unit."""
 
+    def __str__(self) -> str:
+        name, _, unit = self.figure.rpartition("_")
+        sign, points, scale, digits = ("ms", "ms", 1e3, 0)
+        if unit == "percent":
+            sign, points, scale, digits = ("%", "points", 1.0, 1)
+        return (
+            f"{name} {scale * self.measured:.{digits}f} {sign}, stored "
+            f"{scale * self.stored:.{digits}f} +- {scale * self.allowed:.{digits}f} {points}"
+        )
 
-def misses(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Miss]:
+
+def deviations(measured: StepResponse, stored: StoredStep, tolerance: Tolerance) -> list[Deviation]:
     """Return which of latency, rise time and overshoot lie outside; NaN always does."""
-    judged = (
-        ("latency_s", tolerance.latency_share, tolerance.floor_s),
-        ("rise_s", tolerance.rise_share, tolerance.floor_s),
-        ("overshoot_percent", 0.0, tolerance.overshoot_points),
-    )
+    floor_s = tolerance.floor_s
     found = []
-    for figure, share, floor in judged:
-        held: float | None = getattr(stored, figure)
-        if held is None:
+    for figure, share, floor in (
+        ("latency_s", tolerance.latency_share, floor_s),
+        ("rise_s", tolerance.rise_share, floor_s),
+        ("overshoot_percent", 0.0, tolerance.overshoot_points),
+    ):
+        expected: float | None = getattr(stored, figure)
+        if expected is None:
             continue
-        allowed = max(share * held, floor)
+        allowed = max(share * expected, floor)
         value: float = getattr(measured, figure)
         # Staying short of the new value is no overshoot: the error at the end tells that.
         compared = max(value, 0.0) if figure == "overshoot_percent" else value
-        if math.isnan(value) or abs(compared - held) > allowed:
-            found.append(Miss(figure, value, held, allowed))
+        if math.isnan(value) or abs(compared - expected) > allowed:
+            found.append(Deviation(figure, value, expected, allowed))
     return found
+
+
+def summary(response: StepResponse) -> str:
+    """Return the judged figures in one line."""
+    return (
+        f"latency {1e3 * response.latency_s:.0f} ms, rise {1e3 * response.rise_s:.0f} ms, "
+        f"overshoot {max(response.overshoot_percent, 0.0):.1f} %"
+    )
+
+
+def judge(measured: MeasuredStep | None, reference: Reference) -> str:
+    """Return the finding of a step. Raises CheckFailedError if it was not flown or deviates."""
+    if measured is None:
+        raise CheckFailedError("not flown")
+    stored = reference.steps.get(measured.step.name)
+    if stored is None:
+        raise CheckFailedError(f"nothing stored for {reference.title}")
+    found = deviations(measured.median, stored, reference.tolerance)
+    require(not found, "; ".join(map(str, found)))
+    return summary(measured.median)
 
 
 def load_reference(name: str, autopilot: int) -> Reference:
@@ -107,6 +137,6 @@ def load_reference(name: str, autopilot: int) -> Reference:
             return reference
     known = ", ".join(list_profiles("conformance"))
     raise UsageError(
-        f"--reference {AUTO}: nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: "
+        f"reference {AUTO}: nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: "
         f"{known}, or a path to a .toml"
     )

@@ -1,136 +1,142 @@
 """The vehicle's time at the moment when something is sent to it.
 
-It is asked for its time right before: from one exchange of a few milliseconds to the setpoint that
-follows it, neither the clocks' drift nor the pace of a simulation has a part in it (F. Cristian,
+The vehicle is asked for its time right before: between that exchange of a few milliseconds and the
+setpoint that follows, neither the clocks' drift nor the pace of a simulation matters (F. Cristian,
 "Probabilistic clock synchronization", Distributed Computing 3, 1989).
 """
 
 from __future__ import annotations
 
+import json
+import threading
 from collections.abc import Callable
 from enum import Enum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from airl_mav.conformance.inbox import Inbox
-from airl_mav.conformance.words import REQUEST_MESSAGE
-from airl_mav.core.constants import US_PER_S
+from airl_mav.conformance.mavlink_names import MavCommand
+from airl_mav.conformance.telemetry import AUTOPILOT_COMPONENT, Telemetry
+from airl_mav.core.clock import NS_PER_US, WallClock
+from airl_mav.core.constants import MS_PER_S, US_PER_S
 
-ANSWER_S = 2.0
-"""Longest wait for an answer [wall s]."""
-
-CLOCKS_APART_S = 1.0
-"""An answer and telemetry tell the same clock if they differ by less [s]."""
-
-TRIES = 8
-"""Most exchanges in a row."""
-
-SHORT_US = 2000
-"""An exchange whose middle is so short ago tells the time well enough [wall µs]."""
-
+MESSAGES = ("SYSTEM_TIME", "TIMESYNC")  # Messages that `VehicleClock.receive` takes
+ANSWER_S = 2.0  # Longest wait for an answer [wall s]
+SAME_CLOCK_S = 1.0  # An answer and telemetry come from the same clock if they differ by less [s]
+ATTEMPTS = 8  # Maximum exchanges in a row
+SHORT_US = 2000  # An exchange is good enough if its middle is no longer ago than this [wall µs]
 SYSTEM_TIME_ID = 2
 
 
 class Method(Enum):
-    """How the vehicle is asked."""
+    """How the vehicle is asked for its time."""
 
     TIMESYNC = "TIMESYNC"
     SYSTEM_TIME = "REQUEST_MESSAGE(SYSTEM_TIME)"
-    """PX4 1.16 addresses its answer to TIMESYNC at random, and MAVSDK drops it."""
+    """PX4 1.16 leaves the target of its TIMESYNC answer unset, and MAVSDK drops it."""
     TELEMETRY = "the newest telemetry"
-    """No question at all: up to one message too early."""
+    """Not at all: up to one message too early."""
 
 
-class Fix(NamedTuple):
-    """One exchange."""
+class Exchange(NamedTuple):
+    """A question and its answer."""
 
     boot_s: float
     """The vehicle's time since boot when it answered [s]."""
     middle_us: float
-    """Middle between asking and hearing the answer, by the inbox's stopwatch [wall µs]."""
+    """Middle between question and answer [wall µs]."""
     round_trip_us: int
-    """From asking to hearing [wall µs]."""
+    """From question to answer [wall µs]."""
 
 
 class VehicleClock:
-    """Asks in the way that is answered."""
+    """Asks the vehicle for its time, by the first method that it answers."""
 
-    def __init__(self, inbox: Inbox, send: Callable[[str, dict[str, object]], None]) -> None:
-        """Take what is needed to ask.
-
-        Args:
-            inbox: Where answers arrive.
-            send: Sends a raw message.
-        """
-        self._inbox, self._send = inbox, send
-        self._asked_ns = 0
+    def __init__(
+        self, telemetry: Telemetry, send: Callable[[str, dict[str, Any]], None], speed: float
+    ) -> None:
+        self._telemetry, self._send, self._speed = telemetry, send, speed
+        self.wall = WallClock()
+        self._question = 0
+        """ts1 of the newest TIMESYNC [ns]."""
+        self._answer: tuple[float, int] | None = None
+        """Time since boot [s], and when it was received [wall µs]."""
+        self._answered = threading.Event()
         self.method = Method.TIMESYNC
 
-    def choose(self) -> Method:
-        """Find out what is answered, and ask in this way from now on."""
+    def receive(self, message: Any, _: object) -> None:
+        """Take a SYSTEM_TIME or TIMESYNC of MAVSDK's mavlink_direct."""
+        if message.component_id != AUTOPILOT_COMPONENT or self._answered.is_set():
+            return
+        received_us, fields = self.wall.time_us(), json.loads(message.fields_json)
+        if message.message_name != self.method.name:
+            return
+        if self.method is Method.SYSTEM_TIME:
+            boot_s = fields["time_boot_ms"] / MS_PER_S
+        elif fields["tc1"] and fields["ts1"] == self._question:
+            boot_s = fields["tc1"] / (US_PER_S * NS_PER_US)
+        else:
+            return
+        self._answer = boot_s, received_us
+        self._answered.set()
+
+    def choose_method(self) -> Method:
+        """Find the first method that the vehicle answers, and use it from now on."""
         for self.method in Method:
-            if self.method is Method.TELEMETRY or self._exchange() is not None:
+            if self.method is Method.TELEMETRY or self._ask() is not None:
                 break
         return self.method
 
-    def fix(self) -> Fix | None:
-        """Ask until an exchange is short, a few times; return the shortest, None without any."""
-        best: Fix | None = None
-        for _ in range(TRIES):
-            found = None if self.method is Method.TELEMETRY else self._exchange()
+    def exchange(self) -> Exchange | None:
+        """Return the first of a few exchanges that is short enough, else the shortest."""
+        best: Exchange | None = None
+        for _ in range(ATTEMPTS):
+            found = None if self.method is Method.TELEMETRY else self._ask()
             if found is None:
-                return best
+                break
+            if self.wall.time_us() - found.middle_us <= SHORT_US:
+                return found
             if best is None or found.round_trip_us < best.round_trip_us:
                 best = found
-            if self._inbox.stopwatch.time_us() - found.middle_us <= SHORT_US:
-                # The newest one, although another may have been shorter.
-                return found
         return best
 
     def now(self) -> float:
         """Return the vehicle's time since boot, or that of its newest telemetry [s]."""
-        found = self.fix()
-        return self._inbox.boot_s if found is None else found.boot_s
+        found = self.exchange()
+        return self._telemetry.boot_s if found is None else found.boot_s
 
-    def sending(self, fix: Fix | None, newest_s: float, speed: float) -> tuple[float, bool]:
-        """Return when what is sent right after this call comes to the vehicle.
+    def sending_time(self) -> tuple[float, bool]:
+        """Return when a message that is sent right after this call reaches the vehicle.
 
-        Before it is sent and not after: a call into MAVSDK sends at once, but returns only when
-        Python's other threads let it.
-
-        Args:
-            fix: What `fix` returned right before.
-            newest_s: Newest time of telemetry [s].
-            speed: Simulated seconds per wall second of the vehicle.
+        It is asked before sending and not after: a call into MAVSDK sends at once, but returns only
+        when Python's other threads let it.
 
         Returns:
-            Time since boot [s], and whether it comes from an exchange: without one it is
-            `newest_s`.
+            Time since boot [s], and whether it comes from an exchange rather than from telemetry.
         """
-        if fix is None:
+        newest_s, found = self._telemetry.boot_s, self.exchange()
+        if found is None:
             return newest_s, False
-        since_us = self._inbox.stopwatch.time_us() - fix.middle_us
-        return fix.boot_s + since_us * speed / US_PER_S, True
+        since_us = self.wall.time_us() - found.middle_us
+        return found.boot_s + since_us * self._speed / US_PER_S, True
 
-    def _exchange(self) -> Fix | None:
-        """Ask, and wait for the answer; None when there is none, or by another clock."""
-        inbox, newest_s = self._inbox, self._inbox.boot_s
-        inbox.answered.clear()
-        inbox.answer = None
-        # What is asked is known before an answer can come.
-        self._asked_ns += 1
-        inbox.asked_ns = self._asked_ns if self.method is Method.TIMESYNC else 0
-        asked_us = inbox.stopwatch.time_us()
+    def _ask(self) -> Exchange | None:
+        """Exchange once; None when there is no answer, or one by another clock."""
+        newest_s = self._telemetry.boot_s
+        self._answer = None
+        # Set before an answer can come.
+        self._question += 1
+        self._answered.clear()
+        asked_us = self.wall.time_us()
         if self.method is Method.TIMESYNC:
-            self._send("TIMESYNC", {"tc1": 0, "ts1": self._asked_ns})
+            self._send("TIMESYNC", {"tc1": 0, "ts1": self._question})
         else:
-            inbox.unheard[REQUEST_MESSAGE] += 1
+            self._telemetry.unlogged_acks[MavCommand.REQUEST_MESSAGE] += 1
             params = {"param1": SYSTEM_TIME_ID} | {f"param{n}": 0.0 for n in range(2, 8)}
-            command = {"command": REQUEST_MESSAGE, "confirmation": 0}
+            command = {"command": MavCommand.REQUEST_MESSAGE.value, "confirmation": 0}
             self._send("COMMAND_LONG", {**command, **params})
-        if not inbox.answered.wait(ANSWER_S) or inbox.answer is None:
+        if not self._answered.wait(ANSWER_S) or self._answer is None:
             return None
-        boot_s, heard_us = inbox.answer
+        boot_s, received_us = self._answer
         # Before the first telemetry there is nothing to compare with.
-        if newest_s > 0.0 and abs(boot_s - newest_s) > CLOCKS_APART_S:
+        if newest_s > 0.0 and abs(boot_s - newest_s) > SAME_CLOCK_S:
             return None
-        return Fix(boot_s, (asked_us + heard_us) / 2.0, heard_us - asked_us)
+        return Exchange(boot_s, (asked_us + received_us) / 2.0, received_us - asked_us)

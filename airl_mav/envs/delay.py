@@ -32,7 +32,7 @@ class SpeedBound:
         """Fastest action."""
         return min(self.asked_m_s, self.safe_velocity_m_s)
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Return one line for people, also where the bound changes nothing."""
         facts = (
             f"safe velocity {self.safe_velocity_m_s:.2f} m/s (latency {self.latency_s:.3f} s, "

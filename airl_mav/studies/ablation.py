@@ -12,7 +12,6 @@ from rich.console import Console
 
 from airl_mav.cli import train
 from airl_mav.cli.cells import Cell
-from airl_mav.cli.train_command import TrainCommand
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.flight.paper import ABLATION
 from airl_mav.flight.statistics import Aggregate
@@ -96,12 +95,12 @@ def prepare(config: AblationConfig, root: Path, console: Console) -> int:
         folder = each.trained_at(root)
         if each.training is None or (folder / "policy" / "card.json").exists():
             continue
-        command = TrainCommand(
-            each.training, out=folder, steps=each.steps, name=folder.name, resume=True
+        command = train.TrainOptions(
+            config=each.training, out=folder, steps=each.steps, name=folder.name, resume=True
         )
         words = ["airl", "train", each.training, "--out", f"{folder}", "--name", folder.name]
         words += [] if each.steps is None else ["--steps", f"{each.steps}"]
-        if code := train.run(command, console, words=shlex.join(words)):
+        if code := train.run(command, console, command_line=shlex.join(words)):
             return code
     return 0
 

@@ -13,7 +13,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 
 GREATEST_LAYERS, GREATEST_FILTERS = 16, 256
-"""As of a template in `training.spec.NetworkSpec`."""
+"""As of a template in `training.config.NetworkSpec`."""
 
 
 class Grid(ProfileModel):

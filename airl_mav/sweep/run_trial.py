@@ -20,8 +20,7 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.sweep.store import SweepFolder, TrainingProgress
 from airl_mav.sweep.trial import Trained, Trial, TrialResult, result_of, size_of, training_of
 from airl_mav.training.config import TrainingConfig
-from airl_mav.training.result import export_best
-from airl_mav.training.run import nominal, train
+from airl_mav.training.run import export_best, fit, nominal
 from airl_mav.training.store import CONFIG_FILE, Evaluation, TrainingFolder
 
 NOTE_US = 2 * US_PER_S
@@ -54,7 +53,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
         # Looked at under the lock: whoever had it may have ended the trial.
         if (done := folder.result(trial)) is not None:
             return done
-        best = train(config, training, _Watcher(folder, trial), device)
+        best = fit(config, training, _Watcher(folder, trial), device)
         export_best(training, config, trial.name)
         seeds = folder.config.evaluation
         flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))
@@ -95,7 +94,7 @@ def _held(training: TrainingFolder) -> Iterator[None]:
 
 
 class _Watcher:
-    """Leaves a note of the progress now and then. A `training.run.Watcher`."""
+    """Leaves a note of the progress now and then. A `training.run.TrainingProgress`."""
 
     def __init__(self, folder: SweepFolder, trial: Trial) -> None:
         self._folder, self._trial = folder, trial
@@ -103,7 +102,7 @@ class _Watcher:
         self._due_us = 0
         self._success: float | None = None
 
-    def progress(self, steps: int, success: float | None, zone: int | None) -> None:  # noqa: ARG002
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:  # noqa: ARG002
         """Training goes on."""
         if self._clock.time_us() >= self._due_us:
             self._due_us = self._clock.time_us() + NOTE_US

@@ -14,8 +14,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
 from airl_mav.policy.template import Size, template_size
 from airl_mav.sweep.config import SweepConfig
-from airl_mav.training.config import TrainingConfig
-from airl_mav.training.spec import NetworkSpec
+from airl_mav.training.config import NetworkSpec, TrainingConfig
 
 
 @dataclass(frozen=True, order=True)

@@ -15,9 +15,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from airl_mav.core.errors import UsageError
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import policy_arguments, to_channels_last
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 
 POLICY = "MultiInputPolicy"
 

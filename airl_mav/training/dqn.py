@@ -22,8 +22,8 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch.nn import functional
 
+from airl_mav.training.config import Precision
 from airl_mav.training.replay import Batch, NStepReplay
-from airl_mav.training.spec import Precision
 
 
 class DoubleDQN(DQN):

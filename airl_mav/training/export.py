@@ -1,241 +1,260 @@
-"""From a trained network to a policy that flies: ONNX and its card, checked against torch."""
+"""Stable-Baselines3 models, ours or foreign, to policies that fly."""
 
 from __future__ import annotations
 
-import copy
-import io
-import logging
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import importlib
+import inspect
+import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import replace_file
-from airl_mav.policy.card import (
-    ONNX_FILE,
-    TORCH_FILE,
-    PolicyCard,
-    PolicyFacts,
-    digest,
-    write_card,
-)
-from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
-from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime
+from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.card import PolicyCard, PolicyFacts
+from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
+from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS
+from airl_mav.training.onnx_export import TOLERANCE, export_network, random_inputs
 
-OPSET = 18
-"""ONNX operators: the newest that torch writes without a conversion."""
+CHECKED = 64
+"""Random observations on which the model's own decisions are compared."""
 
-TOLERANCE = 1e-4
-"""Greatest error of an exported output, in shares of the greatest output (at least 1)."""
-
-CHECKED_ROWS = (1, 3, 64)
-"""Batches on which a network and its export are compared."""
+_LIBRARIES = ("airl_mav.training.dqn", "stable_baselines3", "sb3_contrib")
 
 
-class Layer(NamedTuple):
-    """A layer that took part in an inference."""
+class _Network(nn.Module):
+    """From the three inputs to SB3's Dict of observations."""
 
-    text: str
-    macs: int
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(
+        self, depth: torch.Tensor, velocity: torch.Tensor, goal: torch.Tensor
+    ) -> torch.Tensor:
+        found: torch.Tensor = self.inner({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
+        return found
 
 
-def layers(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> list[Layer]:
-    """Run a network once and return its convolutions and dense layers in order.
+class _MeanOfQuantiles(nn.Module):
+    """QR-DQN: the value of an action is the mean of its quantiles."""
 
-    Args:
-        module: The network.
-        inputs: Its inputs, with one row each.
+    def __init__(self, quantiles: nn.Module) -> None:
+        super().__init__()
+        self.quantiles = quantiles
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        found: torch.Tensor = self.quantiles(seen).mean(dim=1)
+        return found
+
+
+class _Actor(nn.Module):
+    """The way from observations to actions alone: no noise, no value function."""
+
+    def __init__(self, owner: Any, extractor: nn.Module, *layers: nn.Module) -> None:
+        super().__init__()
+        self.space, self.scaled = owner.observation_space, owner.normalize_images
+        self.extractor = extractor
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        # SB3 divides uint8 images by 255 here.
+        scaled = preprocess_obs(cast("Any", seen), self.space, normalize_images=self.scaled)
+        found: torch.Tensor = self.layers(self.extractor(scaled))
+        return found
+
+
+def network_of(model: BaseAlgorithm) -> nn.Module:
+    """Return the part of a model that decides, as `export_network` takes it.
+
+    Raises:
+        UsageError: The policy has a memory, or is of a kind that is not known.
     """
-    found: list[Layer] = []
-
-    def note(layer: nn.Module, _: Any, output: torch.Tensor) -> None:
-        if isinstance(layer, nn.Conv2d):
-            kernel = "x".join(str(side) for side in layer.kernel_size)
-            stride = "" if set(layer.stride) == {1} else f"/{layer.stride[0]}"
-            text = f"conv {layer.out_channels} {kernel}{stride}"
-            found.append(Layer(text, output.numel() * layer.weight[0].numel()))
-        elif isinstance(layer, nn.Linear):
-            found.append(Layer(f"dense {layer.out_features}", output.numel() * layer.in_features))
-
-    with _hooked(module, note), torch.no_grad():
-        module(*inputs)
-    return found
-
-
-def count_macs(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
-    """Return the multiply-accumulates of one inference, in convolutions and dense layers."""
-    return sum(layer.macs for layer in layers(module, inputs))
-
-
-def count_parameters(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
-    """Return the weights and biases of the layers that take part in an inference."""
-    used: dict[int, int] = {}
-
-    def note(layer: nn.Module, _: Any, __: Any) -> None:
-        used.update((id(weights), weights.numel()) for weights in layer.parameters(recurse=False))
-
-    with _hooked(module, note), torch.no_grad():
-        module(*inputs)
-    return sum(used.values())
+    policy: Any = model.policy
+    if hasattr(policy, "lstm_actor"):
+        raise UsageError(f"{type(model).__name__}: recurrent policies cannot be exported")
+    if hasattr(policy, "quantile_net"):
+        return _Network(_MeanOfQuantiles(policy.quantile_net))
+    if hasattr(policy, "q_net"):
+        return _Network(policy.q_net)
+    actor: Any = getattr(policy, "actor", None)
+    if hasattr(actor, "latent_pi"):
+        # SAC and its kin: the mode of the squashed Gaussian is the squashed mean.
+        return _Network(
+            _Actor(actor, actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
+        )
+    if actor is not None:
+        return _Network(actor)
+    if hasattr(policy, "mlp_extractor"):
+        # PPO and its kin: logits of discrete actions; else the mean, squashed or cut off.
+        last: nn.Module = nn.Identity()
+        if isinstance(policy.action_space, spaces.Box):
+            last = nn.Tanh() if policy.squash_output else nn.Hardtanh(-1.0, 1.0)
+        hidden = policy.mlp_extractor.policy_net
+        extractor = policy.pi_features_extractor
+        return _Network(_Actor(policy, extractor, hidden, policy.action_net, last))
+    raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
 
-def export_network(
-    module: nn.Module, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
+def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpec) -> None:
+    """Raise UsageError unless a model takes the arrays of a layout and gives an action set."""
+    seen = model.observation_space
+    wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
+    accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
+    parts = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"not a Dict": seen}
+    fits = parts.keys() == wanted.keys() and all(
+        isinstance(part, spaces.Box)
+        and part.shape == wanted[key][0]
+        # SB3 turns all floats into float32.
+        and (part.dtype == np.uint8 if key == DEPTH else part.dtype.kind == "f")
+        for key, part in parts.items()
+    )
+    if not fits:
+        found = ", ".join(f"{key} {part.dtype} {part.shape}" for key, part in parts.items())
+        raise UsageError(f"observation space {found}; accepted with this layout: {accepted}")
+    space, count = model.action_space, discrete_actions(actions)
+    if count is not None:
+        if not (isinstance(space, spaces.Discrete) and space.n == count and space.start == 0):
+            raise UsageError(
+                f"action space {space}; accepted with {actions.set!r}: Discrete({count})"
+            )
+    elif not (
+        isinstance(space, spaces.Box)
+        and space.shape == (CONTINUOUS_OUTPUTS,)
+        and (space.low == -1.0).all()
+        and (space.high == 1.0).all()
+    ):
+        raise UsageError(
+            f"action space {space}; accepted with {actions.set!r}: "
+            f"Box(-1.0, 1.0, ({CONTINUOUS_OUTPUTS},), float32)"
+        )
+
+
+def export(
+    model: Path, algorithm: str, facts: PolicyFacts, out: Path, *, with_torch: bool = False
 ) -> PolicyCard:
-    """Write a network as `policy.onnx` with its card, and return the card.
-
-    Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
-    without a card, or an old card that refuses the new policy: never a card for the wrong one.
+    """Turn the .zip of a Stable-Baselines3 model into a policy folder that flies.
 
     Args:
-        module: Takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; returns a
-            score for each discrete action (n, k), or the continuous action (n, 2). Scaling the
-            image is its own business.
+        model: The .zip. It holds pickled Python objects: export only those of people you trust.
+        algorithm: Name of the class that wrote it, of stable-baselines3 or sb3-contrib.
+        facts: What the card says beyond the network.
+        out: Folder to write policy.onnx and card.json to; made if need be.
+        with_torch: Also write policy.pt2, for the torch runtime.
+
+    Returns:
+        The card.
+
+    Raises:
+        UsageError: The model cannot be loaded, does not fit the facts or cannot be exported, or
+            `out` cannot be written. Nothing usable was written then.
+    """
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: not a folder")
+    learner = load_sb3(model, algorithm)
+    try:
+        return export_sb3(learner, facts, out, with_torch=with_torch)
+    except UsageError as error:
+        raise UsageError(f"{model}: {error}") from error
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}") from None
+
+
+def export_sb3(
+    model: BaseAlgorithm, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
+) -> PolicyCard:
+    """Write a model as `policy.onnx` with its card, and return the card.
+
+    Args:
+        model: Any algorithm of stable-baselines3 or sb3-contrib without memory.
         facts: What the card says beyond the network.
         folder: Where to write; made if need be.
         with_torch: Also write the network as a torch program.
 
     Raises:
-        UsageError: The network does not fit the facts, cannot be exported, or the export differs.
+        UsageError: The model's spaces do not fit the facts, or it cannot be exported.
     """
-    spec = facts.observation
-    example = _tensors(spec, random_inputs(spec, 2, np.random.default_rng(0)))
-    with _quiet():
-        try:
-            module = copy.deepcopy(module).cpu().eval()
-            program = _program(module, example)
-            onnx = _onnx(program)
-        except Exception as error:  # torch's exporter raises all kinds.
-            raise UsageError(f"torch cannot export the network: {_line(error)}") from error
-        archive = _archive(program) if with_torch else None
+    check_spaces(model, facts.observation, facts.actions)
+    network = network_of(model)
+    training = model.policy.training
+    model.policy.set_training_mode(False)
     try:
-        _compare(module, OnnxRuntime(onnx, spec, facts.actions), spec, "ONNX Runtime")
-        if archive is not None:
-            _compare(module, TorchRuntime(archive, spec), spec, "the torch program")
-    except ValueError as error:
-        raise UsageError(f"the exported network: {error}") from None
-    one = tuple(tensor[:1] for tensor in example)
-    parts = layers(module, one)
-    card = PolicyCard(
-        **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
-        sha256=digest(onnx),
-        torch_sha256=None if archive is None else digest(archive),
-        network=", ".join(part.text for part in parts),
-        parameters=count_parameters(module, one),
-        macs=sum(part.macs for part in parts),
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    replace_file(folder / ONNX_FILE, onnx)
-    if archive is not None:
-        replace_file(folder / TORCH_FILE, archive)
-    write_card(folder, card)
-    if archive is None:
-        (folder / TORCH_FILE).unlink(missing_ok=True)
-    return card
-
-
-def random_inputs(spec: ObservationSpec, n: int, rng: np.random.Generator) -> Encoded:
-    """Return arrays of a layout with n rows of noise."""
-    return {
-        key: rng.integers(0, 256, (n, *box.shape), np.uint8)
-        if key == DEPTH
-        else rng.normal(0.0, 2.0, (n, *box.shape)).astype(np.float32)
-        for key, box in boxes(spec).items()
-    }
-
-
-def _compare(module: nn.Module, runtime: Runtime, spec: ObservationSpec, name: str) -> None:
-    """Raise ValueError unless a runtime gives what the network gives."""
-    rng = np.random.default_rng(1)
-    for n in CHECKED_ROWS:
-        inputs = random_inputs(spec, n, rng)
-        with torch.no_grad():
-            wanted: NDArray[np.float32] = module(*_tensors(spec, inputs)).numpy()
-        found = runtime.infer(inputs)
-        if found.shape != wanted.shape or not np.isfinite(wanted).all():
-            raise ValueError(f"torch gives {wanted.shape}, {name} {found.shape}, or no numbers")
-        error = float(np.abs(found - wanted).max())
-        if not error <= TOLERANCE * max(1.0, float(np.abs(wanted).max())):
-            raise ValueError(f"{name} is off by {error:.3g}; accepted: {TOLERANCE:g} of the output")
-
-
-def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.export.ExportedProgram:
-    """Trace a network with a free number of rows, without the paths of this machine."""
-    rows = {0: torch.export.Dim("n", min=1)}
-    program = torch.export.export(module, example, dynamic_shapes=tuple(rows for _ in example))
-    for node in program.graph.nodes:
-        node.meta.pop("stack_trace", None)
-    return program
-
-
-def _onnx(program: torch.export.ExportedProgram) -> bytes:
-    """Turn a program into ONNX, weights inside, without notes on where each operator came from."""
-    written = torch.onnx.export(
-        program,
-        args=(),
-        dynamo=True,
-        opset_version=OPSET,
-        external_data=False,
-        output_names=[ACTION],
-        verbose=False,
-    )
-    assert written is not None  # noqa: S101 (it is None only for the old exporter)
-    model = written.model_proto
-    graph = model.graph
-    graph.ClearField("metadata_props")
-    graph.ClearField("value_info")
-    for entry in (*graph.node, *graph.input, *graph.output, *graph.initializer):
-        entry.ClearField("metadata_props")
-        entry.ClearField("doc_string")
-    for value in (*graph.input, *graph.output):
-        value.type.tensor_type.shape.dim[0].dim_param = "n"
-    data: bytes = model.SerializeToString(deterministic=True)
-    return data
-
-
-def _archive(program: torch.export.ExportedProgram) -> bytes:
-    """Return a program as the bytes of a .pt2 file."""
-    buffer = io.BytesIO()
-    torch.export.save(program, buffer)
-    return buffer.getvalue()
-
-
-def _tensors(spec: ObservationSpec, inputs: Encoded) -> tuple[torch.Tensor, ...]:
-    return tuple(torch.from_numpy(inputs[key]) for key in boxes(spec))
-
-
-@contextmanager
-def _hooked(module: nn.Module, hook: Callable[[nn.Module, Any, Any], None]) -> Iterator[None]:
-    """Call a hook after each part of a network that runs."""
-    handles = [part.register_forward_hook(hook) for part in module.modules()]
-    try:
-        yield
+        _check_decisions(model, network, facts)
+        return export_network(network, facts, folder, with_torch=with_torch)
     finally:
-        for handle in handles:
-            handle.remove()
+        model.policy.set_training_mode(training)
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence what torch's exporter has to say about its own future and about torchvision."""
-    log = logging.getLogger("torch.onnx")
-    level = log.level
-    log.setLevel(logging.ERROR)
+def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
+    """Load a model from the .zip that its `save` wrote.
+
+    The archive holds pickled Python objects: load only those of people you trust.
+
+    Args:
+        path: The .zip.
+        algorithm: Name of the class that wrote it.
+
+    Raises:
+        UsageError: No such file or algorithm, or the archive is not one of its.
+    """
+    learner = algorithm_class(algorithm)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file")
+    if not zipfile.is_zipfile(path):
+        raise UsageError(f"{path}: not a .zip of stable-baselines3")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        log.setLevel(level)
+        # Nothing will be learned: no room for a million steps.
+        model: BaseAlgorithm = learner.load(
+            path, device="cpu", custom_objects={"buffer_size": 1000, "tensorboard_log": None}
+        )
+    except Exception as error:  # Unpickling raises whatever the pickled objects do.
+        line = (str(error) or type(error).__name__).splitlines()[0]
+        raise UsageError(f"{path}: not a model of {learner.__name__}: {line}") from None
+    return model
 
 
-def _line(error: Exception) -> str:
-    """Return the first line of an error."""
-    return (str(error) or type(error).__name__).splitlines()[0]
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """Return an algorithm by the name of its class, in any case.
+
+    Raises:
+        UsageError: There is none (lists those that exist).
+    """
+    known: dict[str, type[BaseAlgorithm]] = {}
+    for library in _LIBRARIES:
+        members = inspect.getmembers(importlib.import_module(library), inspect.isclass)
+        known |= {
+            key: found
+            for key, found in members
+            if issubclass(found, BaseAlgorithm) and not inspect.isabstract(found)
+        }
+    for key, found in known.items():
+        if key.lower() == name.lower():
+            return found
+    raise UsageError(f"algorithm {name!r}: accepted: {', '.join(sorted(known))}")
+
+
+def _check_decisions(model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts) -> None:
+    """Raise UsageError unless the network decides as the model's own `predict` does."""
+    seen = random_inputs(facts.observation, CHECKED, np.random.default_rng(2))
+    decided, _ = model.policy.predict(cast("Any", seen), deterministic=True)
+    device = model.device
+    with torch.no_grad():
+        tensors = [torch.from_numpy(seen[key]).to(device) for key in boxes(facts.observation)]
+        outputs = network(*tensors).cpu().numpy()
+    slack = TOLERANCE * max(1.0, float(np.abs(outputs).max()))
+    if discrete_actions(facts.actions) is None:
+        same = np.abs(outputs - decided).max() <= slack
+    else:
+        # Of two that are as good as each other either may win.
+        same = (outputs[np.arange(CHECKED), decided] >= outputs.max(axis=1) - slack).all()
+    if not same:
+        raise UsageError(
+            f"{type(model).__name__}: its {type(model.policy).__name__} decides by more than its "
+            "network: it cannot be exported"
+        )

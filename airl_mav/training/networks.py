@@ -15,7 +15,7 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY
-from airl_mav.training.spec import NetworkSpec
+from airl_mav.training.config import NetworkSpec
 
 VECTORS = (VELOCITY, GOAL)
 VECTOR_INPUTS = 6

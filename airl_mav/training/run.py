@@ -1,6 +1,6 @@
-"""Train: the learner, periodic evaluation, the best weights, checkpoints.
+"""A training run: learning, evaluations, checkpoints, and the export of the best weights.
 
-All that is not learning happens between two rollouts, where a run can be taken up again exactly.
+All that is not learning happens between two rollouts, where a run can be resumed exactly.
 """
 
 from __future__ import annotations
@@ -8,7 +8,8 @@ from __future__ import annotations
 import io
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,22 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 
-from airl_mav.core.clock import WallClock
+from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.provenance import package_versions
+from airl_mav.envs.delay import bounded
 from airl_mav.envs.evaluation import Flown, fly_episodes, success_rate
 from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
-from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.envs.vector import FIRST_TRAINING_SEED, LAST_TRAINING_SEED, NavigationVectorEnv
+from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import Encoded
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
+from airl_mav.training.export import export_sb3
 from airl_mav.training.store import Evaluation, TrainingFolder
 
 RECENT = 200
@@ -36,20 +42,44 @@ LOG_EVERY = 100
 """Episodes (off-policy) between two points of the TensorBoard curves."""
 
 
-class Watcher(Protocol):
-    """Whoever shows the progress."""
+class TrainingProgress(Protocol):
+    """Receives the progress of a training run."""
 
-    def progress(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Training goes on."""
-        ...
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        """Called after each step of all vehicles.
+
+        Args:
+            steps: Decisions of all vehicles so far.
+            success: Share of the last `RECENT` episodes that reached the goal; None before one.
+            zone: Open curriculum zone; None without a curriculum.
+        """
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """An evaluation is done."""
-        ...
+        """Called after an evaluation; `best`: better than all before it."""
 
     def checkpointed(self, steps: int) -> None:
-        """A checkpoint lies on the disk."""
-        ...
+        """Called when a checkpoint is on the disk."""
+
+
+class _NoProgress:
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        pass
+
+    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
+        pass
+
+    def checkpointed(self, steps: int) -> None:
+        pass
+
+
+class TrainingResult(NamedTuple):
+    """What a training run made."""
+
+    folder: TrainingFolder
+    best: Evaluation
+    """The evaluation of the exported weights."""
+    card: PolicyCard
+    """Card of the policy in `folder.policy`."""
 
 
 def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
@@ -58,15 +88,45 @@ def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
 
 
 def train(
-    config: TrainingConfig, folder: TrainingFolder, watcher: Watcher, device: str = "cpu"
-) -> Evaluation:
-    """Train to the end, from the newest checkpoint if there is one.
+    config: TrainingConfig,
+    out: Path,
+    *,
+    name: str,
+    resume: bool = False,
+    progress: TrainingProgress | None = None,
+    device: str = "cpu",
+    command: str = "airl_mav.training.run.train",
+) -> TrainingResult:
+    """Train a policy to the end and export its best weights.
 
     Args:
-        config: What to train.
-        folder: Where everything goes.
-        watcher: Is told how it goes.
+        config: What to train; its fastest action is bounded by the safe velocity, if it asks.
+        out: Folder of the run; made if need be.
+        name: Name of the policy on its card.
+        resume: Continue the run in `out` from its newest checkpoint, if there is one.
+        progress: Receives the progress.
         device: What learns, as torch calls it.
+        command: What to note on the card as the command that made the policy.
+
+    Returns:
+        The run's folder, the best evaluation and the policy's card.
+
+    Raises:
+        UsageError: A profile or the algorithm cannot be used, `out` holds another run, another
+            process trains in it, or the network cannot be exported.
+        KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
+    """
+    config = config.model_copy(update={"environment": bounded(config.environment)})
+    folder = TrainingFolder.begin(out, config, command, resume=resume)
+    with folder.locked():
+        best = fit(config, folder, progress or _NoProgress(), device)
+    return TrainingResult(folder, best, export_best(folder, config, name))
+
+
+def fit(
+    config: TrainingConfig, folder: TrainingFolder, progress: TrainingProgress, device: str = "cpu"
+) -> Evaluation:
+    """Train to the end in a locked folder, from the newest checkpoint if there is one.
 
     Returns:
         The evaluation of the best weights, which lie in `folder.best_model`.
@@ -78,7 +138,7 @@ def train(
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
-    callback = _Between(config, folder, watcher, env)
+    callback = _BetweenRollouts(config, folder, progress, env)
     meta = load_latest(folder.checkpoints, model)
     if meta is not None:
         callback.restore(meta)
@@ -94,21 +154,21 @@ def train(
     return best
 
 
-class _Between(BaseCallback):
-    """What happens between two rollouts."""
+class _BetweenRollouts(BaseCallback):
+    """Evaluates and saves between two rollouts."""
 
     def __init__(
         self,
         config: TrainingConfig,
         folder: TrainingFolder,
-        watcher: Watcher,
+        progress: TrainingProgress,
         env: NavigationVecEnv,
     ) -> None:
         super().__init__()
         self.done = False
         self._config = config
         self._folder = folder
-        self._watcher = watcher
+        self._progress = progress
         self._env = env
         self._recent: deque[bool] = deque(maxlen=RECENT)
         self._evaluated = -1
@@ -139,7 +199,7 @@ class _Between(BaseCallback):
     def _save(self) -> None:
         self._saved = self.model.num_timesteps
         save_checkpoint(self._folder.checkpoints, self.model, self._meta())
-        self._watcher.checkpointed(self._saved)
+        self._progress.checkpointed(self._saved)
 
     # --- SB3's hooks
 
@@ -158,7 +218,7 @@ class _Between(BaseCallback):
         zone = None if curriculum is None else curriculum.zone
         if zone is not None:
             self.logger.record("rollout/zone", zone)
-        self._watcher.progress(self.model.num_timesteps, self._success(), zone)
+        self._progress.trained(self.model.num_timesteps, self._success(), zone)
         return not self.done
 
     def finish(self, model: BaseAlgorithm) -> None:
@@ -189,7 +249,7 @@ class _Between(BaseCallback):
         best = self._folder.best()
         better = best is None or evaluation.rank > best.rank
         if better:
-            self._folder.save_best(saved(model), evaluation)
+            self._folder.save_best(model_bytes(model), evaluation)
         self._folder.add_evaluation(evaluation)
         model.logger.record("eval/success_rate", evaluation.success_rate)
         if evaluation.flight_time_s is not None:
@@ -198,7 +258,7 @@ class _Between(BaseCallback):
         if selection.stop_at is not None and evaluation.success_rate >= selection.stop_at:
             self.done = True
         self._paused_us += self._clock.time_us() - began_us
-        self._watcher.evaluated(evaluation, best=better)
+        self._progress.evaluated(evaluation, best=better)
 
     def _success(self) -> float | None:
         return sum(self._recent) / len(self._recent) if self._recent else None
@@ -241,16 +301,42 @@ def summary(
     )
 
 
-def saved(model: BaseAlgorithm) -> bytes:
+def model_bytes(model: BaseAlgorithm) -> bytes:
     """Return a learner as stable-baselines3 saves it, without its replay."""
     buffer = io.BytesIO()
     model.save(buffer, exclude=["replay", "replay_buffer", "generator"])
     return buffer.getvalue()
 
 
-def load_best(folder: TrainingFolder, config: TrainingConfig) -> BaseAlgorithm:
-    """Return a learner with the best weights of a run."""
-    env = NavigationVecEnv(NavigationVectorEnv(1, config.environment))
+def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> PolicyCard:
+    """Export the best weights of a run to its `policy` folder. Raises UsageError if it cannot."""
+    best, about = folder.best(), folder.about()
+    assert best is not None  # noqa: S101 - a finished run has one
+    environment = config.environment
+    facts = PolicyFacts(
+        name=name,
+        description=config.description,
+        observation=Navigation(environment, 1).observation,
+        actions=environment.action_spec,
+        hold_s=environment.episode.hold_s,
+        goal_radius_m=environment.episode.goal_radius_m,
+        altitude_m=environment.episode.altitude_m,
+        hover_after_s=environment.episode.hover_after_s,
+        algorithm=config.algorithm.name,
+        training=Training(
+            arena=environment.arena,
+            first_arena_seed=FIRST_TRAINING_SEED,
+            last_arena_seed=LAST_TRAINING_SEED - 1,
+            seed=config.seed,
+            env_steps=best.steps,
+            config_file=name,
+            config=config.model_dump(mode="json", exclude_none=True),
+            command=about["command"],
+            versions=package_versions(),
+            date_utc=utc_now().isoformat(timespec="seconds"),
+        ),
+    )
+    env = NavigationVecEnv(NavigationVectorEnv(1, environment))
     model = make_model(config.algorithm, config.network, env, config.seed)
     model.set_parameters(str(folder.best_model), device="cpu")
-    return model
+    return export_sb3(model, facts, folder.policy)

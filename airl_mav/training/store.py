@@ -63,20 +63,29 @@ class TrainingFolder:
     """A training run on disk. Whatever is killed when: it can be read, and gone on from."""
 
     def __init__(self, path: Path) -> None:
-        """Wrap a folder; use `create` or `open`."""
+        """Wrap a folder; use `begin`, `create` or `open`."""
         self.path = path
+
+    @classmethod
+    def begin(
+        cls, path: Path, config: TrainingConfig, command: str, *, resume: bool
+    ) -> TrainingFolder:
+        """Open the folder to resume its run, if it holds one, or create it. Raises UsageError."""
+        if resume and (path / CONFIG_FILE).exists():
+            return cls.open(path, config)
+        return cls.create(path, config, command)
 
     @classmethod
     def create(cls, path: Path, config: TrainingConfig, command: str) -> TrainingFolder:
         """Make the folder. Raises UsageError when it already holds a run."""
         if (path / CONFIG_FILE).exists():
             raise UsageError(
-                f"--out {path}: holds a training run already; --resume goes on with it"
+                f"{path}: holds a training run already; accepted: another folder, or resume"
             )
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"--out {path}: {error.strerror}") from None
+            raise UsageError(f"{path}: {error.strerror}") from None
         about = {
             "schema": SCHEMA,
             "created_utc": utc_now().isoformat(timespec="seconds"),
@@ -101,7 +110,7 @@ class TrainingFolder:
                 if getattr(theirs, name) != getattr(config, name)
             ]
             raise UsageError(
-                f"--resume: {path} was begun with another configuration "
+                f"{path}: the run to resume has another configuration "
                 f"({', '.join(changed)}); accepted: the same"
             )
         return folder

@@ -14,33 +14,25 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from airl_mav.cli.conformance import examination, run
-from airl_mav.cli.conformance_command import ConformanceCommand
+from airl_mav.cli.conformance import ConformanceOptions, run
 from airl_mav.conformance import vehicle_clock
-from airl_mav.conformance.checks import (
+from airl_mav.conformance.checklist import (
+    CheckDefinition,
+    CheckFailedError,
     Checklist,
-    FailedError,
+    Line,
     NotApplicableError,
     Outcome,
+    Transcript,
     require,
 )
-from airl_mav.conformance.inbox import Inbox
-from airl_mav.conformance.reference import StoredStep, Tolerance, load_reference, misses
+from airl_mav.conformance.mavlink_names import version_name
+from airl_mav.conformance.reference import StoredStep, Tolerance, deviations, load_reference
+from airl_mav.conformance.result import ConformanceResult, Settings
 from airl_mav.conformance.step_response import StepResponse, median_response, step_response
-from airl_mav.conformance.steps import (
-    MANOEUVRES,
-    QUIET_S,
-    STEP_NAMES,
-    Body,
-    Ned,
-    Step,
-    measure,
-    plan,
-)
-from airl_mav.conformance.track import Track
-from airl_mav.conformance.transcript import Line, Transcript
+from airl_mav.conformance.steps import BEFORE_S, MANOEUVRES, STEP_NAMES, Step, measure, plan
+from airl_mav.conformance.telemetry import Motion, Telemetry
 from airl_mav.conformance.vehicle_clock import Method, VehicleClock
-from airl_mav.conformance.words import version_name
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.loading import list_profiles
@@ -147,21 +139,21 @@ def test_median_of_flights() -> None:
 # --- steps read from telemetry
 
 
-def a_track(seconds: float, velocity: np.ndarray, yaw: np.ndarray, rate: np.ndarray) -> Track:
+def a_motion(seconds: float, velocity: np.ndarray, yaw: np.ndarray, rate: np.ndarray) -> Motion:
     """Telemetry at 100 Hz; velocity (n, 3), yaw and rate (n,)."""
     times = 100.0 + np.arange(0.0, seconds, 0.01)
-    motion = np.column_stack([times, np.zeros((len(times), 3)), velocity])
-    return Track(motion, np.column_stack([times, yaw, rate]))
+    position = np.column_stack([times, np.zeros((len(times), 3)), velocity])
+    return Motion(position, np.column_stack([times, yaw, rate]))
 
 
 def test_forward_is_along_the_heading_before_the_step() -> None:
     n = 600
-    after = np.arange(n) * 0.01 - QUIET_S
+    after = np.arange(n) * 0.01 - BEFORE_S
     speed = 2.0 * first_order(after, 0.1, 0.3)
     yaw = math.radians(120.0)
     velocity = np.column_stack([speed * math.cos(yaw), speed * math.sin(yaw), np.zeros(n)])
-    track = a_track(6.0, velocity, np.full(n, yaw), np.zeros(n))
-    found = measure(Step("forward-2", "forward", 0.0, 2.0), track, 100.0 + QUIET_S)
+    motion = a_motion(6.0, velocity, np.full(n, yaw), np.zeros(n))
+    found = measure(Step("forward-2", "forward", 0.0, 2.0), motion, 100.0 + BEFORE_S)
     assert found.rise_s == pytest.approx(0.3 * math.log(9.0), abs=0.011)
     assert found.t50_s == pytest.approx(0.1 + 0.3 * math.log(2.0), abs=0.011)
     assert found.error == pytest.approx(0.0, abs=1e-6)
@@ -170,35 +162,36 @@ def test_forward_is_along_the_heading_before_the_step() -> None:
 @pytest.mark.parametrize("target", [90.0, -90.0, 170.0])
 def test_heading_steps_in_degrees_across_any_wrap(target: float) -> None:
     n = 600
-    share = second_order(np.arange(n) * 0.01 - QUIET_S, 0.05, 6.0, 0.5)
+    share = second_order(np.arange(n) * 0.01 - BEFORE_S, 0.05, 6.0, 0.5)
     yaw = np.radians(target * share)
     wrapped = (yaw + math.pi) % (2.0 * math.pi) - math.pi
-    track = a_track(6.0, np.zeros((n, 3)), wrapped, np.zeros(n))
-    found = measure(Step("yaw-90", "heading", 0.0, target), track, 100.0 + QUIET_S)
+    motion = a_motion(6.0, np.zeros((n, 3)), wrapped, np.zeros(n))
+    found = measure(Step("yaw-90", "heading", 0.0, target), motion, 100.0 + BEFORE_S)
     assert found.overshoot_percent == pytest.approx(16.3, abs=0.3)
 
 
 def test_down_and_heading_rate_are_read_from_their_columns() -> None:
     n = 600
-    share = first_order(np.arange(n) * 0.01 - QUIET_S, 0.0, 0.2)
+    share = first_order(np.arange(n) * 0.01 - BEFORE_S, 0.0, 0.2)
     velocity = np.column_stack([np.zeros(n), np.zeros(n), -2.0 * share])
-    track = a_track(6.0, velocity, np.zeros(n), np.radians(30.0) * share)
+    motion = a_motion(6.0, velocity, np.zeros(n), np.radians(30.0) * share)
     for step in (Step("up-2", "down", 0.0, -2.0), Step("yawspeed-30", "heading rate", 0.0, 30.0)):
-        found = measure(step, track, 100.0 + QUIET_S)
+        found = measure(step, motion, 100.0 + BEFORE_S)
         assert found.rise_s == pytest.approx(0.2 * math.log(9.0), abs=0.011)
 
 
 def test_every_step_is_flown_once_and_starts_where_the_leg_before_it_ends() -> None:
     legs = plan(STEP_NAMES, mirrored=False)
     assert [leg.step.name for leg in legs if leg.step] == list(STEP_NAMES)
-    axes = {"north": 0, "east": 1, "down": 2, "forward": 0, "heading": 3, "heading rate": 3}
+    columns = {"north": 1, "east": 2, "down": 3, "forward": 1, "heading": 4, "heading rate": 4}
     for before, leg in pairwise(legs):
         if leg.step is None:
             continue
-        axis = axes[leg.step.reading]
-        assert before.setpoint[axis] == leg.step.before
-        assert leg.setpoint[axis] == leg.step.after
-        assert isinstance(leg.setpoint, Body) == (leg.step.reading in ("forward", "heading rate"))
+        column = columns[leg.step.quantity]
+        assert before.setpoint[column] == leg.step.before
+        assert leg.setpoint[column] == leg.step.after
+        in_body = leg.step.quantity in ("forward", "heading rate")
+        assert leg.setpoint.frame == ("body" if in_body else "ned")
 
 
 def test_mirrored_flights_come_back() -> None:
@@ -206,8 +199,7 @@ def test_mirrored_flights_come_back() -> None:
     for mirrored in (False, True):
         for leg in plan(STEP_NAMES, mirrored=mirrored):
             # Facing north all the time: forward is north.
-            assert isinstance(leg.setpoint, Ned | Body)
-            way += np.array(leg.setpoint[:2]) * leg.seconds
+            way += np.array(leg.setpoint[1:3]) * leg.seconds
             assert leg.step is None or np.sign(leg.step.after - leg.step.before) != 0
     assert way == pytest.approx([0.0, 0.0])
 
@@ -261,19 +253,19 @@ def response(latency_s: float = 0.1, rise_s: float = 1.0, overshoot: float = 3.0
     ],
 )
 def test_tolerances(measured: StepResponse, outside: list[str]) -> None:
-    assert [miss.figure for miss in misses(measured, STORED, Tolerance())] == outside
+    assert [each.figure for each in deviations(measured, STORED, Tolerance())] == outside
 
 
 def test_a_short_time_may_be_off_by_a_sample() -> None:
     short = StoredStep(latency_s=0.035)
-    assert not misses(response(latency_s=0.0449), short, Tolerance())
-    assert misses(response(latency_s=0.0451), short, Tolerance())
+    assert not deviations(response(latency_s=0.0449), short, Tolerance())
+    assert deviations(response(latency_s=0.0451), short, Tolerance())
 
 
 def test_overshoot_that_is_missing_is_a_miss() -> None:
     stored = StoredStep(overshoot_percent=15.0)
-    (miss,) = misses(response(overshoot=-3.0), stored, Tolerance())
-    assert miss.figure == "overshoot_percent"
+    (found,) = deviations(response(overshoot=-3.0), stored, Tolerance())
+    assert found.figure == "overshoot_percent"
 
 
 # --- checks and transcript
@@ -282,6 +274,11 @@ def test_overshoot_that_is_missing_is_a_miss() -> None:
 def a_checklist() -> tuple[Checklist, list[Line]]:
     shown: list[Line] = []
     return Checklist(Transcript(SimClock(), shown.append)), shown
+
+
+def a_result(checklist: Checklist, **found: Any) -> ConformanceResult:
+    settings = Settings("udpin://127.0.0.1:14540", "auto", 1.0, 10.0, STEP_NAMES, 1, False, 30.0)
+    return ConformanceResult(settings, checklist.checks, **found)
 
 
 def test_checks_and_what_they_find() -> None:
@@ -295,11 +292,10 @@ def test_checks_and_what_they_find() -> None:
         raise NotApplicableError("no rangefinder")
 
     assert checklist.perform("first", lambda: "quick")
-    assert checklist.passed
     assert checklist.perform("second", says_nothing)
-    assert checklist.passed
+    assert a_result(checklist).passed
     assert not checklist.perform("third", fails)
-    assert not checklist.passed
+    assert not a_result(checklist).passed
     outcomes = [(check.name, check.outcome, check.finding) for check in checklist.checks]
     assert outcomes == [
         ("first", Outcome.PASSED, "quick"),
@@ -325,16 +321,51 @@ def test_what_ends_a_flight_is_noted_and_goes_on(error: BaseException) -> None:
 
 def test_nothing_checked_is_nothing_passed() -> None:
     checklist, _ = a_checklist()
-    assert not checklist.passed
-    with pytest.raises(FailedError):
-        require(False, "nothing")
+    assert not a_result(checklist).passed
+
+
+def test_a_failed_essential_check_ends_its_table_and_steps_alone_need_fewer() -> None:
+    def fails(vehicle: str) -> str:
+        raise CheckFailedError(vehicle)
+
+    table = (
+        CheckDefinition("one", str.upper),
+        CheckDefinition("two", fails, for_steps=True),
+        CheckDefinition("three", fails, essential=True, for_steps=True),
+        CheckDefinition("four", str.upper, for_steps=True),
+    )
+    for steps_only, names in ((False, ["one", "two", "three"]), (True, ["two", "three"])):
+        checklist, _ = a_checklist()
+        assert not checklist.perform_all(table, "quad", steps_only=steps_only)
+        assert [check.name for check in checklist.checks] == names
+    assert checklist.perform_all(table[:2], "quad")
+
+
+@pytest.mark.parametrize(
+    ("found", "verdict"),
+    [
+        ({}, "FAILED: 1 passed, 1 failed, 0 not applicable: land"),
+        ({"interrupted": True}, "INTERRUPTED: 1 passed, 1 failed, 0 not applicable"),
+        (
+            {"known_to_be_down": False},
+            "FAILED: 1 passed, 1 failed, 0 not applicable: land; NOT known to be down",
+        ),
+    ],
+)
+def test_verdict(found: dict[str, Any], verdict: str) -> None:
+    checklist, _ = a_checklist()
+    checklist.perform("arm", lambda: "armed")
+    checklist.skip("land", "not reached")
+    result = a_result(checklist, **found)
+    assert result.verdict == verdict
+    assert not result.passed
 
 
 def test_repeated_lines_are_counted() -> None:
     shown: list[Line] = []
     transcript = Transcript(SimClock(2_500_000), shown.append)
     for text in ("a", "b", "b", "b", "c"):
-        transcript.say("heard", text)
+        transcript.add("heard", text)
     assert [line.text for line in shown] == ["a", "b", "... and 2 times more", "c"]
     assert transcript.lines == shown
     assert shown[0].time_s == 2.5
@@ -364,38 +395,30 @@ def test_columns_say_where_they_come_from() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"steps": ("north-3",)}, "--steps north-3: accepted: north-2, "),
-        ({"steps": ()}, "--steps: accepted: one name or more"),
-        ({"speed": 0.0}, "--speed 0: accepted: 0.01 <= value <= 100"),
-        ({"speed": math.nan}, "--speed nan: accepted: 0.01 <= value <= 100"),
-        ({"altitude": 7.0}, "--altitude 7: accepted: 8 <= value <= 100"),
-        ({"altitude": 1.0, "steps_only": True}, "--altitude 1: accepted: 2 <= value <= 100"),
-        ({"repeat": 0}, "--repeat 0: accepted: 1 <= value <= 20"),
-        ({"connect_timeout": 0.0}, "--connect-timeout 0: accepted: 1 <= value <= 3600"),
+        ({"steps": ("north-3",)}, "steps 'north-3': accepted: north-2, "),
+        ({"steps": ()}, "steps: accepted: one name or more"),
+        ({"speed": 0.0}, "speed 0: accepted: 0.01 <= value <= 100"),
+        ({"speed": math.nan}, "speed nan: accepted: 0.01 <= value <= 100"),
+        ({"altitude_m": 7.0}, "altitude_m 7: accepted: 8 <= value <= 100"),
+        ({"altitude_m": 1.0, "steps_only": True}, "altitude_m 1: accepted: 2 <= value <= 100"),
+        ({"repeat": 0}, "repeat 0: accepted: 1 <= value <= 20"),
+        ({"connect_timeout_s": 0.0}, "connect_timeout_s 0: accepted: 1 <= value <= 3600"),
         ({"reference": "betaflight"}, "'betaflight'; shipped: ardupilot, ardupilot-own-model, px4"),
-        ({"out": Path("no/such/folder/x.json")}, "--out no/such/folder/x.json: no folder"),
-        ({"skip_steps": True, "steps_only": True}, "--skip-steps: accepted: without --steps-only"),
-        ({"skip_steps": True, "steps": ("yaw-90",)}, "--skip-steps: accepted: without --steps"),
+        ({"out": Path("no/such/folder/x.json")}, "out 'no/such/folder/x.json': no folder"),
+        ({"skip_steps": True, "steps_only": True}, "skip_steps: accepted: without --steps-only"),
+        ({"skip_steps": True, "steps": ("yaw-90",)}, "skip_steps: accepted: without --steps"),
     ],
 )
 def test_input_that_cannot_be_used(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        examination(ConformanceCommand(**options))
+        run(ConformanceOptions(**options), Console(file=io.StringIO()))
     assert message in str(error.value)
-
-
-def test_what_is_flown() -> None:
-    every = examination(ConformanceCommand())
-    assert (every.steps, every.behaviour) == (STEP_NAMES, True)
-    assert examination(ConformanceCommand(skip_steps=True)).steps == ()
-    some = examination(ConformanceCommand(steps=("yaw-90",), steps_only=True))
-    assert (some.steps, some.behaviour) == (("yaw-90",), False)
 
 
 @pytest.mark.parametrize("url", ["nonsense", "udpin://127.0.0.1:not-a-port"])
 def test_a_connection_that_cannot_be(url: str) -> None:
     with pytest.raises(UsageError, match=re.escape(f"--connect {url}: ")):
-        run(ConformanceCommand(connect=url), Console(file=io.StringIO()))
+        run(ConformanceOptions(connect=url), Console(file=io.StringIO()))
 
 
 # --- what is heard
@@ -409,9 +432,9 @@ class Message:
         self.fields_json = json.dumps(fields)
 
 
-def an_inbox() -> tuple[Inbox, list[str]]:
+def a_telemetry() -> tuple[Telemetry, list[str]]:
     shown: list[str] = []
-    return Inbox(Transcript(SimClock(), lambda line: shown.append(line.text))), shown
+    return Telemetry(Transcript(SimClock(), lambda line: shown.append(line.text))), shown
 
 
 def a_text(text: str, number: int = 0, part: int = 0) -> Message:
@@ -419,22 +442,22 @@ def a_text(text: str, number: int = 0, part: int = 0) -> Message:
 
 
 def test_long_texts_are_put_together() -> None:
-    inbox, shown = an_inbox()
+    telemetry, shown = a_telemetry()
     whole = "Arming denied: Resolve system health failures first, then again"
     for message in (a_text(whole[:50], 7), a_text(whole[50:] + "\t", 7, 1), a_text("Armed", 8)):
-        inbox.hear(message, None)
-    assert [text.text for text in inbox.texts] == [whole, "Armed"]
+        telemetry.receive(message, None)
+    assert [text.text for text in telemetry.texts] == [whole, "Armed"]
     assert shown == [f'STATUSTEXT 2 "{whole}"', 'STATUSTEXT 2 "Armed"']
-    assert inbox.said("Armed") is not None
-    assert inbox.said("Arming", since=1) is None
+    assert telemetry.find_text("Armed") is not None
+    assert telemetry.find_text("Arming", since=1) is None
 
 
 def test_only_changes_of_a_heartbeat_are_told() -> None:
-    inbox, shown = an_inbox()
+    telemetry, shown = a_telemetry()
     beat = {"custom_mode": 4, "base_mode": 81, "system_status": 3, "autopilot": 3, "type": 2}
     for base_mode in (81, 81, 209, 209):
-        inbox.hear(Message("HEARTBEAT", **{**beat, "base_mode": base_mode}), None)
-    inbox.hear(Message("HEARTBEAT", component_id=154, **{**beat, "custom_mode": 0}), None)
+        telemetry.receive(Message("HEARTBEAT", **{**beat, "base_mode": base_mode}), None)
+    telemetry.receive(Message("HEARTBEAT", component_id=154, **{**beat, "custom_mode": 0}), None)
     assert shown == [
         "HEARTBEAT 4, disarmed, system_status 3",
         "HEARTBEAT 4, armed, system_status 3",
@@ -442,34 +465,39 @@ def test_only_changes_of_a_heartbeat_are_told() -> None:
 
 
 def test_motion_by_the_vehicles_clock() -> None:
-    inbox, _ = an_inbox()
+    telemetry, _ = a_telemetry()
     for time_boot_ms in range(1000, 3000, 10):
         position = {"x": 1.0, "y": 2.0, "z": -3.0, "vx": None, "vy": 0.5, "vz": 0.0}
-        inbox.hear(Message("LOCAL_POSITION_NED", time_boot_ms=time_boot_ms, **position), None)
-        inbox.hear(Message("ATTITUDE", time_boot_ms=time_boot_ms, yaw=0.1, yawspeed=0.2), None)
-    track = inbox.recent(0.5)
-    assert track.motion[0, 0] == pytest.approx(2.49)
-    assert track.motion[-1, 0] == inbox.boot_s == pytest.approx(2.99)
-    assert len(track.heading) == len(track.motion) == 51
-    assert np.isnan(track.motion[0, 4])
-    part = track.between(2.6, 2.7)
-    assert part.motion[:, 0] == pytest.approx(np.arange(2.6, 2.705, 0.01))
+        telemetry.receive(
+            Message("LOCAL_POSITION_NED", time_boot_ms=time_boot_ms, **position), None
+        )
+        telemetry.receive(
+            Message("ATTITUDE", time_boot_ms=time_boot_ms, yaw=0.1, yawspeed=0.2), None
+        )
+    motion = telemetry.recent(0.5)
+    assert motion.position[0, 0] == pytest.approx(2.49)
+    assert motion.position[-1, 0] == telemetry.boot_s == pytest.approx(2.99)
+    assert len(motion.heading) == len(motion.position) == 51
+    assert np.isnan(motion.position[0, 4])
+    part = motion.between(2.6, 2.7)
+    assert part.position[:, 0] == pytest.approx(np.arange(2.6, 2.705, 0.01))
 
 
 class Vehicle:
     """Answers, or not."""
 
-    def __init__(self, inbox: Inbox, *methods: Method) -> None:
-        self.inbox, self.methods = inbox, methods
+    def __init__(self, telemetry: Telemetry, *methods: Method) -> None:
+        self.telemetry, self.methods = telemetry, methods
+        self.clock = VehicleClock(telemetry, self.send, speed=0.0)
 
     def send(self, name: str, fields: dict[str, object]) -> None:
         if name == "TIMESYNC" and Method.TIMESYNC in self.methods:
             answer = Message(name, tc1=5_125_000_000, ts1=fields["ts1"])
-            self.inbox.hear(answer, None)
+            self.clock.receive(answer, None)
         elif name == "COMMAND_LONG" and Method.SYSTEM_TIME in self.methods:
             assert (fields["command"], fields["param1"]) == (512, 2)
-            self.inbox.hear(Message("COMMAND_ACK", command=512, result=0), None)
-            self.inbox.hear(Message("SYSTEM_TIME", time_boot_ms=5125), None)
+            self.telemetry.receive(Message("COMMAND_ACK", command=512, result=0), None)
+            self.clock.receive(Message("SYSTEM_TIME", time_boot_ms=5125), None)
 
 
 @pytest.mark.parametrize(
@@ -487,27 +515,28 @@ def test_the_time_is_asked_for_in_the_way_that_is_answered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(vehicle_clock, "ANSWER_S", 0.02)
-    inbox, shown = an_inbox()
-    clock = VehicleClock(inbox, Vehicle(inbox, *methods).send)
-    inbox.boot_s = 5.1
-    assert clock.choose() is chosen
-    sent_s, exact = clock.sending(clock.fix(), 5.1, 0.0)
+    telemetry, shown = a_telemetry()
+    clock = Vehicle(telemetry, *methods).clock
+    telemetry.boot_s = 5.1
+    assert clock.choose_method() is chosen
+    sent_s, exact = clock.sending_time()
     assert (pytest.approx(sent_s), exact) == told
     assert not shown, "its own answers are no news"
 
 
 def test_another_clock_is_not_taken_for_telemetrys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicle_clock, "ANSWER_S", 0.02)
-    inbox, _ = an_inbox()
-    clock = VehicleClock(inbox, Vehicle(inbox, Method.TIMESYNC).send)
-    inbox.boot_s = 1_700.0
-    assert clock.choose() is Method.TELEMETRY
+    telemetry, _ = a_telemetry()
+    clock = Vehicle(telemetry, Method.TIMESYNC).clock
+    telemetry.boot_s = 1_700.0
+    assert clock.choose_method() is Method.TELEMETRY
 
 
-def test_of_exchanges_the_first_short_one_is_taken_and_the_time_since_added() -> None:
-    inbox, _ = an_inbox()
+def test_of_exchanges_the_first_short_one_is_taken_and_the_time_since_added(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    telemetry, _ = a_telemetry()
     now_us = [0]
-    inbox.stopwatch.time_us = lambda: now_us[0]
     round_trips_us = [50_000, 9_000, 1_500, 1_000]
 
     def send(name: str, fields: dict[str, object]) -> None:
@@ -516,13 +545,11 @@ def test_of_exchanges_the_first_short_one_is_taken_and_the_time_since_added() ->
         now_us[0] += way_us
         tc1 = 10_000_000_000 + 2 * now_us[0] * 1000
         now_us[0] += way_us
-        inbox.hear(Message(name, tc1=tc1, ts1=fields["ts1"]), None)
+        clock.receive(Message(name, tc1=tc1, ts1=fields["ts1"]), None)
 
-    clock = VehicleClock(inbox, send)
-    fix = clock.fix()
-    assert fix is not None
-    assert (fix.round_trip_us, round_trips_us) == (1_500, [1_000])
-    now_us[0] += 700
-    sent_s, exact = clock.sending(fix, 0.0, 2.0)
+    clock = VehicleClock(telemetry, send, speed=2.0)
+    monkeypatch.setattr(clock.wall, "time_us", lambda: now_us[0])
+    sent_s, exact = clock.sending_time()
     assert exact
+    assert round_trips_us == [1_000]
     assert sent_s == pytest.approx(10.0 + 2e-6 * now_us[0], abs=1e-9)

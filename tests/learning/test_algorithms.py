@@ -7,8 +7,8 @@ from stable_baselines3 import PPO
 
 from airl_mav.core.errors import UsageError
 from airl_mav.training.algorithms import CLASSES, CONTINUOUS_ONLY, ROLLOUT, make_model
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from tests.support.toy_fleet import ToyFleet
 
 SHORT = {

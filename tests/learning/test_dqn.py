@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from stable_baselines3.common.logger import configure
 
 from airl_mav.training.algorithms import make_model
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.replay import NStepReplay
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from tests.support.toy_fleet import ToyFleet
 
 SHAPES = {"depth": ((1, 2, 2), np.dtype(np.uint8)), "goal": ((3,), np.dtype(np.float32))}

@@ -31,8 +31,8 @@ from airl_mav.policy.card import load_card, open_model, read_card
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.learned import decide, load_learned
 from airl_mav.profiles.computer import load_computer
-from airl_mav.training import export
-from airl_mav.training.sb3_export import export_sb3, network_of
+from airl_mav.training import onnx_export as export
+from airl_mav.training.export import export_sb3, network_of
 from tests.support.policy_kit import SPEC, Eye, export_tiny, facts, make_model, noise
 from tests.support.processes import ROOT
 
@@ -294,8 +294,26 @@ def test_a_foreign_zip_exports_with_one_command(
     code = airl(
         monkeypatch,
         *("export", zips / "dqn.zip", "--algorithm", "dqn", "--out", out),
-        *("--image", "32x24", "--fov", "90", "--range", "15", "--actions", "paper-25"),
-        *("--max-speed", "4", "--hold", "0.25", "--epsilon", "0.1", "--description", "a friend's"),
+        *(
+            "--image",
+            "32x24",
+            "--horizontal-fov-deg",
+            "90",
+            "--range-m",
+            "15",
+            "--actions",
+            "paper-25",
+        ),
+        *(
+            "--max-speed-m-s",
+            "4",
+            "--hold-s",
+            "0.25",
+            "--epsilon",
+            "0.1",
+            "--description",
+            "a friend's",
+        ),
     )
     assert code == 0
     card = read_card(out)
@@ -339,7 +357,7 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         ("text.zip", ["--algorithm", "DQN"], ["text.zip: not a .zip"]),
         ("empty.zip", ["--algorithm", "DQN"], ["empty.zip: not a model of DQN"]),
         ("sac.zip", ["--algorithm", "DQN"], ["sac.zip: not a model of DQN"]),
-        ("dqn.zip", ["--algorithm", "oracle"], ["--algorithm 'oracle'", "DQN", "PPO", "QRDQN"]),
+        ("dqn.zip", ["--algorithm", "oracle"], ["algorithm 'oracle'", "DQN", "PPO", "QRDQN"]),
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--image", "64x48"],
@@ -356,23 +374,27 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
             ["--algorithm", "TD3", "--actions", "velocity"],
             ["action space Box(-5.0, 5.0, (2,), float32)", "Box(-1.0, 1.0, (2,), float32)"],
         ),
-        ("dqn.zip", ["--algorithm", "DQN", "--image", "32"], ["--image '32'", "WIDTHxHEIGHT"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--image", "2x2"], ["height_px = 2", "4 <= value"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--image", "32"], ["image '32'", "WIDTHxHEIGHT"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--image", "2x2"], ["height_px 2", "4 <= value"]),
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--layout", "paper", "--image", "32x10"],
-            ["height_px = 10", "more than 10"],
+            ["height_px 10", "more than 10"],
         ),
-        ("dqn.zip", ["--algorithm", "DQN", "--fov", "200"], ["horizontal_fov_deg = 200", "< 170"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--range", "100"], ["range_m = 100", "<= 65 m"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--max-speed", "0"], ["max_speed_m_s = 0", "m/s"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--hold", "-1"], ["hold_s -1", "0 <= value <= 10 s"]),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--horizontal-fov-deg", "200"],
+            ["horizontal_fov_deg 200", "< 170"],
+        ),
+        ("dqn.zip", ["--algorithm", "DQN", "--range-m", "100"], ["range_m 100", "<= 65 m"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--max-speed-m-s", "0"], ["max_speed_m_s 0", "m/s"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--hold-s", "-1"], ["hold_s -1", "0 <= value <= 10 s"]),
         ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["epsilon 1.5", "value <= 1"]),
         ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["name 'a b'"]),
         (
             "sac.zip",
             ["--algorithm", "SAC", "--actions", "velocity", "--epsilon", "0.1"],
-            ["epsilon = 0.1", "0 with the action set 'velocity'"],
+            ["epsilon 0.1", "0 with the action set 'velocity'"],
         ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else value,
@@ -407,5 +429,5 @@ def test_out_that_is_a_file_is_refused(
     out.write_text("mine")
     code = airl(monkeypatch, "export", zips / "dqn.zip", "--algorithm", "DQN", "--out", out)
     assert code == 2
-    assert f"--out {out}: not a folder" in capsys.readouterr().err
+    assert f"{out}: not a folder" in capsys.readouterr().err
     assert out.read_text() == "mine"

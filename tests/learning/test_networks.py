@@ -13,6 +13,7 @@ from torch.nn import functional
 
 from airl_mav.core.errors import UsageError
 from airl_mav.training.algorithms import make_model
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import (
     DepthExtractor,
@@ -20,7 +21,6 @@ from airl_mav.training.networks import (
     flat_size,
     to_channels_last,
 )
-from airl_mav.training.spec import AlgorithmSpec, NetworkSpec
 from tests.support.toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
 
 

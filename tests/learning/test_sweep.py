@@ -33,8 +33,8 @@ from airl_mav.sweep.size_fit import fit_times, neighbours
 from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
 from airl_mav.sweep.trial import size_of, training_of, trials
+from airl_mav.training.config import NetworkSpec
 from airl_mav.training.networks import count_parameters
-from airl_mav.training.spec import NetworkSpec
 from tests.support.sweep_kit import TINY, fake_results, write_sweep_file
 
 MADE = provenance("airl sweep")

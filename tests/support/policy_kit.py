@@ -19,7 +19,7 @@ from torch import nn
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
-from airl_mav.training.sb3_export import export_sb3
+from airl_mav.training.export import export_sb3
 
 SPEC = ObservationSpec(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=20.0)
 """Fits the camera of the shipped vehicle `quad`: 64x48 px."""

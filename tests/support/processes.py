@@ -74,8 +74,8 @@ def children_of(pid: int) -> dict[str, int]:
     return found
 
 
-def _allow_interrupt() -> None:
-    # A runner in the background may have Ctrl-C switched off for all its children.
+def allow_interrupt() -> None:
+    """Let a child be interrupted: children inherit SIGINT ignored from a background runner."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -93,7 +93,7 @@ class Running:
                 stderr=subprocess.STDOUT,
                 cwd=folder,
                 env=environment,
-                preexec_fn=_allow_interrupt,
+                preexec_fn=allow_interrupt,
             )
         self.pid = self.process.pid
         self.children: dict[str, int] = {}

@@ -53,7 +53,7 @@ def test_an_environment_is_bounded_by_its_longest_latency() -> None:
     tight = bounded(spec)
     assert tight.max_speed_m_s == bound.safe_velocity_m_s < 5.0
     assert bounded(tight) == tight
-    assert "actions scaled by 0.86" in bound.in_words()
+    assert "actions scaled by 0.86" in bound.describe()
     env = NavigationVectorEnv(1, delay=PI, safe_velocity={"sensing_distance_m": 3.0})
     assert env.environment.action_spec.max_speed_m_s == tight.max_speed_m_s
 
@@ -63,7 +63,7 @@ def test_a_bound_above_the_fastest_action_is_told_and_does_nothing() -> None:
     bound = speed_bound(spec)
     assert bound is not None
     assert bounded(spec) == spec
-    assert "nothing is scaled" in bound.in_words()
+    assert "nothing is scaled" in bound.describe()
     assert speed_bound(spec_of(None, {"delay": PI})) is None
 
 

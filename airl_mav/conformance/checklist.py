@@ -1,0 +1,146 @@
+"""The transcript of a run, and its checks with their outcomes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from enum import Enum
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
+from companion.interfaces import LinkError
+
+LineKind = Literal["sent", "heard", "check", "note"]
+
+
+class Line(NamedTuple):
+    """One line of the transcript."""
+
+    time_s: float
+    """Since the start, in the vehicle's seconds [s]."""
+    kind: LineKind
+    text: str
+
+
+class Transcript:
+    """Everything sent and received, in its order; written by any thread."""
+
+    def __init__(self, clock: Clock, progress: Callable[[Line], None]) -> None:
+        """Start empty. `progress` is called with each line, by the thread that adds it."""
+        self._clock, self._progress = clock, progress
+        self._lock = threading.Lock()
+        self.lines: list[Line] = []
+        self._repeated = 0
+
+    @property
+    def time_s(self) -> float:
+        """The present time on the lines' scale [s]."""
+        return self._clock.time_us() / US_PER_S
+
+    def add(self, kind: LineKind, text: str) -> None:
+        """Add a line; one that repeats the last is only counted."""
+        with self._lock:
+            if self.lines and self.lines[-1][1:] == (kind, text):
+                self._repeated += 1
+                return
+            if self._repeated:
+                self._append("note", f"... and {self._repeated} times more")
+                self._repeated = 0
+            self._append(kind, text)
+
+    def _append(self, kind: LineKind, text: str) -> None:
+        line = Line(self.time_s, kind, text)
+        self.lines.append(line)
+        self._progress(line)
+
+
+class Outcome(Enum):
+    """The outcome of a check."""
+
+    PASSED = "pass"
+    FAILED = "fail"
+    NOT_APPLICABLE = "not applicable"
+
+
+class Check(NamedTuple):
+    """A check that was made."""
+
+    name: str
+    outcome: Outcome
+    finding: str
+    """One line."""
+    time_s: float
+    """How long it took, by the transcript's clock [s]."""
+
+
+class CheckFailedError(Exception):
+    """The finding of a check that fails."""
+
+
+class NotApplicableError(Exception):
+    """Why a check says nothing about this vehicle."""
+
+
+def require(condition: object, finding: str) -> None:
+    """Raise CheckFailedError with a finding unless a condition is true."""
+    if not condition:
+        raise CheckFailedError(finding)
+
+
+class CheckDefinition(NamedTuple):
+    """A check that can be made."""
+
+    name: str
+    function: Callable[[Any], str]
+    """Makes it on a Vehicle and returns its finding. Raises as `Checklist.perform` says."""
+    essential: bool = False
+    """Whether the rest of its table is left out when it fails."""
+    for_steps: bool = False
+    """Whether it is also made when step responses alone are asked for."""
+
+
+class Checklist:
+    """Checks in the order in which they are made."""
+
+    def __init__(self, transcript: Transcript) -> None:
+        self._transcript = transcript
+        self.checks: list[Check] = []
+
+    def perform(self, name: str, check: Callable[[], str]) -> bool:
+        """Make a check and return whether it did not fail.
+
+        The check returns its finding, or raises CheckFailedError or NotApplicableError. LinkError
+        and KeyboardInterrupt are noted as failed and raised again.
+        """
+        start_s = self._transcript.time_s
+        try:
+            self._note(name, Outcome.PASSED, check(), start_s)
+        except NotApplicableError as reason:
+            self._note(name, Outcome.NOT_APPLICABLE, str(reason), start_s)
+        except CheckFailedError as finding:
+            self._note(name, Outcome.FAILED, str(finding), start_s)
+            return False
+        except (LinkError, KeyboardInterrupt) as error:
+            self._note(name, Outcome.FAILED, str(error) or "interrupted", start_s)
+            raise
+        return True
+
+    def perform_all(
+        self, table: Iterable[CheckDefinition], vehicle: Any, *, steps_only: bool = False
+    ) -> bool:
+        """Make the checks of a table on a Vehicle, and return whether no essential one failed."""
+        return all(
+            self.perform(entry.name, partial(entry.function, vehicle)) or not entry.essential
+            for entry in table
+            if entry.for_steps or not steps_only
+        )
+
+    def skip(self, name: str, reason: str) -> None:
+        """Note a check that could not be made as failed."""
+        self._note(name, Outcome.FAILED, reason, self._transcript.time_s)
+
+    def _note(self, name: str, outcome: Outcome, finding: str, start_s: float) -> None:
+        self.checks.append(Check(name, outcome, finding, self._transcript.time_s - start_s))
+        self._transcript.add("check", f"{name}: {outcome.value}: {finding}")

@@ -1,0 +1,209 @@
+"""The whole run: the checks in their order. Whatever fails, the vehicle is brought down."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+
+from airl_mav.conformance.checklist import CheckFailedError, Checklist, Line, Transcript, require
+from airl_mav.conformance.flight_checks import (
+    FACING_EAST,
+    LANDING_CHECKS,
+    LOSS_CHECKS,
+    OFFBOARD_CHECKS,
+    hold,
+    setpoint_checks,
+    start_offboard,
+    takeoff,
+)
+from airl_mav.conformance.ground_checks import GROUND_CHECKS, heartbeat
+from airl_mav.conformance.reference import AUTO, judge, load_reference, summary
+from airl_mav.conformance.result import ConformanceResult, Settings
+from airl_mav.conformance.step_response import StepResponse
+from airl_mav.conformance.steps import (
+    BEFORE_S,
+    MANOEUVRES,
+    STEP_NAMES,
+    STOP_NED,
+    Leg,
+    MeasuredStep,
+    StepName,
+    measure,
+    plan,
+)
+from airl_mav.conformance.vehicle import Vehicle, raw_setpoints
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from companion.interfaces import LinkError
+
+FACE_NORTH_S = 5.0  # Before the first step, to turn north and stand [s]
+RESCUE_S = 300.0  # Longest landing after a failure [s]
+RESCUE_RETRY_S = 2.0  # A request to land is repeated so often while it is not answered [s]
+HEARTBEAT_S = 1.5  # A heartbeat comes within [s]
+
+
+def check_conformance(
+    connect: str = "udpin://127.0.0.1:14540",
+    *,
+    reference: str = AUTO,
+    speed: float = 1.0,
+    altitude_m: float = 10.0,
+    steps: Sequence[StepName] = STEP_NAMES,
+    repeat: int = 1,
+    steps_only: bool = False,
+    connect_timeout_s: float = 30.0,
+    progress: Callable[[Line], None] | None = None,
+) -> ConformanceResult:
+    """Fly a flight controller through all checks and step responses. It takes off.
+
+    Whatever fails, the vehicle is landed first. Ctrl-C (KeyboardInterrupt) lands it too: the
+    result is then `interrupted`.
+
+    Args:
+        connect: MAVSDK connection, udpin://HOST:PORT or serial://DEVICE:BAUD.
+        reference: Stored step responses: auto (by the autopilot), px4, ardupilot, or a path to a
+            .toml.
+        speed: Simulated seconds per wall second of the vehicle, 0.01 to 100; 1 for a real one.
+        altitude_m: Take-off altitude, 8 to 100, with `steps_only` from 2 [m].
+        steps: Names of the steps to fly; none: ().
+        repeat: How often the steps are flown, 1 to 20; every other time mirrored.
+        steps_only: Whether refusals, frames, offboard loss and hold are left out.
+        connect_timeout_s: Longest wait for a flight controller, 1 to 3600 [wall s].
+        progress: Called with each line of the transcript as it is added, by any thread.
+
+    Returns:
+        All checks, step responses and the transcript.
+
+    Raises:
+        UsageError: A value is out of range, the connection is invalid or its port taken, nobody
+            is heard, or the autopilot or the stored column is not known. Nothing has been
+            commanded then.
+    """
+    settings = Settings(
+        connect, reference, speed, altitude_m, tuple(steps), repeat, steps_only, connect_timeout_s
+    )
+    if reference != AUTO:
+        load_reference(reference, 0)
+    transcript = Transcript(WallClock(speed), progress or (lambda _: None))
+    checklist = Checklist(transcript)
+    result = ConformanceResult(settings, checklist.checks, transcript.lines)
+    with closing(Vehicle(connect, speed, transcript)) as vehicle:
+        transcript.add("note", f"waiting for a flight controller on {connect}")
+        try:
+            vehicle.connect(connect_timeout_s)
+            _check(vehicle, checklist, result)
+        except LinkError:
+            pass  # Noted with the check that met it.
+        except KeyboardInterrupt:
+            result.interrupted = True
+        result.heartbeat = vehicle.telemetry.latest("HEARTBEAT")
+        result.autopilot_version = vehicle.telemetry.latest("AUTOPILOT_VERSION")
+    if result.reference is not None and result.steps:
+        for name in STEP_NAMES:
+            if name in settings.steps:
+                found, stored = result.steps.get(name), result.reference
+                checklist.perform(f"step {name}", lambda: judge(found, stored))  # noqa: B023
+    return result
+
+
+def _check(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
+    """Make all checks, as far as one leads to the next. Raises UsageError and LinkError."""
+    settings = result.settings
+    if not checklist.perform("heartbeat", lambda: heartbeat(vehicle)):
+        return
+    beat = vehicle.telemetry.latest("HEARTBEAT") or {}
+    result.reference = load_reference(settings.reference, beat["autopilot"])
+    vehicle.unasked_hz = result.reference.streams_hz
+    try:
+        if checklist.perform_all(GROUND_CHECKS, vehicle, steps_only=settings.steps_only):
+            _check_in_air(vehicle, checklist, result)
+    finally:
+        _bring_down(vehicle, result)
+
+
+def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
+    """Make the checks in the air; the vehicle is armed."""
+    settings = result.settings
+    checklist.perform("takeoff", lambda: takeoff(vehicle, settings.altitude_m))
+    if vehicle.height_m < settings.altitude_m / 2.0:
+        return
+    if not settings.steps_only:
+        checklist.perform_all(OFFBOARD_CHECKS, vehicle)
+        vehicle.call("offboard.stop()", vehicle.offboard.stop)
+        with raw_setpoints(vehicle, FACING_EAST) as stream:
+            checklist.perform_all(setpoint_checks(stream), vehicle)
+    if settings.steps:
+        checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))
+        vehicle.call("offboard.stop()", vehicle.offboard.stop)
+    if not settings.steps_only:
+        if not checklist.perform_all(LOSS_CHECKS, vehicle):
+            checklist.skip("setpoints resume", "not reached")
+        checklist.perform("hold", lambda: hold(vehicle))
+    checklist.perform_all(LANDING_CHECKS, vehicle)
+
+
+def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, MeasuredStep]) -> str:
+    """Fly the steps; responses are added as they come. Raises CheckFailedError, LinkError."""
+    steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
+    start_offboard(vehicle, STOP_NED)
+    vehicle.wait(FACE_NORTH_S)
+    inexact = 0
+    for repetition in range(settings.repeat):
+        for leg in plan(settings.steps, mirrored=repetition % 2 == 1):
+            response, exact = _fly_leg(vehicle, leg)
+            inexact += not exact
+            if leg.step is not None and response is not None:
+                name = leg.step.name
+                vehicle.transcript.add("note", f"{name}: {summary(response)}")
+                measured.setdefault(name, MeasuredStep(steps[name], [])).flights.append(response)
+    finding = f"{sum(len(each.flights) for each in measured.values())} steps"
+    finding += f", timed by {vehicle.clock.method.value}"
+    return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
+
+
+def _fly_leg(vehicle: Vehicle, leg: Leg) -> tuple[StepResponse | None, bool]:
+    """Hold a setpoint for its time; return the response, and whether its time is exact."""
+    sent_s, exact = vehicle.fly(leg.setpoint)
+    vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
+    offboard = vehicle.mode == vehicle.autopilot.offboard_mode
+    require(offboard, f"it left offboard: {vehicle.mode_name}")
+    if leg.step is None:
+        return None, exact
+    motion = vehicle.telemetry.recent(leg.seconds + 2.0 * BEFORE_S)
+    try:
+        motion = motion.between(sent_s - BEFORE_S, sent_s + leg.seconds)
+        return measure(leg.step, motion, sent_s), exact
+    except ValueError as error:
+        raise CheckFailedError(f"{leg.step.name}: {error}") from None
+
+
+def _bring_down(vehicle: Vehicle, result: ConformanceResult) -> None:
+    """Land if it is still armed; repeat the request until it answers. Ctrl-C gives it up."""
+    if not vehicle.may_be_armed:
+        return
+    note = vehicle.transcript.add
+    with suppress(LinkError):
+        # The heartbeat, once a second, may not have told it yet.
+        vehicle.wait_for(lambda: vehicle.armed, HEARTBEAT_S)
+    if not vehicle.armed and vehicle.telemetry.silence_s < HEARTBEAT_S:
+        return
+    note("note", "still armed: landing")
+    result.known_to_be_down = answered = False
+    stopwatch = WallClock(vehicle.speed)
+    try:
+        while stopwatch.time_us() < RESCUE_S * US_PER_S:
+            try:
+                answered = answered or not vehicle.call("action.land()", vehicle.action.land)
+                if vehicle.wait_for(lambda: not vehicle.armed, RESCUE_RETRY_S):
+                    result.known_to_be_down = True
+                    note("note", "landed and disarmed")
+                    return
+            except LinkError as error:
+                # It may be heard again.
+                note("note", f"{error}: trying to land")
+                answered = False
+                retry_us = stopwatch.time_us() + int(RESCUE_RETRY_S * US_PER_S)
+                stopwatch.sleep_until(retry_us)
+    finally:
+        if not result.known_to_be_down:
+            note("note", "NOT known to be down: take over")

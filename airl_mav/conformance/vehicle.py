@@ -1,0 +1,345 @@
+"""The vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
+
+Waits follow the vehicle's own clock, so that they mean the same at any speed of a simulation; its
+silence is measured by the wall clock.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+from mavsdk import ComponentType
+from mavsdk.exceptions import MavsdkError
+from mavsdk.plugins.action import Action
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
+from mavsdk.plugins.offboard import Offboard, VelocityBodyYawspeed, VelocityNedYaw
+
+from airl_mav.conformance import telemetry, vehicle_clock
+from airl_mav.conformance.autopilots import AUTOPILOTS, PX4, Autopilot
+from airl_mav.conformance.checklist import Transcript
+from airl_mav.conformance.mavlink_names import (
+    ARMED_FLAG,
+    CUSTOM_MODE_FLAG,
+    MavCommand,
+    MavFrame,
+    name_of,
+)
+from airl_mav.conformance.steps import Setpoint
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from companion.connection import first_autopilot, open_connection
+from companion.interfaces import LinkError
+
+POLL_S = 0.02  # How often a condition is looked at [wall s]
+SILENT_S = 5.0
+"""A vehicle counts as lost when nothing is received for so long; heartbeats come each second
+[wall s]."""
+
+SLOWEST, SLACK_S = 20.0, 10.0
+"""A wait is given up when it takes so many times as long by the wall clock, and so many seconds
+more [1, wall s]."""
+
+# MAVSDK repeats a command within 2 s of wall time; simulators have been seen to stall longer.
+COMMAND_ATTEMPTS = 5
+MODE_S = 3.0  # Longest wait until the heartbeat, which comes each second, shows a new mode [s]
+STREAM_PERIOD_S = 0.05  # Raw setpoints are repeated at 20 Hz, as MAVSDK repeats its own [s]
+
+# SET_POSITION_TARGET_LOCAL_NED.type_mask: a bit says what to ignore.
+VELOCITY_AND_YAW = 0x9C7
+VELOCITY = 0xDC7
+VELOCITY_FORCE_BIT = 0xFC7
+IGNORE_ALL = 0xDFF
+
+
+class Vehicle:
+    """One vehicle, observed and commanded."""
+
+    def __init__(self, url: str, speed: float, transcript: Transcript) -> None:
+        """Open a MAVSDK connection. Raises UsageError if its URL is invalid or its port taken.
+
+        `speed` is the simulated seconds per wall second of the vehicle.
+        """
+        self.url, self.speed = url, speed
+        self.transcript = transcript
+        self.telemetry = telemetry.Telemetry(transcript)
+        self.clock = vehicle_clock.VehicleClock(self.telemetry, self.send, speed)
+        self.autopilot: Autopilot = PX4
+        self.unasked_hz: Mapping[str, float] = {}
+        """Messages that are expected without asking [Hz]."""
+        # PX4 sends STATUSTEXT only where it hears a ground station.
+        self._mavsdk = open_connection(url, ComponentType.GROUND_STATION)
+        self._direct: Any = None
+        self.action: Any = None
+        self.offboard: Any = None
+        self._target = 0
+        self.may_be_armed = False
+        """Whether it was asked to arm, and has not disarmed after it as far as is known."""
+
+    def connect(self, timeout_s: float) -> None:
+        """Wait for a flight controller. Raises UsageError if none is heard in time [wall s]."""
+        system = first_autopilot(self._mavsdk, timeout_s)
+        if system is None:
+            raise UsageError(
+                f"--connect {self.url}: no flight controller heard in {timeout_s:g} s "
+                "(--connect-timeout-s)"
+            )
+        self._target = system.get_system_id()
+        self._direct = MavlinkDirect(system)
+        for names, receive in (
+            (telemetry.MESSAGES, self.telemetry.receive),
+            (vehicle_clock.MESSAGES, self.clock.receive),
+        ):
+            for name in names:
+                self._direct.subscribe_message(name, receive)
+        self.action, self.offboard = Action(system), Offboard(system)
+
+    def expect_autopilot(self, number: int) -> None:
+        """Expect the behaviour of a HEARTBEAT.autopilot. Raises UsageError if it is not known."""
+        if number not in AUTOPILOTS:
+            known = ", ".join(f"{key} {each.title}" for key, each in AUTOPILOTS.items())
+            raise UsageError(
+                f"--connect {self.url}: HEARTBEAT.autopilot = {number}; accepted: {known}"
+            )
+        self.autopilot = AUTOPILOTS[number]
+        self.telemetry.mode_name = self.autopilot.mode_name
+
+    def close(self) -> None:
+        """Release MAVSDK."""
+        for plugin in (self.offboard, self.action, self._direct):
+            if plugin is not None:
+                plugin.destroy()
+        self._mavsdk.destroy()
+
+    # --- commands
+
+    def call(self, what: str, call: Callable[[], Any]) -> str:
+        """Make a call into MAVSDK; return "" when it succeeded, else the result's name."""
+        self.transcript.add("sent", what)
+        try:
+            call()
+        except MavsdkError as error:
+            result = getattr(error, "result", None) or error.args[0]
+            name = str(getattr(result, "name", result))
+            self.transcript.add("heard", f"{what}: {name}")
+            return name
+        return ""
+
+    def call_or_fail(self, what: str, call: Callable[[], Any]) -> None:
+        """Make a call into MAVSDK. Raises LinkError when it is refused."""
+        if reason := self.call(what, call):
+            raise LinkError(f"{what}: {reason}")
+
+    def command(self, number: int, *params: float, note: str = "") -> int:
+        """Send a COMMAND_LONG, repeat it while it is not answered, and return its MAV_RESULT.
+
+        Parameters that are left out are 0. Raises LinkError without an answer.
+        """
+        values = " ".join(f"{value:g}" for value in params)
+        what = f"{name_of(MavCommand, number)} {values}".strip()
+        self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
+        padded = (*params, *[0.0] * 7)[:7]
+        numbered = {f"param{index}": value for index, value in enumerate(padded, 1)}
+        command = {"command": int(number), "confirmation": 0, **numbered}
+        message = self._message("COMMAND_LONG", command)
+        for left in reversed(range(COMMAND_ATTEMPTS)):
+            try:
+                answer = self._direct.send_command(message)
+                return int(json.loads(answer.fields_json)["result"])
+            except MavlinkDirectError as error:
+                problem = f"{what}: {error.result.name.lower()}"
+                self.transcript.add("note", f"{problem}, {left} more attempts")
+        raise LinkError(problem)
+
+    def set_mode(self, mode: tuple[int, int], note: str) -> int:
+        """Request a mode, by DO_SET_MODE's parameters 2 and 3, and return the MAV_RESULT."""
+        flags = CUSTOM_MODE_FLAG | (ARMED_FLAG if self.armed else 0)
+        return self.command(MavCommand.DO_SET_MODE, flags, *mode, note=note)
+
+    def fly(self, setpoint: Setpoint) -> tuple[float, bool]:
+        """Give MAVSDK a setpoint, which it sends at once and then repeats at 20 Hz.
+
+        Returns:
+            When it reached the vehicle, by its clock [s], and whether from an exchange.
+        """
+        reached: list[tuple[float, bool]] = []
+
+        def send() -> None:
+            reached.append(self.clock.sending_time())
+            if setpoint.frame == "ned":
+                self.offboard.set_velocity_ned(VelocityNedYaw(*setpoint[1:]))
+            else:
+                self.offboard.set_velocity_body(VelocityBodyYawspeed(*setpoint[1:]))
+
+        values = ", ".join(f"{value:g}" for value in setpoint[1:])
+        self.call_or_fail(f"set_velocity_{setpoint.frame}({values})", send)
+        (reached_s, exact), latest = reached[0], self.clock.exchange()
+        # A simulation may have stalled in between: it was not later than this second exchange.
+        return (reached_s if latest is None else min(reached_s, latest.boot_s)), exact
+
+    def send(self, name: str, fields: dict[str, Any]) -> None:
+        """Send a raw message; None in a field is NaN. Raises LinkError."""
+        try:
+            self._direct.send_message(self._message(name, fields))
+        except MavlinkDirectError as error:
+            raise LinkError(f"{name}: {error.result.name.lower()}") from None
+
+    def _message(self, name: str, fields: dict[str, Any]) -> MavlinkMessage:
+        target = {"target_system": self._target, "target_component": telemetry.AUTOPILOT_COMPONENT}
+        return MavlinkMessage(name, fields_json=json.dumps({**target, **fields}))
+
+    # --- waiting
+
+    def poll(self) -> None:
+        """Wait until the next look. Raises LinkError when the vehicle is silent."""
+        threading.Event().wait(POLL_S)
+        if self.telemetry.silence_s > SILENT_S:
+            raise LinkError(f"nothing heard for {SILENT_S:g} s")
+
+    def wait_for(self, condition: Callable[[], Any], timeout_s: float) -> Any:
+        """Wait for a condition, by the vehicle's clock, and return its last value.
+
+        Raises LinkError if the vehicle is silent, or its clock stands still.
+        """
+        start_s, wall = self.telemetry.boot_s, WallClock()
+        while not (value := condition()):
+            elapsed_s = self.telemetry.boot_s - start_s
+            if elapsed_s >= timeout_s:
+                return value
+            if wall.time_us() / US_PER_S > SLOWEST * timeout_s / self.speed + SLACK_S:
+                raise LinkError(f"its clock advanced by only {elapsed_s:.1f} s")
+            self.poll()
+        return value
+
+    def wait(self, seconds: float) -> None:
+        """Wait for a time by the vehicle's clock [s]. Raises as `wait_for`."""
+        self.wait_for(lambda: False, seconds)
+
+    def reaches_mode(self, *modes: int) -> bool:
+        """Wait for one of these custom_modes; return whether it came within `MODE_S`."""
+        return bool(self.wait_for(lambda: self.mode in modes, MODE_S))
+
+    def count_messages(self, seconds: float) -> tuple[Counter[str], float]:
+        """Count all messages for a while; return their numbers and the vehicle's time [s]."""
+        counts: Counter[str] = Counter()
+
+        def count(message: Any, _: object) -> None:
+            if message.component_id == telemetry.AUTOPILOT_COMPONENT:
+                counts[message.message_name] += 1
+
+        stopwatch, start_s = WallClock(self.speed), self.clock.now()
+        every = self._direct.subscribe_message("", count)  # too costly to keep
+        try:
+            stopwatch.sleep_until(int(seconds * US_PER_S))
+            elapsed_s = self.clock.now() - start_s or stopwatch.time_us() / US_PER_S
+        finally:
+            self._direct.unsubscribe_message(every)
+        return counts, elapsed_s
+
+    # --- state
+
+    @property
+    def armed(self) -> bool:
+        """Whether the newest heartbeat says armed."""
+        return bool(self._newest("HEARTBEAT", "base_mode") & ARMED_FLAG)
+
+    @property
+    def mode(self) -> int:
+        """custom_mode of the newest heartbeat, -1 before the first."""
+        return int(self._newest("HEARTBEAT", "custom_mode", -1))
+
+    @property
+    def mode_name(self) -> str:
+        """Name of the present mode."""
+        return self.autopilot.mode_name(self.mode)
+
+    @property
+    def landed_state(self) -> int:
+        """Newest landed_state, 0 when it is not known."""
+        return int(self._newest("EXTENDED_SYS_STATE", "landed_state"))
+
+    @property
+    def height_m(self) -> float:
+        """Estimated height above the origin [m]."""
+        return -float(self._newest("LOCAL_POSITION_NED", "z"))
+
+    @property
+    def velocity_m_s(self) -> tuple[float, float, float]:
+        """Estimated velocity, north, east, down [m/s]."""
+        north, east, down = (
+            self._newest("LOCAL_POSITION_NED", name) or 0.0 for name in ("vx", "vy", "vz")
+        )
+        return north, east, down
+
+    @property
+    def speed_m_s(self) -> float:
+        """Estimated speed [m/s]."""
+        return math.hypot(*self.velocity_m_s)
+
+    def _newest(self, name: str, field: str, default: int = 0) -> Any:
+        """Return a field of the newest message of a name."""
+        fields = self.telemetry.latest(name)
+        return default if fields is None else fields[field]
+
+
+class RawSetpoint(NamedTuple):
+    """SET_POSITION_TARGET_LOCAL_NED; None is NaN."""
+
+    frame: MavFrame = MavFrame.LOCAL_NED
+    mask: int = VELOCITY_AND_YAW
+    vx: float | None = 0.0
+    yaw_rad: float = 0.0
+
+
+class SetpointStream:
+    """Repeats the newest raw setpoint, and stops while heartbeats go on: MAVSDK's own cannot."""
+
+    def __init__(self, vehicle: Vehicle, setpoint: RawSetpoint) -> None:
+        self._vehicle, self._setpoint = vehicle, setpoint
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="setpoints", daemon=True)
+        self._thread.start()
+
+    def send(self, setpoint: RawSetpoint) -> None:
+        """Send another setpoint, now and from now on."""
+        self._setpoint = setpoint
+        self._send()
+
+    def stop(self) -> None:
+        """Stop; nothing is repeated after it returns."""
+        self._stop.set()
+        self._thread.join()
+
+    def _send(self) -> None:
+        frame, mask, vx, yaw_rad = self._setpoint
+        zeros = dict.fromkeys(("x", "y", "z", "vy", "vz", "afx", "afy", "afz", "yaw_rate"), 0.0)
+        fields = {"time_boot_ms": 0, "coordinate_frame": int(frame), "type_mask": mask, **zeros}
+        self._vehicle.send("SET_POSITION_TARGET_LOCAL_NED", {**fields, "vx": vx, "yaw": yaw_rad})
+
+    def _run(self) -> None:
+        clock = WallClock(self._vehicle.speed)
+        due_us = clock.time_us()
+        while not self._stop.is_set():
+            try:
+                self._send()
+            except LinkError:
+                return  # The main thread notices the silence.
+            # Missed setpoints are not made up for.
+            due_us = max(due_us + int(STREAM_PERIOD_S * US_PER_S), clock.time_us())
+            clock.sleep_until(due_us, self._stop)
+
+
+@contextmanager
+def raw_setpoints(vehicle: Vehicle, setpoint: RawSetpoint) -> Iterator[SetpointStream]:
+    """Repeat raw setpoints until the context ends, or they are stopped."""
+    stream = SetpointStream(vehicle, setpoint)
+    try:
+        yield stream
+    finally:
+        stream.stop()

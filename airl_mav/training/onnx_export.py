@@ -1,0 +1,241 @@
+"""From a trained network to a policy that flies: ONNX and its card, checked against torch."""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.policy.card import (
+    ONNX_FILE,
+    TORCH_FILE,
+    PolicyCard,
+    PolicyFacts,
+    digest,
+    write_card,
+)
+from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
+from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime
+
+OPSET = 18
+"""ONNX operators: the newest that torch writes without a conversion."""
+
+TOLERANCE = 1e-4
+"""Greatest error of an exported output, in shares of the greatest output (at least 1)."""
+
+CHECKED_ROWS = (1, 3, 64)
+"""Batches on which a network and its export are compared."""
+
+
+class Layer(NamedTuple):
+    """A layer that took part in an inference."""
+
+    text: str
+    macs: int
+
+
+def layers(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> list[Layer]:
+    """Run a network once and return its convolutions and dense layers in order.
+
+    Args:
+        module: The network.
+        inputs: Its inputs, with one row each.
+    """
+    found: list[Layer] = []
+
+    def note(layer: nn.Module, _: Any, output: torch.Tensor) -> None:
+        if isinstance(layer, nn.Conv2d):
+            kernel = "x".join(str(side) for side in layer.kernel_size)
+            stride = "" if set(layer.stride) == {1} else f"/{layer.stride[0]}"
+            text = f"conv {layer.out_channels} {kernel}{stride}"
+            found.append(Layer(text, output.numel() * layer.weight[0].numel()))
+        elif isinstance(layer, nn.Linear):
+            found.append(Layer(f"dense {layer.out_features}", output.numel() * layer.in_features))
+
+    with _hooked(module, note), torch.no_grad():
+        module(*inputs)
+    return found
+
+
+def count_macs(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
+    """Return the multiply-accumulates of one inference, in convolutions and dense layers."""
+    return sum(layer.macs for layer in layers(module, inputs))
+
+
+def count_parameters(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
+    """Return the weights and biases of the layers that take part in an inference."""
+    used: dict[int, int] = {}
+
+    def note(layer: nn.Module, _: Any, __: Any) -> None:
+        used.update((id(weights), weights.numel()) for weights in layer.parameters(recurse=False))
+
+    with _hooked(module, note), torch.no_grad():
+        module(*inputs)
+    return sum(used.values())
+
+
+def export_network(
+    module: nn.Module, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
+) -> PolicyCard:
+    """Write a network as `policy.onnx` with its card, and return the card.
+
+    Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
+    without a card, or an old card that refuses the new policy: never a card for the wrong one.
+
+    Args:
+        module: Takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; returns a
+            score for each discrete action (n, k), or the continuous action (n, 2). Scaling the
+            image is its own business.
+        facts: What the card says beyond the network.
+        folder: Where to write; made if need be.
+        with_torch: Also write the network as a torch program.
+
+    Raises:
+        UsageError: The network does not fit the facts, cannot be exported, or the export differs.
+    """
+    spec = facts.observation
+    example = _tensors(spec, random_inputs(spec, 2, np.random.default_rng(0)))
+    with _quiet():
+        try:
+            module = copy.deepcopy(module).cpu().eval()
+            program = _program(module, example)
+            onnx = _onnx(program)
+        except Exception as error:  # torch's exporter raises all kinds.
+            raise UsageError(f"torch cannot export the network: {_line(error)}") from error
+        archive = _archive(program) if with_torch else None
+    try:
+        _compare(module, OnnxRuntime(onnx, spec, facts.actions), spec, "ONNX Runtime")
+        if archive is not None:
+            _compare(module, TorchRuntime(archive, spec), spec, "the torch program")
+    except ValueError as error:
+        raise UsageError(f"the exported network: {error}") from None
+    one = tuple(tensor[:1] for tensor in example)
+    parts = layers(module, one)
+    card = PolicyCard(
+        **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
+        sha256=digest(onnx),
+        torch_sha256=None if archive is None else digest(archive),
+        network=", ".join(part.text for part in parts),
+        parameters=count_parameters(module, one),
+        macs=sum(part.macs for part in parts),
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    replace_file(folder / ONNX_FILE, onnx)
+    if archive is not None:
+        replace_file(folder / TORCH_FILE, archive)
+    write_card(folder, card)
+    if archive is None:
+        (folder / TORCH_FILE).unlink(missing_ok=True)
+    return card
+
+
+def random_inputs(spec: ObservationSpec, n: int, rng: np.random.Generator) -> Encoded:
+    """Return arrays of a layout with n rows of noise."""
+    return {
+        key: rng.integers(0, 256, (n, *box.shape), np.uint8)
+        if key == DEPTH
+        else rng.normal(0.0, 2.0, (n, *box.shape)).astype(np.float32)
+        for key, box in boxes(spec).items()
+    }
+
+
+def _compare(module: nn.Module, runtime: Runtime, spec: ObservationSpec, name: str) -> None:
+    """Raise ValueError unless a runtime gives what the network gives."""
+    rng = np.random.default_rng(1)
+    for n in CHECKED_ROWS:
+        inputs = random_inputs(spec, n, rng)
+        with torch.no_grad():
+            wanted: NDArray[np.float32] = module(*_tensors(spec, inputs)).numpy()
+        found = runtime.infer(inputs)
+        if found.shape != wanted.shape or not np.isfinite(wanted).all():
+            raise ValueError(f"torch gives {wanted.shape}, {name} {found.shape}, or no numbers")
+        error = float(np.abs(found - wanted).max())
+        if not error <= TOLERANCE * max(1.0, float(np.abs(wanted).max())):
+            raise ValueError(f"{name} is off by {error:.3g}; accepted: {TOLERANCE:g} of the output")
+
+
+def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.export.ExportedProgram:
+    """Trace a network with a free number of rows, without the paths of this machine."""
+    rows = {0: torch.export.Dim("n", min=1)}
+    program = torch.export.export(module, example, dynamic_shapes=tuple(rows for _ in example))
+    for node in program.graph.nodes:
+        node.meta.pop("stack_trace", None)
+    return program
+
+
+def _onnx(program: torch.export.ExportedProgram) -> bytes:
+    """Turn a program into ONNX, weights inside, without notes on where each operator came from."""
+    written = torch.onnx.export(
+        program,
+        args=(),
+        dynamo=True,
+        opset_version=OPSET,
+        external_data=False,
+        output_names=[ACTION],
+        verbose=False,
+    )
+    assert written is not None  # noqa: S101 (it is None only for the old exporter)
+    model = written.model_proto
+    graph = model.graph
+    graph.ClearField("metadata_props")
+    graph.ClearField("value_info")
+    for entry in (*graph.node, *graph.input, *graph.output, *graph.initializer):
+        entry.ClearField("metadata_props")
+        entry.ClearField("doc_string")
+    for value in (*graph.input, *graph.output):
+        value.type.tensor_type.shape.dim[0].dim_param = "n"
+    data: bytes = model.SerializeToString(deterministic=True)
+    return data
+
+
+def _archive(program: torch.export.ExportedProgram) -> bytes:
+    """Return a program as the bytes of a .pt2 file."""
+    buffer = io.BytesIO()
+    torch.export.save(program, buffer)
+    return buffer.getvalue()
+
+
+def _tensors(spec: ObservationSpec, inputs: Encoded) -> tuple[torch.Tensor, ...]:
+    return tuple(torch.from_numpy(inputs[key]) for key in boxes(spec))
+
+
+@contextmanager
+def _hooked(module: nn.Module, hook: Callable[[nn.Module, Any, Any], None]) -> Iterator[None]:
+    """Call a hook after each part of a network that runs."""
+    handles = [part.register_forward_hook(hook) for part in module.modules()]
+    try:
+        yield
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence what torch's exporter has to say about its own future and about torchvision."""
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
+
+
+def _line(error: Exception) -> str:
+    """Return the first line of an error."""
+    return (str(error) or type(error).__name__).splitlines()[0]
