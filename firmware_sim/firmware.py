@@ -10,6 +10,7 @@ from typing import Protocol
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.state import Message
 from firmware_sim.flight_controller import FlightController
@@ -131,7 +132,22 @@ class Loaded:
 class Firmware:
     """Flies one episode after the other; its links and its camera stay."""
 
-    def __init__(self, avionics: Avionics, camera: FrameServer | None, pacing: Pacing) -> None:
+    def __init__(
+        self,
+        avionics: Avionics,
+        camera: FrameServer | None,
+        pacing: Pacing,
+        *,
+        recording: bool = True,
+    ) -> None:
+        """Put it together; there is no episode yet.
+
+        Args:
+            avionics: The flight controller and its MAVLink.
+            camera: Where frames go; None = no camera.
+            pacing: How simulated time passes.
+            recording: Whether episodes are recorded, to be saved; without, they may last for ever.
+        """
         self.avionics = avionics
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
@@ -141,6 +157,7 @@ class Firmware:
         """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
         self._pacing = pacing
+        self._recording = recording
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
 
@@ -176,7 +193,13 @@ class Firmware:
         autopilot.on_message = self.on_message
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
         try:
-            simulation = Simulation(setup, start_us=start_us, clock=self.clock, autopilot=autopilot)
+            simulation = Simulation(
+                setup,
+                start_us=start_us,
+                clock=self.clock,
+                autopilot=autopilot,
+                recording=self._recording,
+            )
         except BaseException:
             autopilot.close()
             raise
@@ -217,8 +240,11 @@ class Firmware:
         if simulation is None:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
-        receive = avionics.receive
-        receive(self._pacing.wait(simulation.time_us, self._sockets, receive))
+        receive, due_us, slipped_us = avionics.receive, simulation.time_us, self.slipped_us
+        began_us = self._pacing.wait(due_us, self._sockets, receive)
+        if simulation.recorder is not None and self.epoch_ns is not None:
+            simulation.recorder.began_tick(due_us, began_us, self.slipped_us - slipped_us)
+        receive(began_us)
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
@@ -229,14 +255,9 @@ class Firmware:
 
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
-        if self.simulation is None:
-            return
-        pacing = self._pacing
-        self.simulation.save(
-            path,
-            {"tick/lateness_us": pacing.take_lateness(), "tick/slips_us": pacing.take_slips()},
-        )
-        self._close_tlog()
+        if self.simulation is not None:
+            save_arrays(path, self.simulation.arrays())
+            self._close_tlog()
 
     def _close_tlog(self) -> None:
         if self._tlog is not None:

@@ -161,7 +161,8 @@ def build(command: FirmwareCommand) -> Firmware:
     except UsageError:
         avionics.close()
         raise
-    return Firmware(avionics, camera, pacing)
+    # Stand alone it flies for days, and nobody collects what was recorded.
+    return Firmware(avionics, camera, pacing, recording=command.control is not None)
 
 
 def _avionics(command: FirmwareCommand) -> Avionics:

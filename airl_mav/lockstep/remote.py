@@ -121,8 +121,8 @@ class RemoteStage:
         What the policy saw is not in it: that is the companion's to know.
         """
         simulation = self.firmware.simulation
-        if simulation is not None:
-            self._digest.add_setpoints(simulation.setpoints.arrays())
+        if simulation is not None and simulation.recorder is not None:
+            self._digest.add_setpoints(simulation.recorder.setpoints.arrays())
         return {name: lane for name, lane in self._digest.lanes().items() if name != SEEN}
 
     def close(self) -> None:
