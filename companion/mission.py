@@ -18,7 +18,7 @@ from airl_mav.policy.actions import CameraBound, Policy
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.interfaces import STOP, LinkError
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot, PilotSettings
 from companion.watchdog import Watchdog, WatchdogSettings
 

@@ -12,7 +12,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
@@ -39,7 +39,7 @@ class FrameServer(Protocol):
         ...
 
 
-class Avionics(Protocol):
+class FlightStack(Protocol):
     """What is aboard beside sensors and motors: a flight controller and its MAVLink links.
 
     The links stay; the flight controller is booted anew for each episode. Nothing here raises
@@ -92,8 +92,8 @@ class Avionics(Protocol):
         ...
 
 
-class BuiltinAvionics:
-    """The built-in autopilot behind our own MAVLink server. Implements `Avionics`."""
+class BuiltinFlightStack:
+    """The built-in autopilot behind our own MAVLink server. Implements `FlightStack`."""
 
     def __init__(self, server: MavlinkServer) -> None:
         self._server = server
@@ -134,7 +134,7 @@ class Firmware:
 
     def __init__(
         self,
-        avionics: Avionics,
+        flight_stack: FlightStack,
         camera: FrameServer | None,
         pacing: Pacing,
         *,
@@ -143,12 +143,12 @@ class Firmware:
         """Put it together; there is no episode yet.
 
         Args:
-            avionics: The flight controller and its MAVLink.
+            flight_stack: The flight controller and its MAVLink.
             camera: Where frames go; None = no camera.
             pacing: How simulated time passes.
             recording: Whether episodes are recorded, to be saved; without, they may last for ever.
         """
-        self.avionics = avionics
+        self.flight_stack = flight_stack
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
@@ -189,7 +189,7 @@ class Firmware:
             FirmwareLostError: Real firmware died on the way.
         """
         self.discard()
-        autopilot = self.avionics.boot(setup)
+        autopilot = self.flight_stack.boot(setup)
         autopilot.on_message = self.on_message
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
         try:
@@ -206,15 +206,15 @@ class Firmware:
         self.simulation = simulation
         simulation.tick()
         powered_us = simulation.time_us
-        self.avionics.connect(self._tick_on_the_ground)
+        self.flight_stack.connect(self._tick_on_the_ground)
         if simulation.time_us > powered_us:
             # The time that real firmware took to boot is no part of the episode.
             simulation.begin()
             start_us = simulation.start_us
-        self._sockets = self.avionics.filenos()
+        self._sockets = self.flight_stack.filenos()
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
-            self.avionics.log_to(self._tlog)
+            self.flight_stack.log_to(self._tlog)
         if self.epoch_ns is not None:
             # What lives for the whole episode need not be searched by the garbage collector: a
             # full collection would stall the 250 Hz loop by tens of milliseconds.
@@ -236,11 +236,11 @@ class Firmware:
 
         Raises FirmwareLostError when real firmware does not answer.
         """
-        simulation, avionics = self.simulation, self.avionics
+        simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
-        receive, due_us, slipped_us = avionics.receive, simulation.time_us, self.slipped_us
+        receive, due_us, slipped_us = flight_stack.receive, simulation.time_us, self.slipped_us
         began_us = self._pacing.wait(due_us, self._sockets, receive)
         if simulation.recorder is not None and self.epoch_ns is not None:
             simulation.recorder.began_tick(due_us, began_us, self.slipped_us - slipped_us)
@@ -249,7 +249,7 @@ class Firmware:
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
         simulation.tick()
-        avionics.send(simulation.time_us)
+        flight_stack.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
 
@@ -261,7 +261,7 @@ class Firmware:
 
     def _close_tlog(self) -> None:
         if self._tlog is not None:
-            self.avionics.log_to(None)
+            self.flight_stack.log_to(None)
             self._tlog.close()
             self._tlog = None
 
@@ -277,6 +277,6 @@ class Firmware:
     def close(self) -> None:
         """Release everything."""
         self.discard()
-        self.avionics.close()
+        self.flight_stack.close()
         if self._camera is not None:
             self._camera.close()

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.flight.trajectory import TrajectoryRecorder
-from firmware_sim.autopilot.state import Estimate, Setpoint
-from firmware_sim.flight_controller import Inside
+from firmware_sim.autopilot.autopilot_state import Estimate, Setpoint
+from firmware_sim.flight_controller import Internals
 from firmware_sim.plant.kinematics import POSE
 from firmware_sim.plant.plant import Plant
 
@@ -67,13 +67,13 @@ class FlightRecorder:
     It grows by some 100 kB per simulated second, so a flight that nobody reads has none.
     """
 
-    def __init__(self, inside: Inside | None) -> None:
-        """Start empty; `inside` is what can be seen of the flight controller, None = nothing."""
+    def __init__(self, internals: Internals | None) -> None:
+        """Start empty; `internals` are those of the flight controller, None = nothing."""
         self.setpoints = SetpointLog()
         """Stays empty where nobody can look into the flight controller."""
-        self._inside = inside
-        if inside is not None:
-            inside.on_setpoint = self.setpoints.accepted
+        self._internals = internals
+        if internals is not None:
+            internals.on_setpoint = self.setpoints.accepted
         self.begin()
 
     def begin(self) -> None:
@@ -98,8 +98,8 @@ class FlightRecorder:
 
     def before_controls(self) -> None:
         """Note that the flight controller is about to take a sample."""
-        if self._inside is not None and self.setpoints.fresh:
-            self.setpoints.take(self._inside.ticks_to_motors)
+        if self._internals is not None and self.setpoints.fresh:
+            self.setpoints.take(self._internals.ticks_to_motors)
 
     def after_controls(self, time_us: int) -> None:
         """Note that it has returned motor commands, at `time_us` [µs]."""
@@ -110,8 +110,8 @@ class FlightRecorder:
         """Note the state after a tick of the plant."""
         if self._trajectory.integrate(plant.time_us, plant.power_w):
             self._trajectory.keep(plant.motion[POSE])
-            if self._inside is not None:
-                self._estimates.append(self._inside.estimator.estimate())
+            if self._internals is not None:
+                self._estimates.append(self._internals.estimator.estimate())
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
@@ -121,7 +121,7 @@ class FlightRecorder:
         }
         for name, values in self._trajectory.trajectory().arrays().items():
             arrays[f"trajectory/{name}"] = values
-        if self._inside is None:
+        if self._internals is None:
             return arrays
         for name, values in self.setpoints.arrays().items():
             arrays[f"setpoints/{name}"] = values

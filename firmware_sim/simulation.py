@@ -16,7 +16,7 @@ from airl_mav.core.clock import Clock
 from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.filters import FilterName, filter_named
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import SensorSample, Truth
 from firmware_sim.plant.camera_server import DepthCamera
@@ -83,7 +83,7 @@ class Simulation:
             wind=setup.wind,
             rate_hz=self.autopilot.rate_hz,
         )
-        self.autopilot.see(self.plant.truth)
+        self.autopilot.use_truth(self.plant.truth)
         self._arena = setup.arena
         self._camera: DepthCamera | None = None
         self._capture_us = NEVER_US
@@ -91,7 +91,7 @@ class Simulation:
             self._camera = DepthCamera.from_profile(setup.vehicle.camera, setup.arena)
             self._camera.reset(setup.arena, start_us)
             self._capture_us = self._camera.next_us
-        self.recorder = FlightRecorder(self.autopilot.inside) if recording else None
+        self.recorder = FlightRecorder(self.autopilot.internals) if recording else None
         """None = nothing is recorded."""
         self.start_us = start_us
         self.time_us = start_us

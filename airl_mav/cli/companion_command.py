@@ -28,7 +28,7 @@ from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import DEFAULT_POLICY, PolicyInfo, find_policy, load_policy
 from airl_mav.policy.runtime import RuntimeName
 from companion.camera import ZmqFrameSource
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
 

@@ -14,7 +14,7 @@ from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.policy.actions import Policy
 from companion.camera import ZmqFrameSource
 from companion.conducted import ConductedClock
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.pilot import PilotSettings
 from companion.token_camera import TokenFrameSource

@@ -45,11 +45,11 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.rehearsal.channel import ChildChannel, Failed, LoadEpisode, Ready, Shutdown
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.filters import FilterName
-from firmware_sim.autopilot.state import Message
-from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware
+from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
-from firmware_sim.mavlink.px4_links import Px4Ends, px4_ends, px4_server
+from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.plant.wind import WindSettings
@@ -155,17 +155,17 @@ def build(command: FirmwareCommand) -> Firmware:
     """
     check(command)
     pacing = pacing_of(1.0 if command.speed is None else command.speed)
-    avionics = _avionics(command)
+    flight_stack = _flight_stack(command)
     try:
         camera = CameraServer(f"tcp://{command.bind}:{command.ports.camera_port or '*'}")
     except UsageError:
-        avionics.close()
+        flight_stack.close()
         raise
     # Stand alone it flies for days, and nobody collects what was recorded.
-    return Firmware(avionics, camera, pacing, recording=command.control is not None)
+    return Firmware(flight_stack, camera, pacing, recording=command.control is not None)
 
 
-def _avionics(command: FirmwareCommand) -> Avionics:
+def _flight_stack(command: FirmwareCommand) -> FlightStack:
     """Bind the MAVLink ports and return what flies. Raises UsageError as `build`."""
     if command.firmware != "builtin":
         wanted = Wanted(
@@ -176,13 +176,13 @@ def _avionics(command: FirmwareCommand) -> Avionics:
             lambda: _ends(command),
         )
         return real_avionics(command.firmware, wanted)
-    return BuiltinAvionics(px4_server(_ends(command), unix_us()))
+    return BuiltinFlightStack(udp_server(_ends(command), unix_us()))
 
 
-def _ends(command: FirmwareCommand) -> Px4Ends:
+def _ends(command: FirmwareCommand) -> UdpLinks:
     """Bind the ports of the onboard and the ground station's link. Raises UsageError."""
     ports = command.ports
-    return px4_ends(
+    return bind_udp_links(
         bind=command.bind,
         api_remote=(command.companion_host, ports.api_port),
         api_local_port=ports.api_local_port,
@@ -266,7 +266,7 @@ def fly(
     if firmware.slipped_us:
         given_up_s = firmware.slipped_us / US_PER_S
         console.print(f"{given_up_s:.2f} s given up: this host could not keep up", style="yellow")
-    for name, link in firmware.avionics.counters().items():
+    for name, link in firmware.flight_stack.counters().items():
         console.print(
             f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
             f"sent {link.tx}, not sent {link.send_errors}"

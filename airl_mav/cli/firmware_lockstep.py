@@ -19,7 +19,7 @@ from airl_mav.envs.spec import Delay
 from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.lockstep.remote import RemotePlan, RemoteStage
 from airl_mav.lockstep.tokens import LONGEST_REST_US, TokenSettings
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.firmware import Loaded
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera_server import CameraServer

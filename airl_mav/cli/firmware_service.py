@@ -23,8 +23,8 @@ from airl_mav.rehearsal.channel import (
 )
 from airl_mav.rehearsal.state import state_of
 from firmware_sim import firmware
-from firmware_sim.autopilot.state import Message
-from firmware_sim.crash import CrashWatch
+from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 STATE_EVERY_US = 40_000
@@ -143,7 +143,7 @@ class Service:
         self._setup = setup
         self._record = Path()
         self._reported = 0
-        self._crash = CrashWatch()
+        self._crash = CrashDetector()
         self._handlers: dict[type, Callable[[Any], None]] = {
             LoadEpisode: self._load,
             FinishEpisode: self._finish,
@@ -173,7 +173,7 @@ class Service:
     def _load(self, request: LoadEpisode) -> None:
         episode = self._setup(request)
         tlog = Path(request.tlog) if request.tlog else None
-        self._crash = CrashWatch()
+        self._crash = CrashDetector()
         loaded = self._bench.load(episode, tlog, self._report, self._tell)
         self._record = Path(request.record)
         goal = episode.arena.goal if episode.arena is not None else np.zeros(2)

@@ -26,8 +26,8 @@ from airl_mav.rehearsal.run_folder import FlownEpisode
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.filters import FilterName
-from firmware_sim.autopilot.state import Message
 from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup, Simulation
 

@@ -11,7 +11,7 @@ from airl_mav.rehearsal.evaluation import Job
 from airl_mav.rehearsal.rehearsal import Observer
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.rehearsal.state import state_of
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.simulation import Simulation
 
 SHOW_EVERY = 125

@@ -15,7 +15,7 @@ from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.rehearsal.following import Follower
-from firmware_sim.firmware import BuiltinAvionics, Firmware, FrameServer, Loaded
+from firmware_sim.firmware import BuiltinFlightStack, Firmware, FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -70,7 +70,7 @@ class RemoteStage:
         memory = MemoryEndpoint()
         self._conductor = Conductor(memory, self._partner, self._digest, plan.speed)
         server = MavlinkServer([lockstep_link(memory)], boot_unix_us=BOOT_UNIX_US)
-        self.firmware = Firmware(BuiltinAvionics(server), camera, self._conductor)
+        self.firmware = Firmware(BuiltinFlightStack(server), camera, self._conductor)
         self.firmware.on_tick = self._look
         self._judge = Judge(None, self._digest, order=self._partner.order)
 

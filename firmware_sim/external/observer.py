@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.autopilot.state import Message, Severity
-from firmware_sim.external.modes import flight_of
+from firmware_sim.external.heartbeat_modes import flight_of
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint
@@ -76,7 +76,7 @@ class Observer:
         self.last_text = ""
         """What it said last."""
         self._beat_us = -BEAT_EVERY_US
-        self.poses_as_ground = True
+        self.acts_as_ground_station = True
         """Whether it shows itself as a ground station: PX4 sends texts to nobody else."""
         self.parameters = ParameterClient(self._send)
 
@@ -139,7 +139,7 @@ class Observer:
         self._now_us = now_us
         if self._heard is None:
             return
-        if self.poses_as_ground and now_us - self._beat_us >= BEAT_EVERY_US:
+        if self.acts_as_ground_station and now_us - self._beat_us >= BEAT_EVERY_US:
             self._beat_us = now_us
             self._send(
                 dialect.MAVLink_heartbeat_message(

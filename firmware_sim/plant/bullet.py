@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_sim.quiet import quiet_terminal
+from firmware_sim.plant.silenced_output import silenced_output
 
-with quiet_terminal():
+with silenced_output():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
@@ -22,7 +22,7 @@ NO_CLIENT = -1
 
 def connect() -> Any:
     """Return a client of a new physics server in this process."""
-    with quiet_terminal():
+    with silenced_output():
         return BulletClient(pybullet.DIRECT)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import TICK_US
-from firmware_sim.autopilot.state import Mode, Setpoint
-from firmware_sim.firmware import BuiltinAvionics, Firmware
+from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -33,7 +33,7 @@ class Mute(MemoryEndpoint):
 
 def firmware(pacing: Pacing, *, recording: bool) -> Firmware:
     server = MavlinkServer([onboard_link(Mute())], boot_unix_us=0)
-    return Firmware(BuiltinAvionics(server), None, pacing, recording=recording)
+    return Firmware(BuiltinFlightStack(server), None, pacing, recording=recording)
 
 
 def fly(flown: Firmware, ticks: int, setpoint: Setpoint | None = None) -> None:

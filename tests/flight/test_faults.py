@@ -26,7 +26,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
 from companion.camera import ZmqFrameSource
 from companion.guard import ThreadGuard
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, fly_mission
 from companion.pilot import PilotSettings
 from companion.watchdog import WatchdogSettings

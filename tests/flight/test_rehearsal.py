@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from airl_mav.core.child_process import Exited
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Part, Setup
@@ -39,7 +40,6 @@ from airl_mav.rehearsal.channel import (
 )
 from airl_mav.rehearsal.crew import COMPANION, FIRMWARE
 from airl_mav.rehearsal.episode import Plan, ProcessPlan
-from airl_mav.rehearsal.process import Exited
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 

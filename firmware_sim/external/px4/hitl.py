@@ -191,7 +191,7 @@ class HitlBridge:
         self.armed = controls.armed
         return controls
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Do nothing: a board would take the true state for its estimate."""
 
     def close(self) -> None:

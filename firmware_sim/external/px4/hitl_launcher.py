@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from firmware_sim.external.airframe import Airframe
-from firmware_sim.external.bridge import nobody_to_look_after
+from firmware_sim.external.airframe_check import Airframe
+from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4.hitl import SILENCE_S, HitlBridge, check_line
 from firmware_sim.external.transport.router import Router
 from firmware_sim.mavlink.endpoint import Endpoint
-from firmware_sim.mavlink.px4_links import Px4Ends
+from firmware_sim.mavlink.udp_links import UdpLinks
 
 
 class HitlLauncher:
-    """Finds the same board for each episode. Implements `avionics.Launcher`."""
+    """Finds the same board for each episode. Implements `boot_sequence.Launcher`."""
 
     may_set = False
     reboots = True
@@ -47,7 +47,7 @@ class HitlLauncher:
         self._bridge: HitlBridge | None = None
 
     def launch(self) -> HitlBridge:
-        """Find the board and reboot it; see `avionics.Launcher`."""
+        """Find the board and reboot it; see `boot_sequence.Launcher`."""
         last = self._bridge
         self.stop()
         self._bridge = HitlBridge(
@@ -59,7 +59,7 @@ class HitlLauncher:
             silence_s=self._silence_s,
         )
         try:
-            self._bridge.wait_connected(self._timeout_s, nobody_to_look_after)
+            self._bridge.wait_connected(self._timeout_s, no_process)
         except BaseException:
             self.stop()
             raise
@@ -75,6 +75,6 @@ class HitlLauncher:
         self.stop()
 
 
-def clients_of(ends: Px4Ends) -> dict[str, Endpoint]:
+def clients_of(ends: UdpLinks) -> dict[str, Endpoint]:
     """Return whom a board's frames are passed to, by the name of the link."""
     return {"onboard": ends.api, "gcs": ends.gcs}

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def quiet_terminal() -> Iterator[None]:
+def silenced_output() -> Iterator[None]:
     """Point standard output and standard error at the null device for a while."""
     sys.stdout.flush()
     sys.stderr.flush()

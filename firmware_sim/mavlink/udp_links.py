@@ -9,14 +9,14 @@ from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 
-class Px4Ends(NamedTuple):
+class UdpLinks(NamedTuple):
     """The vehicle's ends of both links."""
 
     api: UdpEndpoint
     gcs: UdpEndpoint
 
 
-def px4_ends(
+def bind_udp_links(
     *,
     bind: str,
     api_remote: Address,
@@ -24,7 +24,7 @@ def px4_ends(
     gcs_remote: Address,
     gcs_local_port: int,
     insecure: bool,
-) -> Px4Ends:
+) -> UdpLinks:
     """Bind the vehicle's ports of both links.
 
     Raises:
@@ -49,10 +49,10 @@ def px4_ends(
     except Exception:
         api.close()
         raise
-    return Px4Ends(api, gcs)
+    return UdpLinks(api, gcs)
 
 
-def px4_server(ends: Px4Ends, boot_unix_us: int) -> MavlinkServer:
+def udp_server(ends: UdpLinks, boot_unix_us: int) -> MavlinkServer:
     """Return the server of both links, still without an autopilot.
 
     Args:

@@ -23,9 +23,9 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion import raw_bytes
-from companion.connection import first_autopilot, open_connection
 from companion.dialects import PX4, Dialect, dialect_of
 from companion.interfaces import STOP, BodyVelocity, LinkError
+from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.1
 """How often a condition is looked at while waiting for it [s]."""
