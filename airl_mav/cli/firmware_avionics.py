@@ -26,7 +26,7 @@ from firmware_sim.external.observer import Observer
 from firmware_sim.external.process.sitl_launcher import SitlLauncher
 from firmware_sim.external.process.working_folders import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
-from firmware_sim.external.px4.hitl_launcher import HitlLauncher, clients_of
+from firmware_sim.external.px4.hitl import HitlLauncher
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import Px4Bridge
 from firmware_sim.external.transport.router import Router, RouterEnd
@@ -109,7 +109,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options = wanted.options
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
-    router = Router(clients_of(wanted.bind_ends()), WallClock())
+    router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
         launcher = HitlLauncher(
             airframe, router, options.serial or "", options.baud, options.firmware_timeout

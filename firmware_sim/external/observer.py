@@ -98,12 +98,6 @@ class Observer:
         """
         return self._ready and "LOCAL_POSITION_NED" in self._came
 
-    @property
-    def heartbeat_armed(self) -> bool:
-        """Whether its newest heartbeat says armed (up to 1 s old)."""
-        beat = self._heard
-        return beat is not None and bool(beat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-
     def flight(self, *, armed: bool) -> Flight:
         """Return phase and mode; `armed` is whether motors may turn."""
         beat = self._heard

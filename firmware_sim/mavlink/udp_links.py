@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from firmware_sim.mavlink.endpoint import Address, UdpEndpoint
+from firmware_sim.mavlink.endpoint import Address, Endpoint, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
@@ -14,6 +14,10 @@ class UdpLinks(NamedTuple):
 
     api: UdpEndpoint
     gcs: UdpEndpoint
+
+    def by_name(self) -> dict[str, Endpoint]:
+        """Return the ends by the names of their links."""
+        return {"onboard": self.api, "gcs": self.gcs}
 
 
 def bind_udp_links(

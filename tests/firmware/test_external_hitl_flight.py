@@ -21,7 +21,7 @@ from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
 from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack
 from firmware_sim.external.observer import Observer
-from firmware_sim.external.px4.hitl_launcher import HitlLauncher, clients_of
+from firmware_sim.external.px4.hitl import HitlLauncher
 from firmware_sim.external.transport.router import Router, RouterEnd
 from firmware_sim.flight_controller import FirmwareMissingError
 from firmware_sim.mavlink.udp_links import bind_udp_links
@@ -55,7 +55,7 @@ class Flight:
             gcs_local_port=gcs_local,
             insecure=False,
         )
-        self.router = Router(clients_of(ends), WallClock())
+        self.router = Router(ends.by_name(), WallClock())
         self.launcher = HitlLauncher(
             *(px4_airframe(quad(), HITL_OUTPUT), self.router, peer.device, 921_600, PATIENCE_S),
             silence_s=PATIENCE_S,

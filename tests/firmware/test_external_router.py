@@ -13,7 +13,6 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock, WallClock
-from firmware_sim.external.px4.hitl_launcher import clients_of
 from firmware_sim.external.transport.router import (
     BURST_BYTES,
     SIMULATOR_IDS,
@@ -231,7 +230,7 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
         gcs_local_port=gcs_local,
         insecure=False,
     )
-    router, line = Router(clients_of(ends), WallClock()), Line()
+    router, line = Router(ends.by_name(), WallClock()), Line()
     end = RouterEnd(router)
 
     def wakes() -> bool:

@@ -1,4 +1,4 @@
-"""The parts around a bridge: the firmware process, the frame check, parameters, the observer, the options."""
+"""The parts around a bridge: process, frame check, parameters, observer, options."""
 
 from __future__ import annotations
 

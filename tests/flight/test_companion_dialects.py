@@ -87,7 +87,6 @@ def test_a_flight_on_ardupilot() -> None:
         link.land(60.0)
         assert copter.mode == LAND
         assert not copter.armed
-        wait_for(lambda: link.on_ground)
 
 
 @pytest.mark.slow
