@@ -70,7 +70,7 @@ def measure_ours() -> list[Result]:
     from airl_mav.profiles.arena import ArenaSpec
     from airl_mav.profiles.loading import load_profile
     from airl_mav.profiles.vehicle import VehicleProfile
-    from firmware_sim.autopilot.parameters import Parameters
+    from firmware_sim.autopilot.parameter_store import Parameters
 
     profile = load_profile("vehicles", "quad", VehicleProfile)
     vehicle = vehicle_of(profile, Parameters(profile.parameters).__getitem__)

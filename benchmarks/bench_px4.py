@@ -27,7 +27,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.process.child import FirmwareChild, Start
+from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
 from firmware_sim.external.px4.program import (
     API_LOCAL_PORT,
     API_PORT,
@@ -35,7 +35,7 @@ from firmware_sim.external.px4.program import (
     environment,
     find_px4,
 )
-from firmware_sim.external.px4.simulator import Px4Bridge
+from firmware_sim.external.px4.sitl import Px4Bridge
 from firmware_sim.external.transport.tcp_port import TcpPort
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
@@ -55,13 +55,13 @@ ARM, TAKEOFF = 400, 22
 class Flown:
     """A bridge as a flight controller."""
 
-    inside = None
+    internals = None
     on_message = None
     flight = Flight()
 
     def __init__(self, bridge: Px4Bridge) -> None:
         self.rate_hz, self.step = bridge.rate_hz, bridge.step
-        self.see, self.close = bridge.see, bridge.close
+        self.use_truth, self.close = bridge.use_truth, bridge.close
 
 
 class Operator:
@@ -162,10 +162,10 @@ def flight(
             start = find_px4(options.px4_dir).start(instance, AIRFRAME, folder)
         else:
             peer = [sys.executable, str(ROOT / "tests/support/px4_peer.py"), "-i", str(instance)]
-            start = Start(peer, {**environment(AIRFRAME), "PYTHONPATH": str(ROOT)})
+            start = StartCommand(peer, {**environment(AIRFRAME), "PYTHONPATH": str(ROOT)})
         if mode == "unpaced":
             start = replace(start, environment={**start.environment, "PX4_SIM_SPEED_FACTOR": "10"})
-        child = FirmwareChild("PX4", start, folder, folder / "px4.txt")
+        child = FirmwareProcess("PX4", start, folder, folder / "px4.txt")
         try:
             bridge.wait_connected(60.0, child.check)
             setup = EpisodeSetup(vehicle, None, 1)
@@ -179,7 +179,7 @@ def flight(
             while not operator.airborne:
                 tick()
                 if simulation.time_us > LIMIT_S * US_PER_S:
-                    raise SystemExit(f"not in the air after {LIMIT_S:g} s; {child.tail()}")
+                    raise SystemExit(f"not in the air after {LIMIT_S:g} s; {child.log_tail()}")
             pacing.restart(simulation.time_us)
             before = dict(watch.seconds)
             start_us, start = simulation.time_us, time.perf_counter()

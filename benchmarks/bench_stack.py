@@ -33,8 +33,8 @@ from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from firmware_sim.autopilot.estimator import Estimator
-from firmware_sim.autopilot.state import Mode, Setpoint
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer

@@ -19,7 +19,7 @@ from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.interfaces import STOP, LinkError
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
 from companion.watchdog import Watchdog
 

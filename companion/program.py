@@ -14,7 +14,7 @@ from airl_mav.policy.actions import Policy
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import open_camera
 from companion.guard import ThreadGuard
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 
 

@@ -17,7 +17,7 @@ from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, Mav
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.clock_offset import Exchanges
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 
 MESSAGE = "TIMESYNC"
 

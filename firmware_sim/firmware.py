@@ -10,8 +10,9 @@ from typing import Protocol
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
@@ -38,7 +39,7 @@ class FrameServer(Protocol):
         ...
 
 
-class Avionics(Protocol):
+class FlightStack(Protocol):
     """What is aboard beside sensors and motors: a flight controller and its MAVLink links.
 
     The links stay; the flight controller is booted anew for each episode. Nothing here raises
@@ -91,8 +92,8 @@ class Avionics(Protocol):
         ...
 
 
-class BuiltinAvionics:
-    """The built-in autopilot behind our own MAVLink server. Implements `Avionics`."""
+class BuiltinFlightStack:
+    """The built-in autopilot behind our own MAVLink server. Implements `FlightStack`."""
 
     def __init__(self, server: MavlinkServer) -> None:
         self._server = server
@@ -131,8 +132,23 @@ class Loaded:
 class Firmware:
     """Flies one episode after the other; its links and its camera stay."""
 
-    def __init__(self, avionics: Avionics, camera: FrameServer | None, pacing: Pacing) -> None:
-        self.avionics = avionics
+    def __init__(
+        self,
+        flight_stack: FlightStack,
+        camera: FrameServer | None,
+        pacing: Pacing,
+        *,
+        recording: bool = True,
+    ) -> None:
+        """Put it together; there is no episode yet.
+
+        Args:
+            flight_stack: The flight controller and its MAVLink.
+            camera: Where frames go; None = no camera.
+            pacing: How simulated time passes.
+            recording: Whether episodes are recorded, to be saved; without, they may last for ever.
+        """
+        self.flight_stack = flight_stack
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
@@ -141,6 +157,7 @@ class Firmware:
         """Called with every text of the autopilot for its operator, if set."""
         self._camera = camera
         self._pacing = pacing
+        self._recording = recording
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
 
@@ -172,26 +189,32 @@ class Firmware:
             FirmwareLostError: Real firmware died on the way.
         """
         self.discard()
-        autopilot = self.avionics.boot(setup)
+        autopilot = self.flight_stack.boot(setup)
         autopilot.on_message = self.on_message
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
         try:
-            simulation = Simulation(setup, start_us=start_us, clock=self.clock, autopilot=autopilot)
+            simulation = Simulation(
+                setup,
+                start_us=start_us,
+                clock=self.clock,
+                autopilot=autopilot,
+                recording=self._recording,
+            )
         except BaseException:
             autopilot.close()
             raise
         self.simulation = simulation
         simulation.tick()
         powered_us = simulation.time_us
-        self.avionics.connect(self._tick_on_the_ground)
+        self.flight_stack.connect(self._tick_on_the_ground)
         if simulation.time_us > powered_us:
             # The time that real firmware took to boot is no part of the episode.
             simulation.begin()
             start_us = simulation.start_us
-        self._sockets = self.avionics.filenos()
+        self._sockets = self.flight_stack.filenos()
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
-            self.avionics.log_to(self._tlog)
+            self.flight_stack.log_to(self._tlog)
         if self.epoch_ns is not None:
             # What lives for the whole episode need not be searched by the garbage collector: a
             # full collection would stall the 250 Hz loop by tens of milliseconds.
@@ -213,34 +236,32 @@ class Firmware:
 
         Raises FirmwareLostError when real firmware does not answer.
         """
-        simulation, avionics = self.simulation, self.avionics
+        simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:
             self.clock.sleep_until(self.clock.time_us() + int(IDLE_S * US_PER_S))
             return
-        receive = avionics.receive
-        receive(self._pacing.wait(simulation.time_us, self._sockets, receive))
+        receive, due_us, slipped_us = flight_stack.receive, simulation.time_us, self.slipped_us
+        began_us = self._pacing.wait(due_us, self._sockets, receive)
+        if simulation.recorder is not None and self.epoch_ns is not None:
+            simulation.recorder.began_tick(due_us, began_us, self.slipped_us - slipped_us)
+        receive(began_us)
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
         simulation.tick()
-        avionics.send(simulation.time_us)
+        flight_stack.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
 
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
-        if self.simulation is None:
-            return
-        pacing = self._pacing
-        self.simulation.save(
-            path,
-            {"tick/lateness_us": pacing.take_lateness(), "tick/slips_us": pacing.take_slips()},
-        )
-        self._close_tlog()
+        if self.simulation is not None:
+            save_arrays(path, self.simulation.arrays())
+            self._close_tlog()
 
     def _close_tlog(self) -> None:
         if self._tlog is not None:
-            self.avionics.log_to(None)
+            self.flight_stack.log_to(None)
             self._tlog.close()
             self._tlog = None
 
@@ -256,6 +277,6 @@ class Firmware:
     def close(self) -> None:
         """Release everything."""
         self.discard()
-        self.avionics.close()
+        self.flight_stack.close()
         if self._camera is not None:
             self._camera.close()

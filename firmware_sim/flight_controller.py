@@ -9,9 +9,9 @@ from airl_mav.core.errors import UsageError
 from firmware_sim.interfaces import Autopilot, Truth
 
 if TYPE_CHECKING:  # Who only looks for a program need not load an estimator.
+    from firmware_sim.autopilot.autopilot_state import Message, Setpoint
     from firmware_sim.autopilot.commander import Flight
     from firmware_sim.autopilot.estimator import Estimator
-    from firmware_sim.autopilot.state import Message, Setpoint
 
 
 class FirmwareLostError(Exception):
@@ -22,7 +22,7 @@ class FirmwareMissingError(UsageError):
     """Real firmware cannot be started, or never connected."""
 
 
-class Inside(Protocol):
+class Internals(Protocol):
     """What can be seen of a flight controller whose inside is open."""
 
     on_setpoint: Callable[[Setpoint, int], None] | None
@@ -59,11 +59,11 @@ class FlightController(Autopilot, Protocol):
         ...
 
     @property
-    def inside(self) -> Inside | None:
+    def internals(self) -> Internals | None:
         """Its inside; None where nobody can look into it: real firmware."""
         ...
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Take what tells the true state: real firmware's simulators send it beside the sensors."""
         ...
 

@@ -6,9 +6,6 @@ import select
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from airl_mav.core.clock import Clock, SimClock, WallClock
 
 MAX_LAG_US = 200_000
@@ -46,14 +43,6 @@ class Pacing(Protocol):
         """
         ...
 
-    def take_lateness(self) -> NDArray[np.int64]:
-        """Return how late each tick began since the last call [µs of simulated time]."""
-        ...
-
-    def take_slips(self) -> NDArray[np.int64]:
-        """Return (k, 2) since the last call: the time at which, and how much was given up [µs]."""
-        ...
-
 
 class WallPacing:
     """Every tick at its wall time."""
@@ -62,8 +51,6 @@ class WallPacing:
         """Take the speed: simulated seconds per wall second, > 0."""
         self.clock = WallClock(speed)
         self.slipped_us = 0
-        self._lateness: list[int] = []
-        self._slips: list[tuple[int, int]] = []
         self._stamp_us = 0
 
     @property
@@ -77,8 +64,6 @@ class WallPacing:
         Real firmware boots as fast as it goes, far ahead of the wall clock.
         """
         self.clock.slip(self.clock.time_us() - tick_us)
-        self._lateness.clear()
-        self._slips.clear()
         self._stamp_us = 0
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
@@ -104,27 +89,13 @@ class WallPacing:
             lost_us = now_us - resumed_us
             clock.slip(lost_us)
             self.slipped_us += lost_us
-            self._slips.append((resumed_us, lost_us))
             now_us = resumed_us
-        self._lateness.append(now_us - tick_us)
         return self._stamp(now_us)
 
     def _stamp(self, now_us: int) -> int:
         """Return a time that never goes back."""
         self._stamp_us = max(self._stamp_us, now_us)
         return self._stamp_us
-
-    def take_lateness(self) -> NDArray[np.int64]:
-        """Return how late each tick began since the last call [µs of simulated time]."""
-        lateness = np.array(self._lateness, np.int64)
-        self._lateness.clear()
-        return lateness
-
-    def take_slips(self) -> NDArray[np.int64]:
-        """Return (k, 2) since the last call: the time at which, and how much was given up [µs]."""
-        slips = np.array(self._slips, np.int64).reshape(-1, 2)
-        self._slips.clear()
-        return slips
 
 
 class Unpaced:
@@ -145,11 +116,3 @@ class Unpaced:
         del sockets, readable
         self.clock.sleep_until(tick_us)
         return tick_us
-
-    def take_lateness(self) -> NDArray[np.int64]:
-        """Return nothing: no tick is late."""
-        return np.zeros(0, np.int64)
-
-    def take_slips(self) -> NDArray[np.int64]:
-        """Return nothing: no time is given up."""
-        return np.zeros((0, 2), np.int64)

@@ -37,7 +37,7 @@ def fly(
     if firmware.slipped_us:
         given_up_s = firmware.slipped_us / US_PER_S
         say(f"{given_up_s:.2f} s given up: this host could not keep up")
-    for name, link in firmware.avionics.counters().items():
+    for name, link in firmware.flight_stack.counters().items():
         say(
             f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
             f"sent {link.tx}, not sent {link.send_errors}"

@@ -27,7 +27,7 @@ from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED, Aircraft, Scenario
 from airl_mav.scenario.resolve import check_firmware, check_ports
 from airl_mav.scenario.resolved import FIRMWARE_TITLES, TRANSPORT_US
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.external.compose import how_to_start
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.pacing import Unpaced, WallPacing
@@ -194,6 +194,8 @@ def _fly_alone(
         gcs_host=options.gcs_host,
         insecure=options.insecure,
         log=options.firmware_log,
+        # It may fly for days, and nobody collects what would be recorded.
+        recording=False,
     )
     with closing(firmware):
         _stop_on_signals(stop)

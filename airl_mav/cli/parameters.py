@@ -9,7 +9,7 @@ from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from firmware_sim.external.airframe import (
+from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,
     Airframe,

@@ -34,8 +34,8 @@ from airl_mav.conformance.steps import Setpoint
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from companion.connection import first_autopilot, open_connection
 from companion.interfaces import LinkError
+from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.02  # How often a condition is looked at [wall s]
 SILENT_S = 5.0

@@ -200,6 +200,14 @@ def cascade_tick(
 
 
 @kernel
+def settle_gyro_filter(memory: Memory, gyro: Biquad) -> None:
+    """Bring the delay elements of the gyro's filter to the steady state of its newest output."""
+    for i in range(3):
+        held = settled(gyro, memory[_GYRO + i])
+        memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = held, held
+
+
+@kernel
 def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
     """Begin: the filters have long seen the first sample, the position loop is due."""
     memory[_PRIMED] = 1.0
@@ -207,8 +215,7 @@ def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
     for i in range(3):
         memory[_VEL_LP + i] = velocity[i]
         memory[_GYRO + i] = omega[i]
-        held = settled(weights.gyro, omega[i])
-        memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = held, held
+    settle_gyro_filter(memory, weights.gyro)
 
 
 @kernel

@@ -17,9 +17,11 @@ from airl_mav.control.cascade import (
     cascade,
     new_memory,
     reset_integrals,
+    settle_gyro_filter,
     ticks_to_motors,
 )
 from airl_mav.control.gains import Gains, pack, unpack
+from airl_mav.control.low_pass import butterworth
 from airl_mav.control.mixer import Motors
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
@@ -87,6 +89,7 @@ class Controller:
             dt: Time between two calls of `fly` [s].
         """
         self._gains = pack(gains)
+        self._gyro_cutoff_hz = gains.gyro_cutoff_hz
         self._dt = dt
         self._memory = new_memory()
         self._output = np.zeros(_SIZE)
@@ -94,6 +97,12 @@ class Controller:
 
     def set_gains(self, gains: Gains) -> None:
         """Fly on with other gains."""
+        cutoff_hz = gains.gyro_cutoff_hz
+        if cutoff_hz != self._gyro_cutoff_hz:
+            # The delay elements are scaled by the cut-off: left as they are, a much higher one
+            # would multiply the measured rates.
+            settle_gyro_filter(self._memory, butterworth(cutoff_hz, self._dt))
+            self._gyro_cutoff_hz = cutoff_hz
         self._gains = pack(gains)
 
     def fly(self, state: Row, demand: Demand) -> Motors:

@@ -116,6 +116,11 @@ class Gains(NamedTuple):
         )
 
 
+LEAST_ARM = 1e-6
+"""Arms along one axis that are shorter than this share of those along the other one are taken for
+missing: no motor command would turn such a vehicle about that axis."""
+
+
 def _allocation(forward: float, right: float) -> tuple[float, float]:
     """Return what a motor gets of a roll and of a pitch torque, for arms in any one unit.
 
@@ -123,7 +128,7 @@ def _allocation(forward: float, right: float) -> tuple[float, float]:
     scale for both axes, so that the weaker one moves a motor by sin 45 deg.
     """
     weaker = min(forward, right)
-    if weaker <= 0.0:
+    if weaker <= LEAST_ARM * max(forward, right):
         return math.sqrt(0.5), math.sqrt(0.5)
     return math.sqrt(0.5) * weaker / right, math.sqrt(0.5) * weaker / forward
 

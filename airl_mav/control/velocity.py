@@ -37,14 +37,14 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     limit = gains.vel_max_xy
     square_p = px * px + py * py
     vx, vy = px + fx, py + fy
-    if square_p >= limit * limit:
+    if 0.0 < square_p >= limit * limit:
         scale = limit / math.sqrt(square_p)
         vx, vy = px * scale, py * scale
     elif vx * vx + vy * vy > limit * limit:
         # Largest share s of the feed-forward with |p + s f| = limit.
         a = fx * fx + fy * fy
         b = px * fx + py * fy
-        s = (-b + math.sqrt(b * b + a * (limit * limit - square_p))) / a
+        s = (-b + math.sqrt(b * b + a * (limit * limit - square_p))) / a if a > 0.0 else 0.0
         vx, vy = px + s * fx, py + s * fy
     if (
         math.isnan(position_sp[0])

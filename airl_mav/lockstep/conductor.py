@@ -9,9 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
-
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
@@ -108,14 +105,6 @@ class Conductor:
                 self._deliver(self._inbound.repeat(first_us), readable)
         self.clock.sleep_until(tick_us)
         return tick_us
-
-    def take_lateness(self) -> NDArray[np.int64]:
-        """Return nothing: no tick is late."""
-        return np.zeros(0, np.int64)
-
-    def take_slips(self) -> NDArray[np.int64]:
-        """Return nothing: no time is given up."""
-        return np.zeros((0, 2), np.int64)
 
     # --- one turn
 

@@ -21,7 +21,7 @@ from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.rehearsal.supervisor import Order, Supervisor
 from airl_mav.scenario.resolved import TRANSPORT_US, ResolvedScenario
 from companion.mission import MissionResult, check_camera, fly_mission
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from airl_mav.flight.judge import TruthSample, Verdict
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.rehearsal.supervisor import Order, Supervisor
-from firmware_sim.crash import CrashWatch
+from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.simulation import Simulation
 
 
@@ -36,7 +36,7 @@ class Judge:
         self._digest = digest
         self._order = order
         self._judged = judged
-        self._crash = CrashWatch()
+        self._crash = CrashDetector()
 
     @property
     def hit(self) -> str | None:

@@ -10,7 +10,7 @@ from airl_mav.rehearsal.rehearsal import Observer
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 

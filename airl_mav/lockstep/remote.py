@@ -23,7 +23,7 @@ from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.model import Ports
-from firmware_sim.firmware import BuiltinAvionics, Firmware, FrameServer, Loaded
+from firmware_sim.firmware import BuiltinFlightStack, Firmware, FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.camera_server import CameraServer
@@ -79,7 +79,7 @@ class RemoteStage:
         memory = MemoryEndpoint()
         self._conductor = Conductor(memory, self._partner, self._digest, plan.speed)
         server = MavlinkServer([lockstep_link(memory)], boot_unix_us=BOOT_UNIX_US)
-        self.firmware = Firmware(BuiltinAvionics(server), camera, self._conductor)
+        self.firmware = Firmware(BuiltinFlightStack(server), camera, self._conductor)
         self.firmware.on_tick = self._look
         self._judge = Judge(None, self._digest, order=self._partner.order)
 
@@ -132,8 +132,8 @@ class RemoteStage:
         What the policy saw is not in it: that is the companion's to know.
         """
         simulation = self.firmware.simulation
-        if simulation is not None:
-            self._digest.add_setpoints(simulation.setpoints.arrays())
+        if simulation is not None and simulation.recorder is not None:
+            self._digest.add_setpoints(simulation.recorder.setpoints.arrays())
         return {name: lane for name, lane in self._digest.lanes().items() if name != SEEN}
 
     def close(self) -> None:

@@ -17,8 +17,8 @@ from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from companion.conducted import ConductedClock
-from companion.link import RAW_URL, MavsdkLink
-from firmware_sim.firmware import BuiltinAvionics, Firmware
+from companion.mavsdk_link import RAW_URL, MavsdkLink
+from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -57,7 +57,7 @@ class Stage:
         """The companion's source of frames."""
         self.camera.clock = self.clock
         server = MavlinkServer([lockstep_link(endpoint)], boot_unix_us=BOOT_UNIX_US)
-        self.firmware = Firmware(BuiltinAvionics(server), self.camera, self.conductor)
+        self.firmware = Firmware(BuiltinFlightStack(server), self.camera, self.conductor)
         self._open = ExitStack()
 
     def __enter__(self) -> Stage:

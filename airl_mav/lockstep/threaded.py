@@ -20,7 +20,7 @@ from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.frames import newest_heartbeat
 from airl_mav.lockstep.turns import Turn
 from companion.conducted import Abandoned
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect
 
 FIRST_BARRIER = 0x8000_0000

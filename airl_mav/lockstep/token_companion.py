@@ -11,7 +11,7 @@ from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.resolved import NATIVE_T2_US
 from companion.camera import open_camera
 from companion.conducted import ConductedClock
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.program import Mission
 from companion.token_camera import TokenFrameSource

@@ -33,7 +33,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from companion.camera import open_camera
 from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import check_camera, fly_mission
 
 CONNECT_TIMEOUT_S = 30.0

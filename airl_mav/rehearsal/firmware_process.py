@@ -34,12 +34,12 @@ from airl_mav.rehearsal.channel import (
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.model import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.autopilot.state import Message
-from firmware_sim.crash import CrashWatch
+from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
-from firmware_sim.firmware import Avionics, BuiltinAvionics, Firmware
+from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
-from firmware_sim.mavlink.px4_links import Px4Ends, px4_ends, px4_server
+from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -59,6 +59,7 @@ def build_firmware(
     gcs_host: str = LOOPBACK,
     insecure: bool = False,
     log: Path | None = None,
+    recording: bool = True,
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
@@ -71,14 +72,15 @@ def build_firmware(
         gcs_host: IPv4 address of the ground station.
         insecure: Whether addresses are allowed that other machines can reach.
         log: What real firmware prints goes here; None: to a file in its folder.
+        recording: Whether episodes are recorded, to be saved; without, they may last for ever.
 
     Raises:
         UsageError: A port is taken, an address unusable, or real firmware is not there.
     """
     ports = aircraft.ports
 
-    def ends() -> Px4Ends:
-        return px4_ends(
+    def ends() -> UdpLinks:
+        return bind_udp_links(
             bind=bind,
             api_remote=(companion_host, ports.api_port),
             api_local_port=ports.api_local_port,
@@ -87,17 +89,17 @@ def build_firmware(
             insecure=insecure,
         )
 
-    avionics: Avionics
+    flight_stack: FlightStack
     if aircraft.firmware == "builtin":
-        avionics = BuiltinAvionics(px4_server(ends(), unix_us()))
+        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us()))
     else:
-        avionics = real_firmware(Wanted(aircraft, vehicle, log, ends))
+        flight_stack = real_firmware(Wanted(aircraft, vehicle, log, ends))
     try:
         camera = CameraServer(f"tcp://{bind}:{ports.camera_port or '*'}")
     except UsageError:
-        avionics.close()
+        flight_stack.close()
         raise
-    return Firmware(avionics, camera, pacing)
+    return Firmware(flight_stack, camera, pacing, recording=recording)
 
 
 class Service:
@@ -116,7 +118,7 @@ class Service:
         firmware.on_tick, firmware.on_message = self._report, self._tell
         self._record = Path()
         self._reported = 0
-        self._crash = CrashWatch()
+        self._crash = CrashDetector()
         self._handlers: dict[type, Callable[[Any], None]] = {
             LoadEpisode: self._load,
             FinishEpisode: self._finish,
@@ -152,7 +154,7 @@ class Service:
         )
         episode = EpisodeSetup(scenario.vehicle, arena, seed, scenario.scenario)
         tlog = Path(request.tlog) if request.tlog else None
-        self._crash = CrashWatch()
+        self._crash = CrashDetector()
         loaded = self._firmware.load(episode, tlog, unix_us())
         self._record = Path(request.record)
         self._channel.send(

@@ -9,11 +9,12 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from airl_mav.core.child_process import Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.channel import Begin, Event, Failed, Ready
-from airl_mav.rehearsal.process import Child, Exited
+from airl_mav.rehearsal.process import Child
 
 FIRMWARE, COMPANION = "firmware", "companion"
 

@@ -52,12 +52,6 @@ def command_for(thrust: float, thrust_curve: float) -> float:
 
 
 @kernel
-def spin(speed: float, command: float, airframe: Airframe, dt: float) -> float:
-    """Return the speed fraction after dt [s]: exact step response of a first-order lag."""
-    return settle(speed, command, airframe, lag(airframe, dt))
-
-
-@kernel
 def wrench(s0: float, s1: float, s2: float, s3: float, airframe: Airframe) -> tuple[float, Vec]:
     """Return collective thrust [N] along body up, and the body torque FRD [N m]."""
     speeds = (s0, s1, s2, s3)

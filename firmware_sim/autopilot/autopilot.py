@@ -13,15 +13,7 @@ from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ, TICK_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic
-from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
-from firmware_sim.autopilot.error_state import P, V
-from firmware_sim.autopilot.estimator import Estimator, NewFilter
-from firmware_sim.autopilot.failsafe import Watch
-from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.guidance import Guidance
-from firmware_sim.autopilot.land_detector import LandDetector
-from firmware_sim.autopilot.parameters import Parameters
-from firmware_sim.autopilot.state import (
+from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
     CommanderStatus,
@@ -32,6 +24,14 @@ from firmware_sim.autopilot.state import (
     Setpoint,
     Severity,
 )
+from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
+from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.estimator import Estimator, NewFilter
+from firmware_sim.autopilot.failsafe import Watch
+from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.guidance import Guidance
+from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -198,11 +198,11 @@ class BuiltinAutopilot:
         return self._controller.ticks_to_motors
 
     @property
-    def inside(self) -> BuiltinAutopilot:
+    def internals(self) -> BuiltinAutopilot:
         """Itself: everything can be looked at."""
         return self
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Do nothing: it never sees the truth."""
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
 
-from firmware_sim.autopilot.state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 
 
 class Phase(IntEnum):

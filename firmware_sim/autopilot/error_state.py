@@ -141,7 +141,7 @@ def true_heading(field: Vector, q: Quat, declination: float) -> float:
 
 
 @kernel
-def see_heading(
+def observe_heading(
     row: Vector, field: Vector, declination: float, by_turn: Vector, innovation: Vector, h: Vector
 ) -> bool:
     """Write the heading's innovation (1,) and its Jacobian (1, 16); False = there is no telling.

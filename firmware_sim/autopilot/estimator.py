@@ -18,8 +18,8 @@ from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, quat_from_
 from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.state import Estimate
 from firmware_sim.interfaces import GpsFix, SensorSample
 
 ALIGN_S = 0.5
@@ -225,7 +225,7 @@ class Estimator:
 
     def _fuse_heading(self, field: Vector) -> None:
         m = self._heading
-        told = es.see_heading(
+        told = es.observe_heading(
             self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
         )
         if told:

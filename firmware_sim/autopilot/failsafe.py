@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
 from firmware_sim.autopilot.commander import Event, Flight, Phase
-from firmware_sim.autopilot.state import Message, Mode, Severity
 
 # Bound once: looking up a member of an enumeration takes as long as a whole timer.
 _GROUND, _AIR, _OFFBOARD = Phase.GROUND, Phase.AIR, Mode.OFFBOARD

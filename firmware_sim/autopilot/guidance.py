@@ -10,10 +10,10 @@ from airl_mav.control.cascade import Demand
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from firmware_sim.autopilot.climb import Climb, ClimbLimits
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
-from firmware_sim.autopilot.state import Mode, Setpoint
 
 NAN = math.nan
 _FREE = (NAN, NAN, NAN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from firmware_sim.autopilot.state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
 from firmware_sim.interfaces import SensorSample
 
 

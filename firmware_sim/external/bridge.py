@@ -8,7 +8,7 @@ from typing import Protocol
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 
-def nobody_to_look_after() -> None:
+def no_process() -> None:
     """Do nothing: for firmware whose process is not ours, nobody can tell whether it lives."""
 
 
@@ -48,7 +48,7 @@ class Bridge(Protocol):
         """
         ...
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Take what tells the true state."""
         ...
 

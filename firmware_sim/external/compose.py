@@ -13,7 +13,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Aircraft, FirmwareName, RealFirmware
-from firmware_sim.external.airframe import (
+from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,
     ardupilot_airframe,
@@ -21,18 +21,18 @@ from firmware_sim.external.airframe import (
 )
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.ardupilot.program import Links, find_arducopter
-from firmware_sim.external.ardupilot.simulator import ArdupilotBridge
-from firmware_sim.external.avionics import BridgedAvionics, Launcher
+from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
+from firmware_sim.external.boot_sequence import ExternalFlightStack, Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.process.sitl_launcher import SitlLauncher
-from firmware_sim.external.process.working_folder import Workplace
+from firmware_sim.external.process.working_folders import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
-from firmware_sim.external.px4.hitl_launcher import HitlLauncher, clients_of
+from firmware_sim.external.px4.hitl import HitlLauncher
 from firmware_sim.external.px4.program import find_px4
-from firmware_sim.external.px4.simulator import Px4Bridge
+from firmware_sim.external.px4.sitl import Px4Bridge
 from firmware_sim.external.transport.router import Router, RouterEnd
 from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
-from firmware_sim.mavlink.px4_links import Px4Ends
+from firmware_sim.mavlink.udp_links import UdpLinks
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Wanted:
     vehicle: VehicleProfile
     log: Path | None
     """What it prints goes here; None = a file in its folder."""
-    bind_ends: Callable[[], Px4Ends]
+    bind_ends: Callable[[], UdpLinks]
     """Binds the vehicle's ends of the links, where they are ours."""
 
 
-def real_firmware(wanted: Wanted) -> BridgedAvionics:
+def real_firmware(wanted: Wanted) -> ExternalFlightStack:
     """Bind the ports of real firmware and return it, not yet started.
 
     Raises:
@@ -56,7 +56,7 @@ def real_firmware(wanted: Wanted) -> BridgedAvionics:
     """
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer")
-    return BridgedAvionics(launcher, observer, wanted.aircraft.real.firmware_timeout)
+    return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)
 
 
 def check_program(real: RealFirmware) -> None:
@@ -105,7 +105,7 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
         airframe,
         partial(Px4Bridge, px4_program.SIMULATOR_PORT + instance),
         None if program is None else partial(program.start, instance, airframe.number),
-        Workplace("px4", options.firmware_dir, wanted.log),
+        WorkingFolders("px4", options.firmware_dir, wanted.log),
         timeout_s=options.firmware_timeout,
         reboots=False,
     )
@@ -129,7 +129,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
         airframe,
         partial(ArdupilotBridge, ardupilot_program.simulator_port(instance)),
         None if program is None else partial(start, program, instance, links, airframe.settings),
-        Workplace("ardupilot", options.firmware_dir, wanted.log),
+        WorkingFolders("ardupilot", options.firmware_dir, wanted.log),
         timeout_s=options.firmware_timeout,
         reboots=True,
     )
@@ -139,7 +139,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options = wanted.aircraft.real
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
-    router = Router(clients_of(wanted.bind_ends()), WallClock())
+    router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
         launcher = HitlLauncher(
             airframe, router, options.serial or "", options.baud, options.firmware_timeout

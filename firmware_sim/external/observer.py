@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.autopilot.state import Message, Severity
-from firmware_sim.external.modes import flight_of
+from firmware_sim.external.heartbeat_modes import flight_of
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint
@@ -76,7 +76,7 @@ class Observer:
         self.last_text = ""
         """What it said last."""
         self._beat_us = -BEAT_EVERY_US
-        self.poses_as_ground = True
+        self.acts_as_ground_station = True
         """Whether it shows itself as a ground station: PX4 sends texts to nobody else."""
         self.parameters = ParameterClient(self._send)
 
@@ -97,12 +97,6 @@ class Observer:
         ArduPilot may be armed before that, but not flown by setpoints; it tells no position yet.
         """
         return self._ready and "LOCAL_POSITION_NED" in self._came
-
-    @property
-    def heartbeat_armed(self) -> bool:
-        """Whether its newest heartbeat says armed (up to 1 s old)."""
-        beat = self._heard
-        return beat is not None and bool(beat.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def flight(self, *, armed: bool) -> Flight:
         """Return phase and mode; `armed` is whether motors may turn."""
@@ -139,7 +133,7 @@ class Observer:
         self._now_us = now_us
         if self._heard is None:
             return
-        if self.poses_as_ground and now_us - self._beat_us >= BEAT_EVERY_US:
+        if self.acts_as_ground_station and now_us - self._beat_us >= BEAT_EVERY_US:
             self._beat_us = now_us
             self._send(
                 dialect.MAVLink_heartbeat_message(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values, dialect
 
 CAPABILITIES: int = (

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMessage, layout
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.rates import GCS_HZ, ONBOARD_HZ, interval_us

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from airl_mav.core.frames import Geodetic
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
-from firmware_sim.autopilot.state import AutopilotState, Message
 from firmware_sim.mavlink import identity
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.state import Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.mavlink.codec import WireMessage, dialect
 
 CHUNK_BYTES = 50

@@ -15,7 +15,7 @@ from airl_mav.vehicle.rotor import settle, wrench
 from firmware_sim.plant.kinematics import from_bullet, quaternion, rates, velocity
 
 IDLE_POWER_W = 5.0
-"""Avionics on the ground, motors off [W]."""
+"""Flight controller and sensors, motors off [W]."""
 
 Speeds = tuple[float, float, float, float]
 """Of the rotors, as fractions of the speed at full command."""

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from firmware_sim.autopilot.autopilot_state import Mode, Result, Severity
 from firmware_sim.autopilot.commander import (
     READINESS,
     TABLE,
@@ -17,7 +18,6 @@ from firmware_sim.autopilot.commander import (
     Phase,
     transition,
 )
-from firmware_sim.autopilot.state import Mode, Result, Severity
 
 BOOT, STANDBY, GROUND, AIR = Phase.BOOT, Phase.STANDBY, Phase.GROUND, Phase.AIR
 OK, NO = Result.ACCEPTED, Result.TEMPORARILY_REJECTED

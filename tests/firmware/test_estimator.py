@@ -29,10 +29,10 @@ from airl_mav.core.frames import (
 )
 from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.error_state import GATE, N_STATES
 from firmware_sim.autopilot.estimator import Estimator
-from firmware_sim.autopilot.parameters import Parameters
-from firmware_sim.autopilot.state import Estimate
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 

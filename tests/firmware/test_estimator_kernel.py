@@ -20,11 +20,11 @@ from airl_mav.core.frames import quat_xyzw_to_wxyz
 from airl_mav.scenario.model import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Mode, Result
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
 from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.parameters import Parameters
-from firmware_sim.autopilot.state import Mode, Result
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import SensorSample
 from tests.support.flight_rig import flight, quad, velocity_setpoint
 

@@ -19,9 +19,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.autopilot.state import Result
+from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.external.ardupilot.json_messages import ServoPacketError, parse_servos, state_line
-from firmware_sim.external.ardupilot.simulator import MAX_GARBAGE, ArdupilotBridge
+from firmware_sim.external.ardupilot.sitl import MAX_GARBAGE, ArdupilotBridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from tests.support.ardupilot_copter import GUIDED, LAND
@@ -136,7 +136,7 @@ class Rig:
     def __init__(self, **settings: Any) -> None:
         (self.port,), _ = free_ports(1, 0)
         self.bridge = ArdupilotBridge(self.port, **settings)
-        self.bridge.see(truth)
+        self.bridge.use_truth(truth)
         self.socket = _socket()
         self.time_us = START_US
         self._pool = ThreadPoolExecutor(1)
@@ -408,7 +408,7 @@ def test_a_process_that_dies_is_noticed_at_once() -> None:
 def test_a_peer_asks_again_when_nobody_answers() -> None:
     (port,), _ = free_ports(1, 0)
     bridge = ArdupilotBridge(port)
-    bridge.see(truth)
+    bridge.use_truth(truth)
     asked = threading.Event()
     with ArdupilotPeer(port, rate_hz=250) as peer:
         bridge.wait_connected(10.0, _alive)

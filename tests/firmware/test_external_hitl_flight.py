@@ -15,16 +15,16 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.telemetry import Telemetry
 
 from airl_mav.core.clock import SimClock, WallClock
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.parameters import Parameters
-from firmware_sim.autopilot.state import Mode
-from firmware_sim.external.airframe import HITL_OUTPUT, px4_airframe
-from firmware_sim.external.avionics import BridgedAvionics, RealFirmware
+from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
+from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack
 from firmware_sim.external.observer import Observer
-from firmware_sim.external.px4.hitl_launcher import HitlLauncher, clients_of
+from firmware_sim.external.px4.hitl import HitlLauncher
 from firmware_sim.external.transport.router import Router, RouterEnd
 from firmware_sim.flight_controller import FirmwareMissingError
-from firmware_sim.mavlink.px4_links import px4_ends
+from firmware_sim.mavlink.udp_links import bind_udp_links
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad
 from tests.support.hitl_peer import HitlPeer
@@ -47,7 +47,7 @@ class Flight:
 
     def __init__(self, peer: HitlPeer) -> None:
         (self.api, api_local, gcs, gcs_local), _ = free_ports(4, 0)
-        ends = px4_ends(
+        ends = bind_udp_links(
             bind=LOOPBACK,
             api_remote=(LOOPBACK, self.api),
             api_local_port=api_local,
@@ -55,7 +55,7 @@ class Flight:
             gcs_local_port=gcs_local,
             insecure=False,
         )
-        self.router = Router(clients_of(ends), WallClock())
+        self.router = Router(ends.by_name(), WallClock())
         self.launcher = HitlLauncher(
             *(px4_airframe(quad(), HITL_OUTPUT), self.router, peer.device, 921_600, PATIENCE_S),
             silence_s=PATIENCE_S,
@@ -67,7 +67,7 @@ class Flight:
     def boot(self) -> Simulation:
         self.observer.restart()
         bridge = self.launcher.launch()
-        firmware = RealFirmware(bridge, self.observer, self.launcher)
+        firmware = ExternalFlightController(bridge, self.observer, self.launcher)
         firmware.on_message = lambda m: self.texts.append(m.text)
         self.firmware = firmware
         return Simulation(SETUP, start_us=7_000_000, clock=SimClock(), autopilot=firmware)
@@ -150,9 +150,9 @@ def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
     flight: Flight, peer: HitlPeer
 ) -> None:
     peer.parameters = partial(Parameters, quad().parameters)  # no CA_ROTOR among them
-    avionics = BridgedAvionics(flight.launcher, flight.observer, 2.0)
+    stack = ExternalFlightStack(flight.launcher, flight.observer, 2.0)
     flight.simulation.close()
-    firmware = avionics.boot(SETUP)
+    firmware = stack.boot(SETUP)
     simulation = Simulation(SETUP, start_us=7_000_000, clock=SimClock(), autopilot=firmware)
     flight.simulation = simulation
 
@@ -161,4 +161,4 @@ def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
         return simulation.time_us
 
     with pytest.raises(FirmwareMissingError, match=r"the parameters .*CA_AIRFRAME"):
-        avionics.connect(tick)
+        stack.connect(tick)

@@ -15,9 +15,9 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.process.child import FirmwareChild
+from firmware_sim.external.process.firmware_process import FirmwareProcess
 from firmware_sim.external.px4.program import find_px4
-from firmware_sim.external.px4.simulator import EPOCH_US, Px4Bridge
+from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -37,14 +37,14 @@ def fine() -> None:
 class Flown:
     """A bridge as a flight controller. Implements `FlightController`."""
 
-    inside = None
+    internals = None
     on_message = None
     flight = Flight()
 
     def __init__(self, bridge: Px4Bridge) -> None:
         self.bridge = bridge
         self.rate_hz = bridge.rate_hz
-        self.see, self.close = bridge.see, bridge.close
+        self.use_truth, self.close = bridge.use_truth, bridge.close
         self.controls: ActuatorControls | None = None
 
     def step(self, sample: SensorSample) -> ActuatorControls:
@@ -454,7 +454,7 @@ def test_a_program_started_like_px4_is_flown(tmp_path):
         build = write_build(tmp_path / "build", *options, "--port", str(bridge.port))
         program = find_px4(build)
         start = program.start(3, 10016, tmp_path)
-        child = FirmwareChild("PX4", start, tmp_path, tmp_path / "log")
+        child = FirmwareProcess("PX4", start, tmp_path, tmp_path / "log")
         try:
             bridge.wait_connected(PATIENCE_S, child.check)
             flight = Scene(bridge, None, TICK_US)

@@ -13,7 +13,6 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock, WallClock
-from firmware_sim.external.px4.hitl_launcher import clients_of
 from firmware_sim.external.transport.router import (
     BURST_BYTES,
     SIMULATOR_IDS,
@@ -23,7 +22,7 @@ from firmware_sim.external.transport.router import (
 )
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.px4_links import px4_ends
+from firmware_sim.mavlink.udp_links import bind_udp_links
 from tests.support.ports import LOOPBACK, free_ports
 
 PATIENCE_S = 60.0
@@ -223,7 +222,7 @@ def test_a_budget_saves_no_more_than_a_burst() -> None:
 
 def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
     (api, api_local, gcs, gcs_local), _ = free_ports(4, 0)
-    ends = px4_ends(
+    ends = bind_udp_links(
         bind=LOOPBACK,
         api_remote=(LOOPBACK, api),
         api_local_port=api_local,
@@ -231,7 +230,7 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
         gcs_local_port=gcs_local,
         insecure=False,
     )
-    router, line = Router(clients_of(ends), WallClock()), Line()
+    router, line = Router(ends.by_name(), WallClock()), Line()
     end = RouterEnd(router)
 
     def wakes() -> bool:

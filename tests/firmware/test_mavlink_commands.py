@@ -7,7 +7,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.state import Arming
+from firmware_sim.autopilot.autopilot_state import Arming
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
 

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.state import Arming
+from firmware_sim.autopilot.autopilot_state import Arming
 from tests.support.mavlink_clients import Bench, RawClient
 
 # Derandomised: a 16-bit checksum lets one random frame in 65,536 pass, too many for a test to

@@ -26,7 +26,7 @@ from mavsdk.plugins.telemetry import FlightMode, LandedState, Telemetry
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.state import Arming, Message, Mode, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Setpoint, Severity
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import (

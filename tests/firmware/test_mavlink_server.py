@@ -10,7 +10,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.state import Arming, AutopilotState, Message, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Message, Severity
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.state import Mode
+from firmware_sim.autopilot.autopilot_state import Mode
 from tests.support.mavlink_clients import Rig, text_of
 
 NAN = math.nan

@@ -13,9 +13,14 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, TICK_US, US_PER_S
-from firmware_sim.autopilot.state import Arming, AutopilotState, Landed, Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode, Setpoint
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.mavlink.modes import base_mode, custom_mode, requested_mode, system_status
+from firmware_sim.mavlink.px4_custom_mode import (
+    base_mode,
+    custom_mode,
+    requested_mode,
+    system_status,
+)
 from firmware_sim.mavlink.scheduler import OFF, StreamScheduler
 from firmware_sim.mavlink.streams import units
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot

@@ -38,15 +38,10 @@ def test_a_lag_is_given_up_once() -> None:
     tick_us = TICK_US
     assert paced.wait(tick_us, [], pytest.fail) == tick_us
     assert paced.slipped_us > MAX_LAG_US
-    ((when, lost),) = paced.take_slips()
-    assert (when, lost) == (tick_us, paced.slipped_us)
-    assert paced.take_lateness().tolist() == [0]
-    assert not len(paced.take_slips())
-    # A new episode counts from anew; the sum of the run stays.
+    # What passes before an episode begins is no part of it.
     total = paced.slipped_us
     time.sleep(0.01)
     paced.restart(tick_us)
-    assert not len(paced.take_slips())
     assert paced.slipped_us == total
 
 
@@ -76,17 +71,18 @@ def test_stamps_never_go_back(talking: list[int]) -> None:
     """Whatever is read before, at and after a slip has times in order."""
     paced = WallPacing(FAST)
     stamps: list[int] = []
+    slips = 0
     tick_us = 0
     for pause in [0.0, 0.001, 0.02, 0.0, 0.0015, 0.001, 0.03, 0.0]:
         time.sleep(pause)
         tick_us += TICK_US
+        before_us = paced.slipped_us
         stamps.append(paced.wait(tick_us, talking, stamps.append))
+        slips += paced.slipped_us > before_us
         # Nor does the clock go back behind one: what happens next is later.
         assert paced.clock.time_us() >= stamps[-1]
     assert stamps == sorted(stamps)
-    slips = paced.take_slips()
-    assert len(slips) >= 2
-    assert slips[:, 1].sum() == paced.slipped_us
+    assert slips >= 2
 
 
 def test_unpaced_time_is_the_tick() -> None:
@@ -94,7 +90,7 @@ def test_unpaced_time_is_the_tick() -> None:
     free.restart(8_000)
     assert free.wait(12_000, [], pytest.fail) == 12_000
     assert free.clock.time_us() == 12_000
-    assert free.take_slips().shape == (0, 2)
+    assert free.slipped_us == 0
     assert free.epoch_ns is None
 
 

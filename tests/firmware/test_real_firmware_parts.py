@@ -1,4 +1,4 @@
-"""The parts around a bridge: the leash, the frame check, parameters, the observer, the options."""
+"""The parts around a bridge: process, frame check, parameters, observer, options."""
 
 from __future__ import annotations
 
@@ -14,10 +14,6 @@ from typing import Any
 
 import pytest
 import tyro
-from pymavlink import mavparm
-from pymavlink.dialects.v20 import common as dialect
-
-from airl_mav.cli.firmware import FirmwareCommand
 from airl_mav.cli.firmware_options import (
     FirmwareName,
     RealFirmwareOptions,
@@ -26,16 +22,19 @@ from airl_mav.cli.firmware_options import (
     how_to_start,
     load_timeout_s,
 )
+from airl_mav.cli.sitl_command import SitlCommand
+from pymavlink import mavparm
+from pymavlink.dialects.v20 import common as dialect
+
+from airl_mav.cli.firmware import FirmwareCommand
 from airl_mav.cli.parameters import KINDS
 from airl_mav.cli.parameters import run as write_parameters
 from airl_mav.cli.parameters_command import ParametersCommand
-from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.model import Ports
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.state import Mode
-from firmware_sim.external.airframe import (
+from firmware_sim.external.airframe_check import (
     ArduPilotAirframe,
     Px4Airframe,
     ardupilot_airframe,
@@ -44,11 +43,11 @@ from firmware_sim.external.airframe import (
 )
 from firmware_sim.external.ardupilot.program import PARAMETERS, Links, find_arducopter
 from firmware_sim.external.ardupilot.program import start as start_arducopter
-from firmware_sim.external.modes import flight_of
+from firmware_sim.external.heartbeat_modes import flight_of
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.parameter_client import ParameterClient, same
-from firmware_sim.external.process.child import FirmwareChild, Start
-from firmware_sim.external.process.working_folder import Workplace
+from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
+from firmware_sim.external.process.working_folders import WorkingFolders
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -57,21 +56,23 @@ from tests.support.processes import ROOT, is_running, wait_until
 
 PX4_ID, ARDUPILOT_ID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
 
-# --- the leash
+# --- the firmware process
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from firmware_sim.external.process.child import FirmwareChild, Start
+from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
 folder = Path(sys.argv[1])
-child = FirmwareChild("X", Start(sys.argv[2:], {}), folder, folder / "x.log")
+child = FirmwareProcess("X", StartCommand(sys.argv[2:], {}), folder, folder / "x.log")
 print("up", flush=True)
 time.sleep(600)
 """
 
 
-def started(folder: Path, *program: str) -> FirmwareChild:
-    return FirmwareChild("PX4", Start(program, {"GREETING": "hello"}), folder, folder / "x.log")
+def started(folder: Path, *program: str) -> FirmwareProcess:
+    return FirmwareProcess(
+        "PX4", StartCommand(program, {"GREETING": "hello"}), folder, folder / "x.log"
+    )
 
 
 def test_a_program_runs_logs_and_is_ended_with_what_it_started(tmp_path: Path) -> None:
@@ -80,7 +81,7 @@ def test_a_program_runs_logs_and_is_ended_with_what_it_started(tmp_path: Path) -
     pid_file = tmp_path / "pid"
     grandchild = int(wait_until(lambda: pid_file.exists() and pid_file.read_text(), "the program"))
     child.check()
-    assert child.tail() == "hello"
+    assert child.log_tail() == "hello"
     child.stop()
     wait_until(lambda: not is_running(grandchild), "its own child to end", 30.0)
     child.stop()
@@ -450,15 +451,15 @@ def test_px4_is_found_in_a_build_a_tree_and_a_package(tmp_path: Path) -> None:
 
 
 def test_folders_of_flights_are_new_each_time(tmp_path: Path) -> None:
-    kept = Workplace("px4", tmp_path / "kept", None)
+    kept = WorkingFolders("px4", tmp_path / "kept", None)
     first, second = kept.fresh(), kept.fresh()
     assert first != second
     assert first.is_dir()
-    again = Workplace("px4", tmp_path / "kept", None)
+    again = WorkingFolders("px4", tmp_path / "kept", None)
     assert again.fresh() not in (first, second)
     kept.close()
     assert first.is_dir()
-    temporary = Workplace("px4", None, None)
+    temporary = WorkingFolders("px4", None, None)
     folder = temporary.fresh()
     assert temporary.fresh() != folder
     assert not folder.exists()

@@ -12,12 +12,12 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from rich.console import Console
-
-from airl_mav.cli import evaluate_task
 from airl_mav.cli.cells import Cell, FlownCell, check_cells, check_root, fly_cells
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_task import Result, Task
+from rich.console import Console
+
+from airl_mav.cli import evaluate_task
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.constants import TICK_US
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.climb import Climb, ClimbLimits, approach_speed
-from firmware_sim.autopilot.state import Mode
 from tests.support.flight_rig import flight
 
 GENTLE = ClimbLimits(1.5, 0.5, 4.0)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
-from firmware_sim.autopilot.state import Mode
-from firmware_sim.crash import is_crash
+from firmware_sim.crash_detector import is_crash
 from firmware_sim.plant.plant import Collision
 from firmware_sim.plant.world import FLOOR
 

@@ -21,15 +21,15 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_lockstep import plan_lockstep
+from airl_mav.cli.evaluate_task import sitl_command
 from PIL import Image
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
 from airl_mav.cli import evaluate_task
 from airl_mav.cli.evaluate import run
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_lockstep import plan_lockstep
-from airl_mav.cli.evaluate_task import sitl_command
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec, EpisodeRules

@@ -18,12 +18,12 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.sitl_command import SitlCommand
 from rich.console import Console
 
 from airl_mav.cli import evaluate_task, sitl
 from airl_mav.cli.evaluate import run
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card

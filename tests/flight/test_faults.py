@@ -27,7 +27,7 @@ from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
 from companion.guard import ThreadGuard
-from companion.link import MavsdkLink
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, fly_mission
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (

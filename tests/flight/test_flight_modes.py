@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import quat_yaw
+from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.state import Arming, Mode, Result, Setpoint
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
 
 STILL = velocity_setpoint(0.0, 0.0, 0.0)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import prepare
 from numpy.typing import NDArray
 from rich.console import Console
 
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import prepare
 from airl_mav.core.constants import TICK_US
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from tests.support.ports import choose_ports

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink import mavutil
-
 from airl_mav.cli.lockstep import lockstep_plan, policies
 from airl_mav.cli.sitl_command import SitlCommand, check
+from pymavlink import mavutil
+
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import LockstepPlan, Watching, fly
 from airl_mav.lockstep.remote import RemotePlan, RemoteStage

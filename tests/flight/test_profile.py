@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from airl_mav.cli.companion_command import CompanionCommand, sampler
 from rich.console import Console
 
 from airl_mav.cli import profile, profile_hil
-from airl_mav.cli.companion_command import CompanionCommand, sampler
 from airl_mav.cli.profile_command import ProfileCommand
 from airl_mav.cli.profile_plan import Measured, planned
 from airl_mav.cli.profile_report import correlation_line, stages_of, verdict

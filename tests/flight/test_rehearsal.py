@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from airl_mav.rehearsal.crew import COMPANION, FIRMWARE
 
+from airl_mav.core.child_process import Exited
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Part, Setup
@@ -37,9 +39,7 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
-from airl_mav.rehearsal.crew import COMPANION, FIRMWARE
 from airl_mav.rehearsal.episode import Plan, ProcessPlan
-from airl_mav.rehearsal.process import Exited
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.sitl_command import SitlCommand
 from rich.console import Console
 
 from airl_mav.cli import evaluate_task, sitl
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.episode import Plan

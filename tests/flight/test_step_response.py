@@ -18,7 +18,7 @@ import pytest
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import heading_to_ned, quat_yaw, wrap_pi
-from firmware_sim.autopilot.state import Setpoint
+from firmware_sim.autopilot.autopilot_state import Setpoint
 from tests.support.flight_rig import NAN, SETPOINT_US, Rig, flight, velocity_setpoint
 
 MESSAGE_US = 10_000

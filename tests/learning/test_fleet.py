@@ -21,7 +21,7 @@ from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet import connect, pybullet
 from firmware_sim.plant.plant import Plant

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import prepare
 from PIL import Image
 from rich.console import Console
 
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import prepare
 from airl_mav.cli.report import run
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.errors import UsageError

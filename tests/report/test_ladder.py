@@ -18,14 +18,14 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from airl_mav.cli.evaluate_command import EvaluateCommand
+from airl_mav.cli.evaluate_task import Result, Task
+from airl_mav.cli.ladder_command import LadderCommand
 from PIL import Image
 from rich.console import Console
 
 from airl_mav.cli import evaluate_task, ladder_levels, main, report
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import Result, Task
 from airl_mav.cli.ladder import run
-from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import gym_flier
 from airl_mav.flight.judge import Outcome

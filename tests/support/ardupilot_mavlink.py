@@ -8,7 +8,14 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from airl_mav.core.frames import heading_to_ned, quat_yaw
-from firmware_sim.autopilot.state import AutopilotState, Landed, Message, Result, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import (
+    AutopilotState,
+    Landed,
+    Message,
+    Result,
+    Setpoint,
+    Severity,
+)
 from firmware_sim.mavlink import identity
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint

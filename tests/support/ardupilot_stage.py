@@ -11,7 +11,7 @@ from typing import Any
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.ardupilot.simulator import ArdupilotBridge
+from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.ardupilot_peer import ArdupilotPeer
 from tests.support.flight_rig import quad
@@ -21,12 +21,12 @@ from tests.support.ports import free_ports
 class BridgeOnly:
     """A flight controller that is nothing but its bridge. Implements `FlightController`."""
 
-    inside = None
+    internals = None
     on_message = None
 
     def __init__(self, bridge: ArdupilotBridge) -> None:
         self.rate_hz = bridge.rate_hz
-        self.step, self.see, self.close = bridge.step, bridge.see, bridge.close
+        self.step, self.use_truth, self.close = bridge.step, bridge.use_truth, bridge.close
         self.flight = Flight()
 
 

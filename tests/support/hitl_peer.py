@@ -34,7 +34,7 @@ from pymavlink.generator import mavcrc
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 from firmware_sim.mavlink.codec import Decoder, Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint

@@ -12,8 +12,7 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
-from firmware_sim.autopilot.port import ParameterValue
-from firmware_sim.autopilot.state import (
+from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
     CommanderStatus,
@@ -26,6 +25,7 @@ from firmware_sim.autopilot.state import (
     Severity,
     Vector,
 )
+from firmware_sim.autopilot.port import ParameterValue
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)

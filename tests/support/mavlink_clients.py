@@ -13,7 +13,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import TICK_US, US_PER_S
-from firmware_sim.autopilot.state import Mode, Result
+from firmware_sim.autopilot.autopilot_state import Mode, Result
 from firmware_sim.mavlink.endpoint import Endpoint, MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import ParameterValue
 
 FRAME = (

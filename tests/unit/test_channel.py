@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
+from airl_mav.core.child_process import Exited
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.channel import (
     Abort,
@@ -27,7 +28,7 @@ from airl_mav.rehearsal.channel import (
     Shutdown,
     parse_event,
 )
-from airl_mav.rehearsal.process import Child, Exited
+from airl_mav.rehearsal.process import Child
 
 
 def members(union: Any) -> tuple[type[channel._Line], ...]:

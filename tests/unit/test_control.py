@@ -26,7 +26,7 @@ from airl_mav.control.velocity import (
 )
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, wrap_pi
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 
 GAINS = Gains.from_parameters(Parameters({"MPC_THR_HOVER": 0.52}).__getitem__)
 NAN = math.nan

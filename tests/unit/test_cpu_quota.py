@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from airl_mav.cli.companion_command import CompanionCommand
 from airl_mav.cli.companion_command import check as check_companion
-from airl_mav.cli.sitl import plan, settings
 from airl_mav.cli.sitl_command import SitlCommand
 from airl_mav.cli.sitl_command import check as check_sitl
+
+from airl_mav.cli.sitl import plan, settings
 from airl_mav.core.cpu_quota import CpuGroup, check_permitted, held_to, remove_left
 from airl_mav.core.errors import UsageError
 from tests.support.processes import ROOT

@@ -22,7 +22,7 @@ from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.loading import list_profiles, load_profile, profiles_dir
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import VehicleProfile
-from firmware_sim.autopilot.parameters import Parameters
+from firmware_sim.autopilot.parameter_store import Parameters
 
 ROOT = Path(__file__).resolve().parents[2]
 QUAD_TOML = (ROOT / "profiles" / "vehicles" / "quad.toml").read_text(encoding="utf-8")

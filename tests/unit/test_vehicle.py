@@ -22,7 +22,7 @@ from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
-from airl_mav.vehicle.rotor import spin, steady_speed, wrench
+from airl_mav.vehicle.rotor import lag, settle, steady_speed, wrench
 
 QUAD = Airframe.from_profile(load_profile("vehicles", "quad", VehicleProfile))
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -47,7 +47,7 @@ def test_lag_is_an_exact_exponential(curve: float, start: float, command: float,
     target = steady_speed(command, curve)
     speed = start
     for _ in range(n):
-        speed = spin(speed, command, airframe, TICK_S)
+        speed = settle(speed, command, airframe, lag(airframe, TICK_S))
     exact = target + (start - target) * math.exp(-n * TICK_S / QUAD.rotor_time_constant)
     assert speed == pytest.approx(exact, abs=1e-12)
 

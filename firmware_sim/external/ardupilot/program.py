@@ -10,7 +10,7 @@ from pathlib import Path
 from airl_mav.core.location import HOME
 from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.parameter_file import ardupilot_file
-from firmware_sim.external.process.child import Start
+from firmware_sim.external.process.firmware_process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -83,7 +83,7 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
 
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
-) -> Start:
+) -> StartCommand:
     """Return how it is started, its parameters in a file.
 
     Args:
@@ -94,7 +94,7 @@ def start(
         folder: Where it runs, and where the file is put.
     """
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
-    return Start(command(str(program), instance, links, PARAMETERS), {})
+    return StartCommand(command(str(program), instance, links, PARAMETERS), {})
 
 
 def how_to_start(instance: int, links: Links) -> str:

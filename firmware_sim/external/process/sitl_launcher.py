@@ -1,6 +1,6 @@
 """How SITL firmware gets going: a program that we start for each flight, or one that the user does.
 
-What is particular to PX4 and to ArduPilot is in `px4_program.py` and `ardupilot_program.py`.
+What is particular to PX4 and to ArduPilot is in `px4.program` and `ardupilot.program`.
 """
 
 from __future__ import annotations
@@ -8,21 +8,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from firmware_sim.external.airframe import Airframe
-from firmware_sim.external.bridge import Bridge, nobody_to_look_after
-from firmware_sim.external.process.child import FirmwareChild, Start
-from firmware_sim.external.process.working_folder import Workplace
+from firmware_sim.external.airframe_check import Airframe
+from firmware_sim.external.bridge import Bridge, no_process
+from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
+from firmware_sim.external.process.working_folders import WorkingFolders
 
 
 class SitlLauncher:
-    """Starts a program for each flight, or waits for the user's. An `avionics.Launcher`."""
+    """Starts a program for each flight, or waits for the user's. A `boot_sequence.Launcher`."""
 
     def __init__(
         self,
         airframe: Airframe,
         bridge: Callable[[], Bridge],
-        program: Callable[[Path], Start] | None,
-        workplace: Workplace,
+        program: Callable[[Path], StartCommand] | None,
+        folders: WorkingFolders,
         *,
         timeout_s: float,
         reboots: bool,
@@ -34,7 +34,7 @@ class SitlLauncher:
             bridge: Opens the simulator's side of its interface, for one flight.
             program: Called with an empty folder, which it may write files to: how the program is
                 started in it. None = the user starts it.
-            workplace: Where it runs and logs.
+            folders: Where it runs and logs.
             timeout_s: Longest wait for it to connect [wall s].
             reboots: Whether it starts anew by itself when told to reboot.
         """
@@ -43,20 +43,20 @@ class SitlLauncher:
         self.reboots = reboots
         self._bridge = bridge
         self._program = program
-        self._workplace = workplace
+        self._folders = folders
         self._timeout_s = timeout_s
-        self._child: FirmwareChild | None = None
+        self._child: FirmwareProcess | None = None
 
     def launch(self) -> Bridge:
-        """Start it, or wait for the user's; see `avionics.Launcher`."""
+        """Start it, or wait for the user's; see `boot_sequence.Launcher`."""
         self.stop()
-        alive = nobody_to_look_after
+        alive = no_process
         bridge = self._bridge()
         try:
             if self._program is not None:
-                folder = self._workplace.fresh()
-                self._child = FirmwareChild(
-                    self.airframe.firmware, self._program(folder), folder, self._workplace.log
+                folder = self._folders.fresh()
+                self._child = FirmwareProcess(
+                    self.airframe.firmware, self._program(folder), folder, self._folders.log
                 )
                 alive = self._child.check
             bridge.wait_connected(self._timeout_s, alive)
@@ -75,4 +75,4 @@ class SitlLauncher:
     def close(self) -> None:
         """End it for good; its temporary folder goes."""
         self.stop()
-        self._workplace.close()
+        self._folders.close()

@@ -15,6 +15,8 @@ from contextlib import suppress
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.errors import UsageError
+from firmware_sim.external.airframe_check import Airframe
+from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.board_link import REBOOT_S, BoardLink
 from firmware_sim.external.transport.router import Router
@@ -122,8 +124,6 @@ class HitlBridge:
         self.time_us = 0
         self.went_down = False
         """The board was told to reboot by others, and did when this was closed."""
-        self.unsent = 0
-        """Samples that the line did not take."""
         self._link = BoardLink(
             router,
             device,
@@ -191,7 +191,7 @@ class HitlBridge:
         self.armed = controls.armed
         return controls
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Do nothing: a board would take the true state for its estimate."""
 
     def close(self) -> None:
@@ -200,7 +200,7 @@ class HitlBridge:
         if link.board.rebooting:
             # Who finds it next must not take it for one that has come up.
             with suppress(FirmwareLostError):
-                link.go_down(_nobody)
+                link.go_down(no_process)
                 self.went_down = True
         elif self.armed or link.board.armed:
             link.disarm()
@@ -240,10 +240,74 @@ class HitlBridge:
         if self._link.send(hil.SENSOR, hil.sensor(sample, time_us)):
             self._stuck_us = None
         else:
-            self.unsent += 1
             self._stuck_us = now_us if self._stuck_us is None else self._stuck_us
         if sample.gps is not None:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
+
+
+class HitlLauncher:
+    """Finds the same board for each episode. Implements `boot_sequence.Launcher`."""
+
+    may_set = False
+    reboots = True
+
+    def __init__(
+        self,
+        airframe: Airframe,
+        router: Router,
+        device: str,
+        baud: int,
+        timeout_s: float,
+        *,
+        silence_s: float = SILENCE_S,
+    ) -> None:
+        """Take where the board is.
+
+        Args:
+            airframe: What it must be set to.
+            router: Where its MAVLink goes.
+            device: Serial device.
+            baud: Bits a second.
+            timeout_s: Longest wait for it to be heard [wall s].
+            silence_s: Longest time between motor commands [wall s].
+
+        Raises:
+            UsageError: The line is too slow.
+        """
+        check_line(device, baud)
+        self.airframe = airframe
+        self._router = router
+        self._device, self._baud = device, baud
+        self._timeout_s, self._silence_s = timeout_s, silence_s
+        self._bridge: HitlBridge | None = None
+
+    def launch(self) -> HitlBridge:
+        """Find the board and reboot it; see `boot_sequence.Launcher`."""
+        last = self._bridge
+        self.stop()
+        self._bridge = HitlBridge(
+            self._router,
+            self._device,
+            self._baud,
+            reboot=last is None or not last.went_down,
+            returning=last is not None,
+            silence_s=self._silence_s,
+        )
+        try:
+            self._bridge.wait_connected(self._timeout_s, no_process)
+        except BaseException:
+            self.stop()
+            raise
+        return self._bridge
+
+    def stop(self) -> None:
+        """Let go of the board."""
+        if self._bridge is not None:
+            self._bridge.close()
+
+    def close(self) -> None:
+        """Let go of the board for good."""
+        self.stop()
 
 
 def check_line(device: str, baud: int) -> int:
@@ -263,7 +327,3 @@ def check_line(device: str, baud: int) -> int:
             f"{int(HIL_BYTES_S * BITS_PER_BYTE / HIL_SHARE)} (usual: 460800, 921600), or USB"
         )
     return carries - HIL_BYTES_S
-
-
-def _nobody() -> None:
-    """Do nothing: there is no process to look after."""

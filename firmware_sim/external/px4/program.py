@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_sim.external.process.child import Start
+from firmware_sim.external.process.firmware_process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT = 4560
@@ -34,7 +34,7 @@ class Px4Program:
     etc: Path
     """Folder of its start-up scripts."""
 
-    def start(self, instance: int, airframe: int, folder: Path) -> Start:
+    def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
         """Return how it is started: in the background, without a shell.
 
         Args:
@@ -47,7 +47,7 @@ class Px4Program:
             *("-d", "-i", str(instance)),
             *("-w", str(folder), "-s", SCRIPT, str(self.etc)),
         ]
-        return Start(argv, environment(airframe))
+        return StartCommand(argv, environment(airframe))
 
 
 def find_px4(folder: Path) -> Px4Program:

@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from firmware_sim.autopilot.state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.mavlink.codec import SYSTEM_ID, WireMessage, dialect, message_id
-from firmware_sim.mavlink.modes import requested_mode
+from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services.context import (
     ANY,

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from airl_mav.core.frames import heading_to_ned, quat_yaw
-from firmware_sim.autopilot.state import Message, Setpoint, Severity, Vector
+from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context, Handler, for_vehicle_or_all
 

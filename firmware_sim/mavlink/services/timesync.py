@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from airl_mav.core.clock import NS_PER_US
-from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context, Handler
 

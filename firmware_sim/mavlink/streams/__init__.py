@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from firmware_sim.autopilot.state import AutopilotState
+from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import attitude, position, sensors, status
 

@@ -6,7 +6,7 @@ import math
 
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import yaw_of
-from firmware_sim.autopilot.state import AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams.units import boot_ms
 

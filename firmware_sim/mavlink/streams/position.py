@@ -10,7 +10,7 @@ from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic,
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import conjugate, rotate, yaw_of
-from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import (
     NAN,

@@ -6,8 +6,8 @@ import math
 
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle import atmosphere
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.autopilot.port import ParameterStore
-from firmware_sim.autopilot.state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import (
     INT16_MAX,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from firmware_sim.autopilot.state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.modes import base_mode, custom_mode, system_status
+from firmware_sim.mavlink.px4_custom_mode import base_mode, custom_mode, system_status
 from firmware_sim.mavlink.streams.sensors import percent
 from firmware_sim.mavlink.streams.units import NAN, boot_ms, int16, uint16
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
-from firmware_sim.autopilot.state import AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import Values
 

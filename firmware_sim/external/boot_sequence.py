@@ -9,9 +9,9 @@ from typing import Protocol
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.vehicle import CORNERS
+from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.autopilot.state import Message, Severity
-from firmware_sim.external.airframe import GROUND_LOSS, Airframe, differences
+from firmware_sim.external.airframe_check import GROUND_LOSS, Airframe, differences
 from firmware_sim.external.bridge import Bridge
 from firmware_sim.external.observer import Observer
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -61,10 +61,10 @@ class Launcher(Protocol):
         ...
 
 
-class RealFirmware:
+class ExternalFlightController:
     """Real firmware behind a bridge. Implements `FlightController`."""
 
-    inside = None
+    internals = None
 
     def __init__(self, bridge: Bridge, observer: Observer, launcher: Launcher) -> None:
         """Take the bridge, what listens to its MAVLink, and how it got going."""
@@ -74,7 +74,7 @@ class RealFirmware:
         self._output = tuple(launcher.airframe.motors.index(corner) for corner in CORNERS)
         self._sample: SensorSample | None = None
         self.rate_hz = bridge.rate_hz
-        self.see = bridge.see
+        self.use_truth = bridge.use_truth
 
     @property
     def on_message(self) -> Callable[[Message], None] | None:
@@ -118,8 +118,8 @@ class RealFirmware:
                 self._bridge.step(sample)
 
 
-class BridgedAvionics:
-    """Implements `firmware_sim.firmware.Avionics` with real firmware."""
+class ExternalFlightStack:
+    """Implements `firmware_sim.firmware.FlightStack` with real firmware."""
 
     def __init__(self, launcher: Launcher, observer: Observer, timeout_s: float) -> None:
         """Put it together; nothing is started yet.
@@ -140,11 +140,11 @@ class BridgedAvionics:
         self.log_to: Callable[[TlogWriter | None], None] = observer.log_to
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
 
-    def boot(self, setup: EpisodeSetup) -> RealFirmware:
+    def boot(self, setup: EpisodeSetup) -> ExternalFlightController:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
         del setup  # Each start is a power-up: it knows nothing of the last flight.
         self._observer.restart()
-        return RealFirmware(self._launcher.launch(), self._observer, self._launcher)
+        return ExternalFlightController(self._launcher.launch(), self._observer, self._launcher)
 
     def connect(self, tick: Callable[[], int]) -> None:
         """Fly ticks on the ground until its frame is known to be right and it may be armed.
@@ -162,7 +162,7 @@ class BridgedAvionics:
         names = airframe.names()
         self._until(tick, self._asking(lambda: parameters.ask(names)), "the parameters")
         # Where a lost ground station has consequences, a rehearsal without one must have them too.
-        observer.poses_as_ground = not parameters.values.get(GROUND_LOSS, 0)
+        observer.acts_as_ground_station = not parameters.values.get(GROUND_LOSS, 0)
         problem = airframe.problem(parameters.values)
         if problem is not None:
             raise FirmwareMissingError(problem)

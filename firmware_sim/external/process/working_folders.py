@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 
-class Workplace:
+class WorkingFolders:
     """Folders for one flight after the other: parameters and flight logs of the firmware."""
 
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from firmware_sim.mavlink.endpoint import Address, UdpEndpoint
+from firmware_sim.mavlink.endpoint import Address, Endpoint, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
 
-class Px4Ends(NamedTuple):
+class UdpLinks(NamedTuple):
     """The vehicle's ends of both links."""
 
     api: UdpEndpoint
     gcs: UdpEndpoint
 
+    def by_name(self) -> dict[str, Endpoint]:
+        """Return the ends by the names of their links."""
+        return {"onboard": self.api, "gcs": self.gcs}
 
-def px4_ends(
+
+def bind_udp_links(
     *,
     bind: str,
     api_remote: Address,
@@ -24,7 +28,7 @@ def px4_ends(
     gcs_remote: Address,
     gcs_local_port: int,
     insecure: bool,
-) -> Px4Ends:
+) -> UdpLinks:
     """Bind the vehicle's ports of both links.
 
     Raises:
@@ -49,10 +53,10 @@ def px4_ends(
     except Exception:
         api.close()
         raise
-    return Px4Ends(api, gcs)
+    return UdpLinks(api, gcs)
 
 
-def px4_server(ends: Px4Ends, boot_unix_us: int) -> MavlinkServer:
+def udp_server(ends: UdpLinks, boot_unix_us: int) -> MavlinkServer:
     """Return the server of both links, still without an autopilot.
 
     Args:

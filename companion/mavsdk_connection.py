@@ -1,8 +1,13 @@
-"""How MAVSDK is opened, and a flight controller found on it."""
+"""How MAVSDK is opened, and a flight controller found on it.
+
+Also what its library offers and MAVSDK-Python 4.1 does not wrap, or wraps slowly.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
@@ -15,6 +20,9 @@ from companion.interfaces import LinkError
 
 SLICE_S = 0.5
 """Longest single wait for a flight controller [wall s]."""
+
+RAW_CHUNK = 65_536
+"""Bytes that are fed at a time; MAVSDK's parser puts a divided frame together again."""
 
 
 def open_connection(url: str, kind: ComponentType) -> Mavsdk:
@@ -61,3 +69,27 @@ def _problem(url: str, result: Any) -> str:
             "(airl-sitl: --api-port)"
         )
     return f"--connect {url}: {name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"
+
+
+def exchange_raw_bytes(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    """Take over the bytes of a `raw://` connection; see `mavsdk_link.MavsdkLink.exchange_raw`."""
+    library, handle = mavsdk._lib, mavsdk._handle
+    mavsdk.subscribe_raw_bytes_to_be_sent(sent)
+    # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
+    buffer = (ctypes.c_uint8 * RAW_CHUNK)()
+    pass_bytes = library.mavsdk_pass_received_raw_bytes
+
+    def feed(data: bytes) -> None:
+        for start in range(0, len(data), RAW_CHUNK):
+            chunk = data[start : start + RAW_CHUNK]
+            ctypes.memmove(buffer, chunk, len(chunk))
+            pass_bytes(handle, buffer, len(chunk))
+
+    return feed
+
+
+def set_timeout(mavsdk: Mavsdk, seconds: float) -> None:
+    """Let MAVSDK repeat what has not been answered after so long [wall s]."""
+    call = mavsdk._lib.mavsdk_set_timeout_s
+    call.argtypes = [ctypes.c_void_p, ctypes.c_double]
+    call(mavsdk._handle, seconds)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from firmware_sim.autopilot.state import Arming, CommanderStatus, Mode
+from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Mode
 from firmware_sim.mavlink.codec import dialect
 
 MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL = 4, 6, 3

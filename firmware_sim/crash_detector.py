@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
-from firmware_sim.autopilot.state import Mode
 from firmware_sim.plant.plant import Collision
 from firmware_sim.plant.world import FLOOR
 from firmware_sim.simulation import Simulation
@@ -23,7 +23,7 @@ def is_crash(hit: Collision, flight: Flight) -> bool:
     return flight.phase is Phase.AIR and not gentle
 
 
-class CrashWatch:
+class CrashDetector:
     """Remembers the first thing that was hit in flight. Looks once a tick, for the flight then."""
 
     def __init__(self) -> None:

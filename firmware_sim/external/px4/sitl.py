@@ -12,7 +12,7 @@ from collections.abc import Callable
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
 from airl_mav.core.ports import LOOPBACK
-from firmware_sim.external.bridge import nobody_to_look_after
+from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT
 from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
@@ -96,7 +96,7 @@ class Px4Bridge:
         """The port it listens on."""
         self._answer_s, self._start_s = answer_s, start_s
         self._clock = WallClock()
-        self._alive: Callable[[], None] = nobody_to_look_after
+        self._alive: Callable[[], None] = no_process
         self._decoder = Decoder(datagrams=False)
         self._encoder = Encoder()
         self._truth: Callable[[], Truth] | None = None
@@ -125,7 +125,7 @@ class Px4Bridge:
                 f"running, with PX4_SIM_MODEL={MODEL} and -i {self.port - SIMULATOR_PORT}?"
             )
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Take what tells the true state."""
         self._truth = truth
 

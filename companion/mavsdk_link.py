@@ -17,15 +17,19 @@ from mavsdk import ComponentType
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
-from mavsdk.plugins.telemetry import LandedState, Telemetry, TelemetryError
+from mavsdk.plugins.telemetry import Telemetry, TelemetryError
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
-from companion import raw_bytes
-from companion.connection import first_autopilot, open_connection
 from companion.dialects import PX4, Dialect, dialect_of
 from companion.interfaces import STOP, BodyVelocity, LinkError
+from companion.mavsdk_connection import (
+    exchange_raw_bytes,
+    first_autopilot,
+    open_connection,
+    set_timeout,
+)
 
 POLL_S = 0.1
 """How often a condition is looked at while waiting for it [s]."""
@@ -169,11 +173,11 @@ class MavsdkLink:
             What to feed MAVSDK with, whole frames, from one thread at a time.
         """
         self.set_timeout(RAW_TIMEOUT_S)
-        return raw_bytes.exchange(self._mavsdk, sent)
+        return exchange_raw_bytes(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
         """Let MAVSDK repeat what has not been answered after so long [wall s], not after 0.5 s."""
-        raw_bytes.set_timeout(self._mavsdk, seconds)
+        set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Exchange STATUSTEXTs with the flight controller; `connect` comes first.
@@ -225,11 +229,6 @@ class MavsdkLink:
     def armed(self) -> bool:
         """Whether the heartbeat says armed (known up to 1 s late)."""
         return bool(self._telemetry.armed())
-
-    @property
-    def on_ground(self) -> bool:
-        """Whether the landing detector says on ground."""
-        return bool(self._telemetry.landed_state() == LandedState.ON_GROUND)
 
     @property
     def flight_mode(self) -> str:

@@ -25,7 +25,7 @@ from firmware_sim.external.ardupilot.json_messages import (
     state_line,
 )
 from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
-from firmware_sim.external.bridge import nobody_to_look_after
+from firmware_sim.external.bridge import no_process
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.endpoint import Address
@@ -66,7 +66,7 @@ class ArdupilotBridge:
         """Open the port; nothing is sent before ArduPilot is heard.
 
         Args:
-            port: UDP port on the loopback address, see `ardupilot_program.simulator_port`.
+            port: UDP port on the loopback address, see `program.simulator_port`.
             pwm_min_us: Pulse of a motor that stands (MOT_PWM_MIN) [µs].
             pwm_max_us: Pulse of full thrust (MOT_PWM_MAX) [µs].
             rate_hz: Lines a second of simulated time; None = what ArduPilot asks for. It goes by
@@ -87,7 +87,7 @@ class ArdupilotBridge:
         """How many of them came in a row."""
         self._pwm_min_us, self._span_us = pwm_min_us, pwm_max_us - pwm_min_us
         self._silence_us = int(silence_s * US_PER_S)
-        self._alive: Callable[[], None] = nobody_to_look_after
+        self._alive: Callable[[], None] = no_process
         self._truth: Callable[[], Truth] | None = None
         self._address: Address | None = None
         self._packet: ServoPacket | None = None
@@ -134,7 +134,7 @@ class ArdupilotBridge:
                 f"{RATES_HZ.start}..{RATES_HZ.stop - 1}"
             )
 
-    def see(self, truth: Callable[[], Truth]) -> None:
+    def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Take what tells the true state: ArduPilot makes GPS, barometer and compass of it."""
         self._truth = truth
 
@@ -149,7 +149,7 @@ class ArdupilotBridge:
         """
         answered, truth, address = self._packet, self._truth, self._address
         if answered is None or truth is None or address is None:
-            raise RuntimeError("step() before wait_connected() and see()")
+            raise RuntimeError("step() before wait_connected() and use_truth()")
         if self._base_us is None:
             # Its time starts at 0 and must move with the first line, too.
             self._base_us = sample.time_us - US_PER_S // self.rate_hz

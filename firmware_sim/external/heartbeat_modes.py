@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
-from firmware_sim.autopilot.state import Mode
-from firmware_sim.mavlink import modes as px4_modes
+from firmware_sim.mavlink import px4_custom_mode as px4_modes
 from firmware_sim.mavlink.codec import dialect
 
 _PX4_MODES = {px4_modes.custom_mode(mode): mode for mode in Mode}

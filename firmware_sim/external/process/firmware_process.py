@@ -1,0 +1,55 @@
+"""The process of external firmware, behind the parent-death guard.
+
+Neither PX4 nor ArduPilot notices by itself that nobody simulates for it any more.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from airl_mav.core.child_process import ChildProcess
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+
+
+@dataclass(frozen=True)
+class StartCommand:
+    """How a program is started in a folder of its own."""
+
+    argv: Sequence[str]
+    """Program and arguments."""
+    environment: Mapping[str, str]
+    """Added to our own environment."""
+
+
+class FirmwareProcess(ChildProcess):
+    """One process of external firmware; it ends with us, also when we are killed."""
+
+    def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
+        """Start it.
+
+        Args:
+            name: What it is called in messages: PX4.
+            command: How it is started.
+            cwd: Its working directory.
+            log: What it prints is appended here.
+
+        Raises:
+            FirmwareMissingError: The program is not there, or may not be run.
+        """
+        self.name = name
+        program = Path(command.argv[0])
+        if not os.access(program, os.X_OK) or not program.is_file():
+            raise FirmwareMissingError(f"{name}: {program}: no program that can be run")
+        super().__init__(command.argv, log, guarded=True, cwd=cwd, environment=command.environment)
+
+    def check(self) -> None:
+        """Raise FirmwareLostError when the process has ended."""
+        exited = self.poll()
+        if exited is not None:
+            tail = self.log_tail()
+            raise FirmwareLostError(
+                f"{self.name} ended ({exited}); log: {self.log}" + (f"\n{tail}" if tail else "")
+            )

@@ -1,0 +1,134 @@
+"""What is kept of a flight for whoever reads the run: only where somebody collects it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.flight.trajectory import TrajectoryRecorder
+from firmware_sim.autopilot.autopilot_state import Estimate, Setpoint
+from firmware_sim.flight_controller import Internals
+from firmware_sim.plant.kinematics import POSE
+from firmware_sim.plant.plant import Plant
+
+
+class SetpointLog:
+    """When each offboard setpoint was accepted, and when the motors first reflected it."""
+
+    def __init__(self) -> None:
+        self._accepted: list[tuple[int, tuple[float, float, float, float]]] = []
+        self._motor_us: list[int] = []
+        self._under_way: list[list[int]] = []
+        """How many setpoints were taken in a tick, and after how many more they are flown."""
+        self._taken = 0
+
+    @property
+    def fresh(self) -> bool:
+        """Whether setpoints were accepted that no tick has taken yet."""
+        return len(self._accepted) > self._taken
+
+    @property
+    def pending(self) -> bool:
+        """Whether setpoints were accepted that no motor commands reflect yet."""
+        return len(self._accepted) > len(self._motor_us)
+
+    def accepted(self, setpoint: Setpoint, time_us: int) -> None:
+        """Note an accepted setpoint and when it was received [µs]."""
+        self._accepted.append((time_us, setpoint.wire))
+
+    def take(self, ticks_to_motors: int) -> None:
+        """Note that the coming tick takes what was accepted, to be flown so many ticks later."""
+        self._under_way.append([len(self._accepted) - self._taken, ticks_to_motors])
+        self._taken = len(self._accepted)
+
+    def ticked(self, time_us: int) -> None:
+        """Note that motor commands were computed, at `time_us` [µs]."""
+        for entry in self._under_way:
+            if entry[1] <= 0:
+                self._motor_us.extend([time_us] * entry[0])
+            entry[1] -= 1
+        self._under_way = [entry for entry in self._under_way if entry[1] >= 0]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return accepted_us (n,), motor_us (n,), setpoint float32 (n, 4)."""
+        n = len(self._motor_us)
+        return {
+            "accepted_us": np.array([t for t, _ in self._accepted[:n]], np.int64),
+            "motor_us": np.array(self._motor_us, np.int64),
+            "setpoint": np.array([v for _, v in self._accepted[:n]], np.float32).reshape(n, 4),
+        }
+
+
+class FlightRecorder:
+    """Collects one episode: its true path, its setpoints, the estimates, how late its ticks were.
+
+    It grows by some 100 kB per simulated second, so a flight that nobody reads has none.
+    """
+
+    def __init__(self, internals: Internals | None) -> None:
+        """Start empty; `internals` are those of the flight controller, None = nothing."""
+        self.setpoints = SetpointLog()
+        """Stays empty where nobody can look into the flight controller."""
+        self._internals = internals
+        if internals is not None:
+            internals.on_setpoint = self.setpoints.accepted
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the path so far: the episode begins now."""
+        self._trajectory = TrajectoryRecorder()
+        self._estimates: list[Estimate] = []
+        """As old as the samples of the trajectory, less one tick: what the motors were told by."""
+        self._lateness_us: list[int] = []
+        self._slips: list[tuple[int, int]] = []
+
+    def began_tick(self, due_us: int, began_us: int, slipped_us: int) -> None:
+        """Note a tick that is paced by the wall clock.
+
+        Args:
+            due_us: When it was due [µs].
+            began_us: When it began [µs].
+            slipped_us: Simulated time that was given up right before it [µs].
+        """
+        self._lateness_us.append(began_us - due_us)
+        if slipped_us:
+            self._slips.append((began_us, slipped_us))
+
+    def before_controls(self) -> None:
+        """Note that the flight controller is about to take a sample."""
+        if self._internals is not None and self.setpoints.fresh:
+            self.setpoints.take(self._internals.ticks_to_motors)
+
+    def after_controls(self, time_us: int) -> None:
+        """Note that it has returned motor commands, at `time_us` [µs]."""
+        if self.setpoints.pending:
+            self.setpoints.ticked(time_us)
+
+    def moved(self, plant: Plant) -> None:
+        """Note the state after a tick of the plant."""
+        if self._trajectory.integrate(plant.time_us, plant.power_w):
+            self._trajectory.keep(plant.motion[POSE])
+            if self._internals is not None:
+                self._estimates.append(self._internals.estimator.estimate())
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
+        arrays: dict[str, NDArray[Any]] = {
+            "tick/lateness_us": np.array(self._lateness_us, np.int64),
+            "tick/slips_us": np.array(self._slips, np.int64).reshape(-1, 2),
+        }
+        for name, values in self._trajectory.trajectory().arrays().items():
+            arrays[f"trajectory/{name}"] = values
+        if self._internals is None:
+            return arrays
+        for name, values in self.setpoints.arrays().items():
+            arrays[f"setpoints/{name}"] = values
+        estimates = self._estimates
+        return arrays | {
+            "estimate/time_us": np.array([e.time_us for e in estimates], np.int64),
+            "estimate/position": np.array([e.position for e in estimates]).reshape(-1, 3),
+            "estimate/velocity": np.array([e.velocity for e in estimates]).reshape(-1, 3),
+            "estimate/quaternion": np.array([e.quaternion for e in estimates]).reshape(-1, 4),
+        }

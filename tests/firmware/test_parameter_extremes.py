@@ -1,0 +1,129 @@
+"""Any parameter at any end of its range, set in flight: nothing raises, motors stay numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
+from tests.support.flight_rig import Rig, flight, velocity_setpoint
+
+SMALL = (0.0, 5e-324, 1e-30)
+"""Zero, and what is hardly more: the smallest double, and a number that MAVLink can carry."""
+
+FORWARD = velocity_setpoint(2.0, 1.0, -0.2, yaw=math.nan, yaw_rate=0.5)
+
+
+def extremes(spec: ParameterSpec) -> list[float]:
+    """Return both ends of a parameter's range, and what lies in it of zero and its neighbours."""
+    return list(dict.fromkeys([spec.low, spec.high, *(v for v in SMALL if spec.low <= v)]))
+
+
+def fly_on(rig: Rig, seconds: float) -> None:
+    """Fly on with MAVLink streaming; every motor command must be a number in 0..1."""
+    step = rig.ap.step
+    commands: list[ActuatorControls] = []
+
+    def noted(sample):
+        commands.append(step(sample))
+        return commands[-1]
+
+    rig.ap.step = noted  # type: ignore[method-assign]
+    server = MavlinkServer([onboard_link(MemoryEndpoint())], rig.ap, boot_unix_us=0)
+    rig.run(seconds, lambda: server.send(rig.sim.time_us))
+    rig.ap.step = step  # type: ignore[method-assign]
+    motors = np.array([c.motors for c in commands])
+    assert np.isfinite(motors).all()
+    assert motors.min() >= 0.0
+    assert motors.max() <= 1.0
+
+
+def fly_at(rig: Rig, spec: ParameterSpec, value: float) -> None:
+    """Fly a moment with a parameter set to a value: as a take-off begins, or as it goes on."""
+    usual = rig.ap.parameters[spec.name]
+    rig.ap.parameters.set(spec.name, value)
+    fly_on(rig, 0.3)
+    rig.ap.parameters.set(spec.name, usual)
+
+
+GROUPS = [SPECS[i : i + 8] for i in range(0, len(SPECS), 8)]
+AT_ONCE = {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=[f"{g[0].name}-{g[-1].name}" for g in GROUPS])
+def test_each_parameter_at_the_ends_of_its_range(group):
+    with flight(parameters=AT_ONCE) as rig:
+        rig.boot()
+        cases = [(spec, value) for spec in group for value in extremes(spec)]
+        for spec, value in cases:
+            # From the ground: filters and integrators begin anew.
+            rig.ap.arm(force=True)
+            rig.ap.takeoff(2.0)
+            fly_at(rig, spec, value)
+            rig.ap.disarm(force=True)
+            rig.tick()
+        rig.run(1.0)
+        rig.take_off(10.0, settle_s=0.0)
+        rig.go_offboard(FORWARD)
+        for spec, value in cases:
+            fly_at(rig, spec, value)
+
+
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.LAND, Mode.RETURN, Mode.POSITION, Mode.TAKEOFF])
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_all_parameters_at_one_end_in_every_mode(mode, end):
+    with flight() as rig:
+        rig.take_off(2.0, settle_s=0.0)
+        for spec in SPECS:
+            rig.ap.parameters.set(spec.name, getattr(spec, end))
+        rig.ap.set_mode(mode)
+        fly_on(rig, 3.0)
+
+
+@settings(
+    max_examples=20,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
+)
+@given(st.data())
+def test_several_parameters_at_once_in_flight(data):
+    with flight() as rig:
+        rig.take_off(2.0, settle_s=0.0)
+        rig.go_offboard(FORWARD)
+        for spec in data.draw(st.lists(st.sampled_from(SPECS), min_size=2, max_size=30)):
+            rig.ap.parameters.set(spec.name, data.draw(st.sampled_from(extremes(spec))))
+        fly_on(rig, 1.0)
+
+
+def test_a_gyro_filter_made_much_faster_in_flight_does_not_disturb_it():
+    with flight() as rig:
+        rig.ap.parameters.set("IMU_GYRO_CUTOFF", 5.0)
+        rig.take_off(3.0)
+        rig.go_offboard(velocity_setpoint(0.0, 0.0, 0.0, yaw=math.nan, yaw_rate=0.5))
+        rig.run(3.0)
+        before = np.array(rig.ap.state().motors)
+        rig.ap.parameters.set("IMU_GYRO_CUTOFF", 100.0)
+        motors = []
+        rig.run(0.1, lambda: motors.append(rig.ap.state().motors))
+        assert np.abs(np.array(motors) - before).max() < 0.1, "delays of 5 Hz read as of 100 Hz"
+
+
+@pytest.mark.parametrize("far_m", [1e-160, 5e-324])
+def test_arms_without_any_length_on_one_axis_fly(far_m):
+    """Set before the flight, as by a vehicle's profile: all four rotors in a line."""
+    line = {f"CA_ROTOR{i}_PX": far_m for i in range(4)}
+    line |= {f"CA_ROTOR{i}_PY": 100.0 for i in range(4)}
+    with flight(parameters=line) as rig:
+        rig.arm()
+        rig.ap.takeoff(2.0)
+        fly_on(rig, 5.0)

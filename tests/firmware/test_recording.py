@@ -1,0 +1,127 @@
+"""What the firmware process keeps of a flight: everything for a harness, nothing stand alone."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from airl_mav.core.constants import TICK_US
+from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
+from firmware_sim.firmware import BuiltinFlightStack, Firmware
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.pacing import MAX_LAG_US, Pacing, Unpaced, WallPacing
+from firmware_sim.simulation import EpisodeSetup
+from tests.support.flight_rig import CALM, quad, velocity_setpoint
+
+TICKS_A_MINUTE = 60 * 250
+
+
+class Mute(MemoryEndpoint):
+    """Nobody takes what is sent here."""
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        del frames
+
+
+def firmware(pacing: Pacing, *, recording: bool) -> Firmware:
+    server = MavlinkServer([onboard_link(Mute())], boot_unix_us=0)
+    return Firmware(BuiltinFlightStack(server), None, pacing, recording=recording)
+
+
+def fly(flown: Firmware, ticks: int, setpoint: Setpoint | None = None) -> None:
+    """Fly on; with a setpoint, streamed at 25 Hz."""
+    for i in range(ticks):
+        if setpoint is not None and i % 10 == 0:
+            flown.simulation.autopilot.offer_setpoint(setpoint, flown.clock.time_us())
+        flown.step()
+
+
+def blocks_kept_by_two_minutes(*, recording: bool) -> int:
+    """Return how many memory blocks two minutes of an offboard flight leave behind."""
+    flown = firmware(Unpaced(), recording=recording)
+    circle = velocity_setpoint(1.0, 0.0, -0.01, yaw=float("nan"), yaw_rate=0.3)
+    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    autopilot = flown.simulation.autopilot
+    fly(flown, 4 * 250)
+    assert autopilot.arm(force=False) == 0
+    autopilot.takeoff(5.0)
+    fly(flown, 15 * 250, circle)
+    assert autopilot.set_mode(Mode.OFFBOARD) == 0
+    fly(flown, 15 * 250, circle)
+    gc.collect()
+    before = sys.getallocatedblocks()
+    fly(flown, 2 * TICKS_A_MINUTE, circle)
+    gc.collect()
+    kept = sys.getallocatedblocks() - before
+    assert autopilot.flight.mode is Mode.OFFBOARD
+    flown.close()
+    return kept
+
+
+def test_memory_stays_bounded_where_nobody_collects_the_record():
+    assert blocks_kept_by_two_minutes(recording=False) < 200
+
+
+def test_the_same_flight_recorded_keeps_its_samples():
+    assert blocks_kept_by_two_minutes(recording=True) > 6_000
+
+
+def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten():
+    flown = firmware(Unpaced(), recording=False)
+    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    autopilot = flown.simulation.autopilot
+    fly(flown, 4 * 250)
+    autopilot.arm(force=False)
+    autopilot.takeoff(3.0)
+    fly(flown, 6 * 250)
+    autopilot.disarm(force=True)
+    fell = 0
+    for _ in range(3 * 250):
+        flown.step()
+        fell += len(flown.simulation.plant.collisions)
+    assert fell >= 1, "it fell from 3 m"
+    assert flown.simulation.plant.collisions == []
+    flown.close()
+
+
+def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path):
+    """Against the pacing's own account, at a hundred times real time: 10 ms are a second."""
+    flown = firmware(WallPacing(100.0), recording=True)
+    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    first_us = flown.simulation.time_us
+    for pause_s in (0.0, 0.03, 0.0):
+        time.sleep(pause_s)
+        flown.step()
+    lost_us = flown.slipped_us
+    flown.save(tmp_path / "record.npz")
+    flown.close()
+    with np.load(tmp_path / "record.npz") as record:
+        lateness, slips = record["tick/lateness_us"], record["tick/slips_us"]
+        ticks = record["trajectory/time_us"]
+    assert lateness.shape == (3,)
+    assert (lateness >= 0).all()
+    assert (lateness <= MAX_LAG_US).all()
+    assert slips[:, 1].sum() == lost_us
+    assert any(when >= first_us + TICK_US and lost > MAX_LAG_US for when, lost in slips)
+    assert ticks[0] == first_us
+
+
+@pytest.mark.parametrize("recording", [True, False])
+def test_an_unpaced_flight_has_no_late_ticks(tmp_path: Path, recording: bool):
+    flown = firmware(Unpaced(), recording=recording)
+    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    fly(flown, 20)
+    assert (flown.simulation.recorder is not None) is recording
+    if recording:
+        arrays = flown.simulation.arrays()
+        assert arrays["tick/lateness_us"].shape == (0,)
+        assert arrays["tick/slips_us"].shape == (0, 2)
+    flown.close()
