@@ -21,7 +21,7 @@ from airl_mav.conformance.steps import STEP_NAMES, StepName
 from airl_mav.conformance.transcript import Line, Transcript
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import write_json
 
 STYLES = {"sent": "cyan", "heard": "", "check": "bold", "note": "dim"}
 

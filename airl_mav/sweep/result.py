@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import read_json, typed, write_json
 from airl_mav.envs.evaluation import OUTCOMES, Flown
 from airl_mav.flight.judge import Outcome
 from airl_mav.sweep.trial import Trial
@@ -113,19 +112,12 @@ def read_result(path: Path, trial: Trial, evaluation: dict[str, Any]) -> TrialRe
     Raises:
         UsageError: The file is not what was written, or of another trial or other flights.
     """
-    try:
-        data = json.loads(path.read_bytes())
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: not a result: {error}") from None
-    if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
-        raise UsageError(f"{path}: schema: accepted: {SCHEMA}")
+    data = read_json(path, SCHEMA, "result")
+    del data["schema"]
     flown = data.pop("evaluation", None)
-    try:
-        result = _RESULT.validate_python(data)
-    except ValidationError as error:
-        raise UsageError(f"{path}: not a result: {error.errors()[0]['msg']}") from None
+    result = typed(_RESULT, data, path)
     if asdict(result.trial) != asdict(trial) or flown != evaluation:
         raise UsageError(f"{path}: of another trial or of other flights; accepted: another --out")
     return result

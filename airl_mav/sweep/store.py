@@ -25,8 +25,8 @@ from pydantic import ValidationError
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_json
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
-from airl_mav.core.versioned import read_json
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.result import TrialResult, read_result, write_result
 from airl_mav.sweep.trial import Trial

@@ -304,7 +304,7 @@ def test_a_result_is_read_as_it_was_written_and_no_other_is_taken(tmp_path: Path
     with pytest.raises(UsageError, match="of another trial or of other flights"):
         folder.result(second)
     (path / "result.json").write_text(text[: len(text) // 2])
-    with pytest.raises(UsageError, match="not a result"):
+    with pytest.raises(UsageError, match="not JSON"):
         folder.result(first)
 
 
