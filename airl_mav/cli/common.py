@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, machine_failure
 from airl_mav.core.ports import Ports
 
 if TYPE_CHECKING:  # The companion shares this module, and not the simulator.
@@ -99,13 +100,32 @@ def check_train_installed() -> None:
     check_installed("train")
 
 
+def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+    """Print what ended a thread, unless it was the machine.
+
+    TensorBoard's thread on a full disk: whoever writes next raises the same error again.
+    """
+    error = failed.exc_value
+    if not isinstance(error, OSError) or machine_failure(error) is None:
+        threading.__excepthook__(failed)
+
+
 def run_command(command: Callable[[], int]) -> None:
-    """Run a command and exit with its code; usage errors become one line and exit code 2."""
+    """Run a command and exit with its code.
+
+    Usage errors become one line and exit code 2, failures of the machine one line and exit code 1.
+    """
+    threading.excepthook = _thread_failed
     try:
         code = command()
     except UsageError as error:
         Console(stderr=True, soft_wrap=True).print(f"error: {error}", style="red", markup=False)
         code = EXIT_USAGE
+    except OSError as error:
+        if (failure := machine_failure(error)) is None:
+            raise
+        Console(stderr=True, soft_wrap=True).print(f"error: {failure}", style="red", markup=False)
+        code = EXIT_BROKEN
     except KeyboardInterrupt:
         code = EXIT_INTERRUPTED
     sys.exit(code)

@@ -78,7 +78,7 @@ def machine_failure(error: OSError) -> str | None:
 def shown(value: object) -> str:
     """Return a value as a message shows it: numbers as a person writes them, never too long."""
     if isinstance(value, float) and float(f"{value:g}") == value:
-        return f"{value:g}"
+        return min(f"{value:g}", repr(value), key=len)
     try:
         # reprlib stops early in containers; a plain repr of a long list or number takes ages.
         text = _REPR.repr(value)

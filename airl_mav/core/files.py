@@ -227,7 +227,7 @@ def _opened(data: bytes, schema: int | None) -> dict[str, Any]:
     """Return the object that bytes hold, without its CRC. Raises ValueError, its text one line."""
     try:
         found = json.loads(data, parse_constant=_refuse_constant)
-        too_deep = _deeper(found, DEEPEST)
+        too_deep = deeper_than(found, DEEPEST)
     except RecursionError:
         too_deep = True
     except ValueError as error:
@@ -250,7 +250,7 @@ def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is no JSON")
 
 
-def _deeper(value: object, most: int) -> bool:
+def deeper_than(value: object, most: int) -> bool:
     """Return whether lists and tables are nested in more than so many levels."""
     level = [value]
     for _ in range(most + 1):
