@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +20,14 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, FieldError, UsageError
+from airl_mav.core.errors import (
+    EXIT_BROKEN,
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
+    FieldError,
+    UsageError,
+    machine_failure,
+)
 from airl_mav.core.fields import range_of, validated
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
@@ -191,6 +199,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     nothing. Usage errors become one line and exit status 2, a machine that fails one line and 1.
     """
     words = sys.argv[1:] if words is None else words
+    threading.excepthook = _thread_failed
     try:
         command = importlib.import_module(module)
         check_installed(*getattr(command, "EXTRAS", ("sim",)))
@@ -200,8 +209,10 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     except UsageError as error:
         _fail(str(error))
         code = EXIT_USAGE
-    except OSError as error:  # a full disk, above all
-        _fail(f"{error.filename or ''}: {error.strerror or error}".removeprefix(": "))
+    except OSError as error:
+        if (failure := machine_failure(error)) is None:
+            raise
+        _fail(failure)
         code = EXIT_BROKEN
     except KeyboardInterrupt:
         code = EXIT_INTERRUPTED
@@ -213,6 +224,16 @@ def _run(run: Callable[[Any], int], options: BaseModel, words: Sequence[str]) ->
         return run(options)
     except FieldError as error:
         raise UsageError(told(error, words)) from None
+
+
+def _thread_failed(failed: threading.ExceptHookArgs) -> None:
+    """Print what ended a thread, unless it was the machine.
+
+    TensorBoard's thread on a full disk: whoever writes next raises the same error again.
+    """
+    error = failed.exc_value
+    if not isinstance(error, OSError) or machine_failure(error) is None:
+        threading.__excepthook__(failed)
 
 
 def _fail(message: str) -> None:

@@ -14,7 +14,7 @@ from airl_mav.conformance.steps import STEP_NAMES, MeasuredStep, StepName
 from airl_mav.conformance.telemetry import Fields
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import write_json
 
 SCHEMA = 1
 """Version of the file."""

@@ -1,7 +1,11 @@
-"""Errors meant for the person at the keyboard: one line, exit code 2, no traceback."""
+"""Errors meant for the person at the keyboard: one line, no traceback.
+
+Input that cannot be used ends a command with exit code 2, a failure of the machine with 1.
+"""
 
 from __future__ import annotations
 
+import errno
 import reprlib
 
 EXIT_BROKEN = 1
@@ -67,10 +71,23 @@ class FieldError(UsageError):
         return self.line()
 
 
+MACHINE_ERRORS = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE}
+)
+"""System errors that the machine is to blame for: a full or broken disk, no more open files."""
+
+
+def machine_failure(error: OSError) -> str | None:
+    """Return one line about a failure of the machine (exit code 1), None for any other error."""
+    if error.errno not in MACHINE_ERRORS:
+        return None
+    return f"{error.filename}: {error.strerror}" if error.filename else f"{error.strerror}"
+
+
 def shown(value: object) -> str:
     """Return a value as a message shows it: numbers as a person writes them, never too long."""
     if isinstance(value, float) and float(f"{value:g}") == value:
-        return f"{value:g}"
+        return min(f"{value:g}", repr(value), key=len)
     try:
         # reprlib stops early in containers; a plain repr of a long list or number takes ages.
         text = _REPR.repr(value)

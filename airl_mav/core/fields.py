@@ -117,9 +117,11 @@ def validated(model: type[Model], data: object, source: object = None) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         found = field_error(error, model)
-        if source is None:
-            raise found from None
-        raise UsageError(f"{source}: {found.line(sign=' = ')}") from None
+    except FieldError as error:  # Of a validator of several fields: it knows which is to blame.
+        found = error
+    if source is None:
+        raise found
+    raise UsageError(f"{source}: {found.line(sign=' = ')}")
 
 
 def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> FieldError:

@@ -1,21 +1,295 @@
-"""Files that are either the old one or the whole new one, whenever the process dies."""
+"""Files that survive kills, full disks and flipped bits: written whole, checked when read.
+
+A file is written under a temporary name, brought to the disk and renamed, so that a reader sees the
+old one or the whole new one. JSON objects carry a CRC-32 of themselves, as the field `crc32`;
+members of archives carry their own. Reading compares them: what is damaged is refused in one line.
+Files without the field, of earlier versions of this package or edited by hand, are read unchecked.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import os
 import shutil
 import zipfile
-from collections.abc import Mapping
-from contextlib import suppress
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import field_error
+
+T = TypeVar("T")
+Arrays = dict[str, NDArray[Any]]
+
+CRC = "crc32"
+"""Field of a JSON object: CRC-32 (zlib) of the rest of it as compact ASCII JSON, hexadecimal."""
+
+DEEPEST = 100
+"""Levels of lists and tables in a JSON file."""
 
 
-def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+# --- whole files
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Write a file so that a reader sees the old one or the whole new one, never a part.
+
+    Raises:
+        OSError: It cannot be written, a full disk above all; its `filename` is the path. The old
+            file is untouched, and nothing is left beside it.
+    """
+    with _replacing(path) as partial:
+        partial.write_bytes(data)
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield the temporary name of a file; on leaving it takes the place of `path`."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        with naming(path):
+            yield partial
+            sync(partial)
+            partial.replace(path)
+            sync_folder(path.parent)
+    except BaseException:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Name a file in the errors of the system that lack a name: those of a write do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None or error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def sync(path: Path) -> None:
+    """Bring a file to the disk. Raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_folder(path: Path) -> None:
+    """Bring the names in a folder to the disk, where the file system knows how."""
+    with suppress(OSError):
+        sync(path)
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal. Raises OSError."""
+    with path.open("rb") as file:
+        digest = hashlib.sha256()
+        while block := file.read(1 << 20):
+            digest.update(block)
+        return digest.hexdigest()
+
+
+# --- JSON
+
+
+def write_json(path: Path, data: Mapping[str, Any]) -> None:
+    """Write a file for people and programs, with its CRC. Raises ValueError for a NaN."""
+    text = json.dumps(_sealed(data), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    replace_file(path, text.encode())
+
+
+def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
+    """Return the object that a file holds, without its CRC.
+
+    Args:
+        path: The file.
+        schema: Version that is understood: the object's field `schema`; None where it has none.
+        what: What the file's folder would hold, for messages.
+
+    Raises:
+        UsageError: The file is missing, no JSON, damaged, or of another version.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path.parent}: no {what} here: {path.name}: {error.strerror}") from None
+    try:
+        return _opened(data, schema)
+    except ValueError as error:
+        raise UsageError(f"{path}: {error}") from None
+
+
+def read_typed(path: Path, adapter: TypeAdapter[T], schema: int | None, what: str) -> T:
+    """Return what a file holds, as its type. Raises UsageError as `read_json`, and for a field."""
+    return typed(adapter, read_json(path, schema, what), path)
+
+
+def typed(adapter: TypeAdapter[T], data: Mapping[str, Any], source: object) -> T:
+    """Return data as its type. Raises UsageError, with the source, for a wrong field."""
+    try:
+        return adapter.validate_python(data)
+    except ValidationError as error:
+        raise UsageError(f"{source}: {field_error(error).line(sign=' = ')}") from None
+
+
+def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
+    """Append objects to a file of JSON lines; on return they are on the disk.
+
+    Raises:
+        ValueError: A NaN or an infinity.
+        OSError: They cannot be written; the file is what it was before.
+    """
+    data = b"".join(json_line(each) for each in objects)
+    with naming(path), path.open("ab") as file:
+        before = file.tell()
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(file.fileno(), before)
+            raise
+
+
+def json_line(data: Mapping[str, Any]) -> bytes:
+    """Return an object as one line with its CRC and its newline. Raises ValueError for a NaN."""
+    return _compact(_sealed(data)) + b"\n"
+
+
+def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]]]:
+    """Return the objects of a file of JSON lines, each with its place: "path:number".
+
+    A last line without its newline was cut short by a kill and is passed over. No file, no objects.
+
+    Args:
+        path: The file.
+        schema: Version that is understood; None where lines have none.
+
+    Raises:
+        UsageError: A line is no JSON, damaged, or of another version.
+    """
+    *whole, rest = _read_if_there(path).split(b"\n")
+    found = []
+    for number, line in enumerate(whole, start=1):
+        try:
+            found.append((f"{path}:{number}", _opened(line, schema)))
+        except ValueError as error:
+            raise UsageError(f"{path}:{number}: {error}") from None
+    # What a kill cuts short is the beginning of a line. A whole one with another byte than its
+    # newline behind it was damaged later.
+    with suppress(ValueError, RecursionError):
+        if isinstance(json.loads(rest[:-1]), dict):
+            raise UsageError(f"{path}:{len(whole) + 1}: damaged: no newline at its end")
+    return found
+
+
+def cut_torn_line(path: Path) -> None:
+    """Cut off a last line without its newline, so that the next one can be appended."""
+    data = _read_if_there(path)
+    if (whole := data.rfind(b"\n") + 1) != len(data):
+        os.truncate(path, whole)
+
+
+def _read_if_there(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+
+
+def _compact(data: Mapping[str, Any]) -> bytes:
+    return json.dumps(data, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _sealed(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an object with its CRC as the last field."""
+    return {**data, CRC: f"{zlib.crc32(_compact(data)):08x}"}
+
+
+def _opened(data: bytes, schema: int | None) -> dict[str, Any]:
+    """Return the object that bytes hold, without its CRC. Raises ValueError, its text one line."""
+    try:
+        found = json.loads(data, parse_constant=_refuse_constant)
+        too_deep = deeper_than(found, DEEPEST)
+    except RecursionError:
+        too_deep = True
+    except ValueError as error:
+        raise ValueError(f"not JSON: {error}") from None
+    if too_deep:
+        raise ValueError(f"nested too deep: accepted: {DEEPEST} levels")
+    held = found.get("schema") if isinstance(found, dict) else None
+    if not isinstance(found, dict) or (schema is not None and held != schema):
+        raise ValueError(f"schema = {held!r}: accepted: {schema}")
+    crc = found.pop(CRC, None)
+    if crc is not None and crc != (computed := f"{zlib.crc32(_compact(found)):08x}"):
+        raise ValueError(
+            f"damaged: {CRC} = {crc!r}: accepted: {computed!r}, that of what it holds "
+            "(without this field it is read unchecked)"
+        )
+    return found
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
+
+
+def deeper_than(value: object, most: int) -> bool:
+    """Return whether lists and tables are nested in more than so many levels."""
+    level = [value]
+    for _ in range(most + 1):
+        level = [
+            inner
+            for each in level
+            if isinstance(each, dict | list)
+            for inner in (each.values() if isinstance(each, dict) else each)
+            if isinstance(inner, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+# --- arrays
+
+
+@dataclass(frozen=True)
+class ArrayGroup:
+    """Arrays of an archive under one name."""
+
+    arrays: Arrays
+    crc32: str
+    """Of the names and contents of all of them, hexadecimal."""
+
+
+NO_ARRAYS = ArrayGroup({}, "00000000")
+"""A group that an archive does not have."""
+
+
+def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name to a new .npz, in place of any old one."""
+    keywords: dict[str, Any] = dict(arrays)
+    with _replacing(path) as partial, partial.open("wb") as file:
+        np.savez(file, **keywords)
+
+
+def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> dict[str, str]:
     """Add groups of arrays to an .npz; the file is the old one or the whole new one.
 
     The old archive is copied as bytes and appended to, so that adding costs a copy and not a second
@@ -25,21 +299,53 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
         path: The archive; made when there is none.
         groups: Arrays by name, by group; their keys become `<group>/<name>`. All that the archive
             has of these groups is replaced.
+
+    Returns:
+        The CRC of each group, as `read_groups` finds it.
     """
-    partial = path.with_name(path.name + ".partial")
-    old = path.exists()
-    if old:
-        shutil.copyfile(path, partial)
-    with _archive(partial, "a" if old else "w") as new:
-        stale = any(_group_of(name) in groups for name in new.namelist())
-        if not stale:
-            _write_groups(new, groups)
-    if stale:
-        # Arrays of an episode that a kill cut off and that is flown again.
-        with _archive(partial, "w") as new:
-            _copy_others(path, new, groups)
-            _write_groups(new, groups)
-    _commit(partial, path)
+    with _replacing(path) as partial:
+        old = path.exists()
+        if old:
+            shutil.copyfile(path, partial)
+        with _archive(partial, "a" if old else "w") as new:
+            stale = any(_group_of(member) in groups for member in new.infolist())
+            if not stale:
+                _write_groups(new, groups)
+                members = new.infolist()
+        if stale:
+            # Arrays of an episode that a kill cut off and that is flown again.
+            with _archive(partial, "w") as new:
+                _copy_others(path, new, groups)
+                _write_groups(new, groups)
+                members = new.infolist()
+    return {
+        group: _group_crc([member for member in members if _group_of(member) == group])
+        for group in groups
+    }
+
+
+def read_groups(path: Path) -> dict[str, ArrayGroup]:
+    """Return all groups of arrays of an archive; none when there is no file.
+
+    Raises:
+        UsageError: It cannot be read or is damaged.
+    """
+    if not path.exists():
+        return {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members: dict[str, list[zipfile.ZipInfo]] = {}
+            for member in archive.infolist():
+                members.setdefault(_group_of(member), []).append(member)
+            return {
+                group: ArrayGroup(
+                    {_array_name(each): _read_array(archive, each) for each in held},
+                    _group_crc(held),
+                )
+                for group, held in members.items()
+            }
+    except Exception as error:  # Anything: a flipped bit asks for passwords or unknown methods.
+        raise UsageError(f"{path}: damaged: {' '.join(str(error).split())[:200]}") from None
 
 
 def _archive(path: Path, mode: Literal["a", "w"]) -> zipfile.ZipFile:
@@ -52,7 +358,7 @@ def _copy_others(
     """Copy what an archive has of all other groups."""
     with zipfile.ZipFile(path) as old:
         for member in old.infolist():
-            if _group_of(member.filename) not in groups:
+            if _group_of(member) not in groups:
                 new.writestr(member, old.read(member))
 
 
@@ -63,33 +369,22 @@ def _write_groups(new: zipfile.ZipFile, groups: Mapping[str, Mapping[str, NDArra
                 np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
 
-def _group_of(name: str) -> str:
-    return name.partition("/")[0]
+def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    """Return an array. Read to its end first: only then the CRC of the member is compared."""
+    data = io.BytesIO(archive.read(member))
+    array: NDArray[Any] = np.lib.format.read_array(data, allow_pickle=False)
+    return array
 
 
-def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a new .npz, in place of any old one."""
-    buffer = io.BytesIO()
-    keywords: dict[str, Any] = dict(arrays)
-    np.savez(buffer, **keywords)
-    replace_file(path, buffer.getvalue())
+def _group_crc(members: Sequence[zipfile.ZipInfo]) -> str:
+    """Return a CRC over the names and the CRCs of an archive's members."""
+    lines = sorted(f"{member.filename} {member.CRC:08x}\n" for member in members)
+    return f"{zlib.crc32(''.join(lines).encode()):08x}"
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Write a file so that a reader sees the old one or the whole new one, never a part."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    _commit(partial, path)
+def _group_of(member: zipfile.ZipInfo) -> str:
+    return member.filename.partition("/")[0]
 
 
-def _commit(partial: Path, path: Path) -> None:
-    """Put a finished file in place, on the disk."""
-    with partial.open("rb+") as file:
-        os.fsync(file.fileno())
-    partial.replace(path)
-    with suppress(OSError):  # Not every file system lets a folder be synced.
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+def _array_name(member: zipfile.ZipInfo) -> str:
+    return member.filename.partition("/")[2].removesuffix(".npy")

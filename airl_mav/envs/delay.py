@@ -10,9 +10,7 @@ from airl_mav.latency.injection import Injection, choose_injection
 from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity
 from airl_mav.latency.source import longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.vehicle.rotor import N_ROTORS
 
 
 @dataclass(frozen=True)
@@ -72,12 +70,7 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
     latency_s = (delay.transport_ms + t2_ms + low_high[1] + delay.link_ms) / MS_PER_S
     acceleration = asked.max_acceleration_m_s2
     if acceleration is None:
-        vehicle = load_vehicle(spec.vehicle)
-        acceleration = max_acceleration(
-            N_ROTORS * vehicle.rotor.thrust_max_n,
-            vehicle.body.mass_kg,
-            parameter_values(vehicle.parameters)["MPC_TILTMAX_AIR"],
-        )
+        acceleration = max_acceleration(load_vehicle(spec.vehicle))
     return SpeedBound(
         latency_s=latency_s,
         sensing_distance_m=asked.sensing_distance_m,

@@ -166,7 +166,7 @@ def _cells(
     short = Path(scenario.arena).stem
 
     def planned(
-        role: Role, title: str, place: Conditions, number: int = 1, **more: Any
+        role: Role, title: str, place: Conditions, more: Mapping[str, Any], number: int = 1
     ) -> tuple[Cell, RunEntry]:
         name = f"{short}-{role}" if number == 1 else f"{short}-{role}-{number}"
         asked = scenario.model_copy(update={**place.fields, **more})
@@ -174,20 +174,20 @@ def _cells(
         return cell, entry_of(cell, label=title, role=role, group=scenario.arena)
 
     cells = [
-        planned("reference", f"{policy.name} {reference.label}", reference),
-        planned("target", f"{policy.name} {target.label}", target),
+        planned("reference", f"{policy.name} {reference.label}", reference, {}),
+        planned("target", f"{policy.name} {target.label}", target, {}),
     ]
     if mitigated is None:
         return cells
     flown = {"policy": mitigated_path}
-    cells.append(planned("mitigated", f"{mitigated.name} {target.label}", target, **flown))
+    cells.append(planned("mitigated", f"{mitigated.name} {target.label}", target, flown))
     for number, place in enumerate(training, start=1):
         which = f" ({place.name})" if len(training) > 1 else ""
         title = f"{mitigated.name} as trained{which}"
         drawn = {**flown, "latency_seed": TRAINING_LATENCY_SEED}
-        cells.append(planned("training", title, place, number, **drawn))
+        cells.append(planned("training", title, place, drawn, number))
     title = f"{mitigated.name} {reference.label}"
-    cells.append(planned("mitigated-reference", title, reference, **flown))
+    cells.append(planned("mitigated-reference", title, reference, flown))
     return cells
 
 

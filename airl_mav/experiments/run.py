@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from airl_mav.core.files import Arrays
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples
-from airl_mav.rehearsal.run_folder import Arrays, LoadedRun, RunInfo, load
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
 from airl_mav.report.rebuild import rebuild
 
 

@@ -18,8 +18,8 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.core.provenance import provenance
-from airl_mav.core.versioned import read_versioned, write_json
 from airl_mav.rehearsal.evaluation import another_config
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.run_folder import RUN_FILE
@@ -92,7 +92,7 @@ _CAMPAIGN = TypeAdapter(Campaign)
 
 def load_campaign(path: Path) -> Campaign:
     """Read the declaration of the campaign in a folder. Raises UsageError."""
-    return read_versioned(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
+    return read_typed(path / CAMPAIGN_FILE, _CAMPAIGN, SCHEMA, "campaign")
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
+from airl_mav.core.files import typed
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 
@@ -52,26 +53,14 @@ class EpisodeRecord:
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA
 
-    def to_json(self) -> str:
-        """Return one JSON line, without its newline. Raises ValueError on NaN or infinity."""
-        return json.dumps(asdict(self), allow_nan=False, separators=(",", ":"))
+    def as_data(self) -> dict[str, Any]:
+        """Return the object of a line."""
+        return asdict(self)
 
     @classmethod
-    def from_json(cls, line: str | bytes) -> EpisodeRecord:
-        """Read one JSON line. Raises ValueError, its message one line, when it is none of ours."""
-        try:
-            data = json.loads(line)
-        except ValueError as error:
-            raise ValueError(f"not JSON: {error}") from None
-        schema = data.get("schema") if isinstance(data, dict) else None
-        if schema != SCHEMA:
-            raise ValueError(f"schema = {schema!r}: accepted: {SCHEMA}")
-        try:
-            return _ADAPTER.validate_python(data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
-            raise ValueError(f"{field} = {first['input']!r}: {first['msg']}") from None
+    def from_data(cls, data: Mapping[str, Any], source: object) -> EpisodeRecord:
+        """Return the record that an object holds. Raises UsageError, with the source, for none."""
+        return typed(_ADAPTER, data, source)
 
 
 def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:

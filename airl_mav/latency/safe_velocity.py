@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
+from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.vehicle import VehicleProfile
 
 
 def safe_velocity(
@@ -31,22 +33,13 @@ def safe_velocity(
     return a * (math.sqrt(latency_s**2 + 2.0 * d / a) - latency_s)
 
 
-def max_acceleration(thrust_n: float, mass_kg: float, tilt_max_deg: float) -> float:
-    """Return the greatest horizontal acceleration of a multicopter that keeps its height [m/s²].
+def max_acceleration(vehicle: VehicleProfile) -> float:
+    """Return the greatest horizontal acceleration of a vehicle that keeps its height [m/s²].
 
-    The lesser of what the tilt limit permits, g tan(tilt), and what the thrust does,
-    sqrt((F / m)² - g²).
-
-    Args:
-        thrust_n: Greatest thrust of all its rotors [N].
-        mass_kg: Mass [kg].
-        tilt_max_deg: Tilt limit [deg].
-
-    Raises:
-        ValueError: It cannot hover.
+    The lesser of what the tilt limit of its autopilot permits, g tan(tilt), and what the thrust
+    does, sqrt((F / m)² - g²).
     """
-    lift = thrust_n / mass_kg
-    if lift <= GRAVITY_M_S2:
-        raise ValueError(f"thrust for {lift:.2f} m/s²: must be above {GRAVITY_M_S2} m/s²")
+    tilt_max_deg = parameter_values(vehicle.parameters)["MPC_TILTMAX_AIR"]
+    lift = vehicle.thrust_n / vehicle.body.mass_kg
     by_thrust = math.sqrt(lift**2 - GRAVITY_M_S2**2)
     return min(GRAVITY_M_S2 * math.tan(tilt_max_deg * DEG), by_thrust)

@@ -7,7 +7,6 @@ that no card ever speaks for another file.
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +15,7 @@ from pydantic import Field, Strict, model_validator
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import read_json, write_json
 from airl_mav.flight.setup import Level
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
@@ -125,15 +124,8 @@ def read_card(folder: Path) -> PolicyCard:
         UsageError: There is none, or it has a field that is missing, unknown or out of range.
     """
     path = folder / CARD_FILE
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid JSON: {error}") from None
-    schema = data.pop("schema", None) if isinstance(data, dict) else None
-    if schema != SCHEMA:
-        raise UsageError(f"{path}: schema = {schema!r}: accepted: {SCHEMA}")
+    data = read_json(path, SCHEMA, "policy")
+    del data["schema"]
     return validated(PolicyCard, data, path)
 
 

@@ -9,8 +9,9 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import validated
+from airl_mav.core.files import DEEPEST, deeper_than
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -28,6 +29,12 @@ _SINGULAR: dict[Kind, str] = {
     "conformance": "conformance",
 }
 Model = TypeVar("Model", bound=BaseModel)
+
+MOST_BYTES = 1 << 20
+"""Size of a profile file; the largest that is shipped has 3 kB."""
+
+MOST_BASES = 10
+"""Profiles that lie below a profile, one under the other."""
 
 
 @cache
@@ -72,7 +79,7 @@ def _path(kind: Kind, name: str) -> Path:
     if not path.is_file():
         known = ", ".join(list_profiles(kind))
         raise UsageError(
-            f"no {_SINGULAR[kind]} profile {name!r}; shipped: {known} (or a path to a .toml)"
+            f"no {_SINGULAR[kind]} profile {shown(name)}; shipped: {known} (or a path to a .toml)"
         )
     return path
 
@@ -81,16 +88,36 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     """Return what a file says, on top of its bases. `above`: the files that led here."""
     if path in above:
         raise UsageError(f"{above[0]}: base: leads back to {path}")
-    try:
-        data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    if len(above) > MOST_BASES:
+        raise UsageError(f"{above[0]}: base: accepted: at most {MOST_BASES} below each other")
+    data = _parse(path)
     base = data.pop("base", None)
     if base is None:
         return data
     if not isinstance(base, str):
-        raise UsageError(f"{path}: base = {base!r}: accepted: the name of a profile, or a path")
+        raise UsageError(f"{path}: base = {shown(base)}: accepted: a name or a path")
     return _overlaid(_read(kind, _path(kind, base), (*above, path)), data)
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    """Return what a TOML file holds. Raises UsageError."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    if len(data) > MOST_BYTES:
+        raise UsageError(f"{path}: accepted: a profile of at most {MOST_BYTES:,} bytes")
+    try:
+        found = tomllib.loads(data.decode())
+        too_deep = deeper_than(found, DEEPEST)
+    except RecursionError:
+        too_deep = True
+    except ValueError as error:  # Also numbers of thousands of digits, and no UTF-8.
+        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    if too_deep:
+        raise UsageError(f"{path}: nested too deep: accepted: {DEEPEST} levels")
+    return found
 
 
 def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:

@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
@@ -138,14 +138,14 @@ class Imu(ProfileModel):
 class Magnetometer(ProfileModel):
     """Three-axis magnetometer, calibrated."""
 
-    rate_hz: float = quantity("sample rate", "Hz", gt=0, le=250)
+    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
     noise_gauss: float = quantity("white noise, sd of a sample", "gauss", ge=0, le=0.1)
 
 
 class Barometer(ProfileModel):
     """Static pressure sensor."""
 
-    rate_hz: float = quantity("sample rate", "Hz", gt=0, le=250)
+    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
     noise_pa: float = quantity("white noise, sd of a sample", "Pa", ge=0, le=100)
     drift_pa_sqrt_s: float = quantity("drift random walk", "Pa/sqrt(s)", ge=0, le=10)
 
@@ -251,6 +251,23 @@ class VehicleProfile(ProfileModel):
     )
     px4: Px4 | None = Field(default=None, description="for --firmware px4 and px4-hitl")
     ardupilot: ArduPilot | None = Field(default=None, description="for --firmware ardupilot")
+
+    @model_validator(mode="after")
+    def _hovers(self) -> VehicleProfile:
+        needed_n = self.body.mass_kg * GRAVITY_M_S2
+        if self.thrust_n <= needed_n:
+            raise FieldError(
+                "body.mass_kg",
+                self.body.mass_kg,
+                problem=f"cannot hover: needs {needed_n:.2f} newton, has {self.thrust_n:.2f} "
+                f"({len(CORNERS)} x rotor.thrust_max_n {self.rotor.thrust_max_n:g})",
+            )
+        return self
+
+    @property
+    def thrust_n(self) -> float:
+        """Greatest thrust of all rotors [N]: more than the weight."""
+        return len(CORNERS) * self.rotor.thrust_max_n
 
     def autopilot_parameters(self) -> dict[str, float]:
         """Return what the built-in autopilot is set to: its rotors' places, what `parameters` say.

@@ -6,23 +6,31 @@ which is written last; arrays without a line belong to an episode that never end
 
 from __future__ import annotations
 
-import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import add_arrays
+from airl_mav.core.files import (
+    CRC,
+    NO_ARRAYS,
+    Arrays,
+    add_arrays,
+    append_lines,
+    cut_torn_line,
+    read_groups,
+    read_lines,
+    read_typed,
+    write_json,
+)
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
-from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
@@ -36,13 +44,13 @@ LATENCY_FILE = "latency.npz"
 TRAJECTORIES_FILE = "trajectories.npz"
 FIRMWARE_PRINTS = "autopilot.log"
 """What real firmware prints, where it was started for the run."""
+STAMPS_CRC, PATH_CRC = "latency_crc32", "trajectory_crc32"
+"""Fields of a line: the CRC of the episode's arrays in the two archives."""
 LOG_FILES = ("firmware.log", "companion.log", FIRMWARE_PRINTS)
 """What the processes have to say to people; the first two are empty when all is well."""
 
 TICK_LATENESS = "tick_lateness_us"
 """Name of the array of a paced run that says how late each tick began [µs]."""
-
-Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -147,17 +155,13 @@ class RunFolder:
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
         """Open a run that was killed, cut off a half-written line, and say what is there."""
         run = load(path)
-        lines = path / EPISODES_FILE
-        if lines.exists():
-            data = lines.read_bytes()
-            if (whole := data.rfind(b"\n") + 1) != len(data):
-                os.truncate(lines, whole)
+        cut_torn_line(path / EPISODES_FILE)
         return cls(path), run
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
         """Replace the settings and the seeds that are planned, in `run.json`."""
         path = self.path / RUN_FILE
-        info = read_versioned(path, _INFO, SCHEMA, "run")
+        info = read_typed(path, _INFO, SCHEMA, "run")
         _write_info(path, replace(info, config=dict(config), seeds=tuple(seeds)))
 
     def tlog_path(self, index: int) -> Path:
@@ -191,36 +195,42 @@ class RunFolder:
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
         """Save episodes; on return they are on the disk.
 
-        The arrays come first, then the lines that commit them.
+        The arrays come first, then the lines that commit them, each with the CRC of its arrays.
         """
         groups = {f"{episode.record.index:03d}": episode for episode in episodes}
-        add_arrays(
-            self.path / TRAJECTORIES_FILE, {g: e.trajectory.arrays() for g, e in groups.items()}
-        )
-        add_arrays(self.path / LATENCY_FILE, {g: e.latency for g, e in groups.items()})
-        lines = b"".join(episode.record.to_json().encode() + b"\n" for episode in episodes)
-        with (self.path / EPISODES_FILE).open("ab") as file:
-            file.write(lines)
-            file.flush()
-            os.fsync(file.fileno())
+        paths = {group: episode.trajectory.arrays() for group, episode in groups.items()}
+        stamps = {group: episode.latency for group, episode in groups.items()}
+        path_crcs = add_arrays(self.path / TRAJECTORIES_FILE, paths)
+        stamp_crcs = add_arrays(self.path / LATENCY_FILE, stamps)
+        lines = [
+            {**episode.record.as_data(), PATH_CRC: path_crcs[group], STAMPS_CRC: stamp_crcs[group]}
+            for group, episode in groups.items()
+        ]
+        append_lines(self.path / EPISODES_FILE, lines)
 
 
 def load(path: Path) -> LoadedRun:
     """Read a run folder back; a last line cut short by a kill is passed over.
 
     Raises:
-        UsageError: The folder holds no run, or a file of it cannot be read.
+        UsageError: The folder holds no run, or a file of it cannot be read or is damaged.
     """
-    info = read_versioned(path / RUN_FILE, _INFO, SCHEMA, "run")
-    episodes = _load_episodes(path / EPISODES_FILE)
-    done = {episode.index for episode in episodes}
-    stamps = _load_arrays(path / LATENCY_FILE)
-    paths = _load_arrays(path / TRAJECTORIES_FILE)
+    info = read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+    records: dict[int, EpisodeRecord] = {}
+    stamp_crcs, path_crcs = {}, {}
+    for place, data in read_lines(path / EPISODES_FILE, LINE_SCHEMA):
+        record = EpisodeRecord.from_data(data, place)
+        # A later line replaces an earlier one. Lines of earlier versions have no CRC.
+        records[record.index] = record
+        stamp_crcs[record.index] = data.get(STAMPS_CRC)
+        path_crcs[record.index] = data.get(PATH_CRC)
+    latency = _load_arrays(path / LATENCY_FILE, stamp_crcs)
+    paths = _load_arrays(path / TRAJECTORIES_FILE, path_crcs)
     try:
-        trajectories = {i: Trajectory.from_arrays(a) for i, a in paths.items() if i in done}
+        trajectories = {i: Trajectory.from_arrays(arrays) for i, arrays in paths.items()}
     except (KeyError, ValueError) as error:
         raise UsageError(f"{path / TRAJECTORIES_FILE}: {error}") from None
-    latency = {i: arrays for i, arrays in stamps.items() if i in done}
+    episodes = tuple(records[index] for index in sorted(records))
     return LoadedRun(path, info, episodes, latency, trajectories)
 
 
@@ -229,33 +239,28 @@ def _write_info(path: Path, info: RunInfo) -> None:
     write_json(path, _INFO.dump_python(info, mode="json"))
 
 
-def _load_episodes(path: Path) -> tuple[EpisodeRecord, ...]:
-    """Read the whole lines, in the order of their index; a later line replaces an earlier."""
-    data = path.read_bytes() if path.exists() else b""
-    whole = data[: data.rfind(b"\n") + 1]
-    episodes = {}
-    for number, line in enumerate(whole.splitlines(), start=1):
-        try:
-            record = EpisodeRecord.from_json(line)
-        except ValueError as error:
-            raise UsageError(f"{path}:{number}: {error}") from None
-        episodes[record.index] = record
-    return tuple(episodes[index] for index in sorted(episodes))
+def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, Arrays]:
+    """Return the arrays of the episodes that have a line, by index.
 
+    Args:
+        path: The archive.
+        crcs: What each episode's line says of its arrays; None in lines of earlier versions.
 
-def _load_arrays(path: Path) -> dict[int, Arrays]:
-    """Read an archive whose keys are `<episode>/<name>`."""
-    episodes: dict[int, Arrays] = {}
-    if not path.exists():
-        return episodes
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            for key in archive.files:
-                index, _, name = key.partition("/")
-                episodes.setdefault(int(index), {})[name] = archive[key]
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{path}: {error}") from None
-    return episodes
+    Raises:
+        UsageError: The archive is damaged, or lacks or has other arrays than the lines say.
+    """
+    groups = read_groups(path)
+    found = {}
+    for index, crc in crcs.items():
+        group = groups.get(f"{index:03d}", NO_ARRAYS)
+        if crc is not None and group.crc32 != crc:
+            raise UsageError(
+                f"{path}: arrays of episode {index}: {CRC} = {group.crc32!r}: accepted: {crc!r}, "
+                f"that of {EPISODES_FILE}"
+            )
+        if group.arrays:
+            found[index] = group.arrays
+    return found
 
 
 def _fresh_folder(parent: Path, name: str) -> Path:

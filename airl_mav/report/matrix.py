@@ -9,8 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.core.files import replace_file
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import replace_file, write_json
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.report.tables import NONE, Column, TableView
 

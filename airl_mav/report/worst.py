@@ -23,11 +23,9 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.sight import Sight
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.safe_velocity import max_acceleration
-from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.tables import NONE, OUTCOME_WORDS, Column, TableView
-from airl_mav.vehicle.rotor import N_ROTORS
 
 EXAMINED = 100
 """Flights whose cause is looked for: the worst."""
@@ -93,7 +91,7 @@ def judge_worst(
     """
     standard = standard_of(run.episodes)
     sight = None if vehicle is None else Sight.of(vehicle.camera)
-    brake = None if vehicle is None else brake_of(vehicle)
+    brake = None if vehicle is None else max_acceleration(vehicle)
     return [
         Judged(
             record,
@@ -103,15 +101,6 @@ def judge_worst(
         )
         for record in ranked(run)[:EXAMINED]
     ]
-
-
-def brake_of(vehicle: VehicleProfile) -> float:
-    """Return the greatest deceleration of a vehicle that keeps its height [m/s²]."""
-    return max_acceleration(
-        N_ROTORS * vehicle.rotor.thrust_max_n,
-        vehicle.body.mass_kg,
-        parameter_values(vehicle.parameters)["MPC_TILTMAX_AIR"],
-    )
 
 
 def _evidence(

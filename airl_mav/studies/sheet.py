@@ -10,8 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from airl_mav.core.files import replace_file
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import replace_file, write_json
 from airl_mav.report.html import environment
 from airl_mav.report.matrix import markdown_table
 from airl_mav.report.tables import TableView

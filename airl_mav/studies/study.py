@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +19,7 @@ from airl_mav.cli.common import run_command
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.files import read_json
 from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import pool, stage_samples
@@ -177,10 +177,7 @@ def run_study(
 def _check_same_study(root: Path, key: str) -> None:
     """Raise UsageError for a folder that holds another study."""
     file = root / DATA_FILE
-    try:
-        held = json.loads(file.read_bytes()).get("study") if file.exists() else key
-    except (OSError, ValueError, AttributeError) as error:
-        raise UsageError(f"{file}: cannot be read: {error}") from None
+    held = read_json(file, None, "study").get("study") if file.exists() else key
     if held != key:
         raise UsageError(f"--out {root}: holds the study {held!r}; accepted: another folder")
 

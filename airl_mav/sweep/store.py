@@ -24,7 +24,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.experiments.store import Declaration, DeclaredCell
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.trial import Trial, TrialResult, trials
@@ -88,7 +88,7 @@ class SweepFolder:
         path = self.trial_path(trial) / RESULT_FILE
         if not path.exists():
             return None
-        held = read_versioned(path, _RESULT_FILE, SCHEMA, "result")
+        held = read_typed(path, _RESULT_FILE, SCHEMA, "result")
         if held.result.trial != trial or held.evaluation != self.evaluation:
             raise UsageError(
                 f"{path}: of another trial or of other flights; accepted: another --out"

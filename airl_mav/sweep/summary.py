@@ -11,7 +11,7 @@ from pydantic import TypeAdapter
 from scipy import stats
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import write_json
 from airl_mav.flight.paper import BEST_OF_SWEEP
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection

@@ -10,9 +10,7 @@ JSON.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
 import pickle
 import shutil
 import warnings
@@ -26,8 +24,17 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import replace_file
-from airl_mav.training.learner_state import Arrays, collect, restore
+from airl_mav.core.files import (
+    Arrays,
+    json_line,
+    naming,
+    read_json,
+    replace_file,
+    sha256_of,
+    sync,
+    sync_folder,
+)
+from airl_mav.training.learner_state import collect, restore
 
 SCHEMA = 1
 KEEP = 2
@@ -62,26 +69,36 @@ def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any])
     final = folder / f"{PREFIX}{_serial(there[-1]) + 1 if there else 1:06d}"
     partial = final.with_name(final.name + PARTIAL)
     partial.mkdir()
-    weights, arrays, state = collect(model)
-    keywords: dict[str, Any] = dict(arrays)
-    with (partial / WEIGHTS).open("wb") as file:
-        torch.save(weights, file)
-    with (partial / ARRAYS).open("wb") as file:
-        np.savez(file, **keywords)
-    (partial / STATE).write_text(json.dumps({"learner": state, "meta": meta}, default=_plain))
-    files = {name: _fingerprint(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
-    (partial / MANIFEST).write_text(json.dumps({"schema": SCHEMA, "files": files}))
-    for path in partial.iterdir():
-        _sync(path)
-    _sync(partial)
+    try:
+        _write(partial, model, meta)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
     partial.rename(final)
-    _sync(folder)
+    sync_folder(folder)
     replace_file(folder / LATEST, f"{final.name}\n".encode())
     for old in _all(folder)[:-KEEP]:
         # Half removed, it must not look like a checkpoint.
         old.rename(old.with_name(old.name + PARTIAL))
         shutil.rmtree(old.with_name(old.name + PARTIAL))
     return final
+
+
+def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None:
+    """Write the files of a checkpoint and bring them to the disk. Raises OSError."""
+    weights, arrays, state = collect(model)
+    keywords: dict[str, Any] = dict(arrays)
+    with naming(partial):
+        with (partial / WEIGHTS).open("wb") as file:
+            torch.save(weights, file)
+        with (partial / ARRAYS).open("wb") as file:
+            np.savez(file, **keywords)
+        (partial / STATE).write_text(json.dumps({"learner": state, "meta": meta}, default=_plain))
+        files = {name: sha256_of(partial / name) for name in (WEIGHTS, ARRAYS, STATE)}
+        (partial / MANIFEST).write_bytes(json_line({"schema": SCHEMA, "files": files}))
+        for path in partial.iterdir():
+            sync(path)
+    sync_folder(partial)
 
 
 def load_latest(
@@ -133,16 +150,16 @@ def load_latest(
 def _read(path: Path) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
     """Read a checkpoint. Raises DamagedError when it is not what was written."""
     try:
-        manifest = json.loads((path / MANIFEST).read_text())
-        if manifest["schema"] != SCHEMA:
-            raise DamagedError(f"schema {manifest['schema']}; accepted: {SCHEMA}")
+        manifest = read_json(path / MANIFEST, SCHEMA, "checkpoint")
         for name in (WEIGHTS, ARRAYS, STATE):
-            if _fingerprint(path / name) != manifest["files"][name]:
+            if sha256_of(path / name) != manifest["files"][name]:
                 raise DamagedError(f"{name} has changed since it was written")
         with np.load(path / ARRAYS, allow_pickle=False) as archive:
             arrays = dict(archive)
         weights = torch.load(path / WEIGHTS, map_location="cpu", weights_only=True)
         return weights, arrays, json.loads((path / STATE).read_text())
+    except UsageError as error:
+        raise DamagedError(str(error)) from None
     except OSError as error:
         name = Path(error.filename).name if error.filename else "a file"
         raise DamagedError(f"{name}: {error.strerror}") from None
@@ -175,21 +192,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is no JSON")
-
-
-def _fingerprint(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
-
-
-def _sync(path: Path) -> None:
-    """Bring a file, or the names in a folder, to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # Not every file system lets a folder be synced.
-            os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -15,9 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from airl_mav.core.files import Arrays
 from airl_mav.training.dqn import DoubleDQN
-
-Arrays = dict[str, NDArray[Any]]
 
 COUNTERS = (
     "num_timesteps",

@@ -11,17 +11,26 @@ policy/             the result: policy.onnx and card.json
 from __future__ import annotations
 
 import fcntl
-import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter
+
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import replace_file
+from airl_mav.core.files import (
+    append_lines,
+    json_line,
+    read_json,
+    read_lines,
+    read_typed,
+    replace_file,
+    typed,
+    write_json,
+)
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.training.config import TrainingConfig
 
@@ -57,6 +66,9 @@ class Evaluation:
     def rank(self) -> tuple[float, float]:
         """What is better is greater: success, then speed."""
         return self.success_rate, -(self.flight_time_s or 1e9)
+
+
+_EVALUATION = TypeAdapter(Evaluation)
 
 
 class TrainingFolder:
@@ -95,7 +107,7 @@ class TrainingFolder:
             "machine": describe_machine(),
             "git": git_state(),
         }
-        replace_file(path / CONFIG_FILE, (json.dumps(about, indent=2) + "\n").encode())
+        write_json(path / CONFIG_FILE, about)
         return cls(path)
 
     @classmethod
@@ -117,17 +129,7 @@ class TrainingFolder:
 
     def about(self) -> dict[str, Any]:
         """Return what `train.json` holds. Raises UsageError when there is no run."""
-        try:
-            about = json.loads((self.path / CONFIG_FILE).read_bytes())
-        except OSError as error:
-            raise UsageError(
-                f"{self.path}: no training run here: {CONFIG_FILE}: {error.strerror}"
-            ) from None
-        except ValueError as error:
-            raise UsageError(f"{self.path / CONFIG_FILE}: not JSON: {error}") from None
-        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
-            raise UsageError(f"{self.path / CONFIG_FILE}: schema: accepted: {SCHEMA}")
-        return about
+        return read_json(self.path / CONFIG_FILE, SCHEMA, "training run")
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -161,34 +163,29 @@ class TrainingFolder:
 
     def evaluations(self) -> list[Evaluation]:
         """Return the evaluations so far; a line cut short by a kill is passed over."""
-        file = self.path / EVALUATIONS_FILE
-        data = file.read_bytes() if file.exists() else b""
-        whole = data[: data.rfind(b"\n") + 1]
-        return [Evaluation(**json.loads(line)) for line in whole.splitlines()]
+        lines = read_lines(self.path / EVALUATIONS_FILE, None)
+        return [typed(_EVALUATION, data, place) for place, data in lines]
 
     def add_evaluation(self, evaluation: Evaluation) -> None:
         """Append a line; on return it is on the disk."""
-        with (self.path / EVALUATIONS_FILE).open("ab") as file:
-            file.write(json.dumps(asdict(evaluation)).encode() + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_lines(self.path / EVALUATIONS_FILE, [asdict(evaluation)])
 
     def forget_after(self, steps: int) -> None:
         """Drop evaluations later than a checkpoint: going on from it will make them again."""
         kept = [each for each in self.evaluations() if each.steps <= steps]
-        lines = "".join(json.dumps(asdict(each)) + "\n" for each in kept)
-        replace_file(self.path / EVALUATIONS_FILE, lines.encode())
+        replace_file(
+            self.path / EVALUATIONS_FILE, b"".join(json_line(asdict(each)) for each in kept)
+        )
 
     def best(self) -> Evaluation | None:
         """Return which evaluation the best weights are of."""
         file = self.path / "best" / BEST_FILE
         if not file.exists() or not self.best_model.exists():
             return None
-        return Evaluation(**json.loads(file.read_bytes()))
+        return read_typed(file, _EVALUATION, None, "training run")
 
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:
         """Keep the best weights. Killed in between, the old line stands for the new weights."""
         self.best_model.parent.mkdir(exist_ok=True)
         replace_file(self.best_model, model)
-        text = json.dumps(asdict(evaluation), indent=2) + "\n"
-        replace_file(self.best_model.parent / BEST_FILE, text.encode())
+        write_json(self.best_model.parent / BEST_FILE, asdict(evaluation))

@@ -69,7 +69,7 @@ def evaluations(out: Path) -> list[dict[str, Any]]:
     lines = (out / "evaluations.jsonl").read_text(encoding="utf-8").splitlines()
     plain = [json.loads(line) for line in lines]
     for line in plain:
-        del line["seconds"]
+        del line["seconds"], line["crc32"]
     return plain
 
 

@@ -26,8 +26,8 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.sight import Sight, bearing, nearest_spot, view_obstacle, view_wall
 from airl_mav.flight.swings import MIN_TURNS, SPOT_M, longest_swing, stretches
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.safe_velocity import max_acceleration
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.worst import brake_of
 
 CAMERA = load_vehicle("quad").camera
 SIGHT = Sight.of(CAMERA)
@@ -402,4 +402,4 @@ def test_a_collision_taken_apart_and_one_that_was_none() -> None:
 
 def test_the_brakes_are_the_tilt_limit_of_the_vehicle() -> None:
     # 45° of tilt, PX4's MPC_TILTMAX_AIR: as much sideways as down.
-    assert brake_of(load_vehicle("quad")) == pytest.approx(9.80665, rel=1e-6)
+    assert max_acceleration(load_vehicle("quad")) == pytest.approx(9.80665, rel=1e-6)

@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import append_lines, read_lines
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import SCHEMA, EpisodeRecord
 from tests.support.run_demo import demo_arena, demo_episode
 
 
@@ -15,48 +18,44 @@ def record() -> EpisodeRecord:
     return demo_episode(2, demo_arena(3))[0]
 
 
-def test_a_line_reads_back_as_it_was(record: EpisodeRecord) -> None:
-    for version in (
+def test_lines_read_back_as_they_were(record: EpisodeRecord, tmp_path: Path) -> None:
+    versions = [
         record,
         replace(record, quality=None, navigation_us=None, wall_s=None, battery_remaining=None),
         replace(record, outcome=Outcome.ABORTED, reason='a "line"\nbreak, ü', notes=()),
-    ):
-        line = version.to_json()
-        assert "\n" not in line
-        assert EpisodeRecord.from_json(line) == version
+    ]
+    path = tmp_path / "episodes.jsonl"
+    append_lines(path, (version.as_data() for version in versions))
+    lines = read_lines(path, SCHEMA)
+    assert [EpisodeRecord.from_data(data, place) for place, data in lines] == versions
+    assert [place for place, _ in lines] == [f"{path}:{number}" for number in (1, 2, 3)]
 
 
 def test_the_line_is_plain_json(record: EpisodeRecord) -> None:
-    data = json.loads(record.to_json())
+    data = json.loads(json.dumps(record.as_data()))
     assert data["schema"] == 1
     assert data["outcome"] == record.outcome.value
     assert record.quality is not None
     assert data["quality"]["distance_m"] == record.quality.distance_m
 
 
-def test_no_nan_is_written(record: EpisodeRecord) -> None:
+def test_no_nan_is_written(record: EpisodeRecord, tmp_path: Path) -> None:
+    path = tmp_path / "episodes.jsonl"
     with pytest.raises(ValueError, match="JSON compliant"):
-        replace(record, battery_remaining=float("nan")).to_json()
+        append_lines(path, [replace(record, battery_remaining=float("nan")).as_data()])
+    assert not path.exists()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema": 99}, "schema = 99: accepted: 1"),
-        ({"outcome": "won"}, "outcome = 'won'"),
-        ({"goal": [1.0]}, "goal"),
-        ({"seed": "many"}, "seed = 'many'"),
+        ({"outcome": "won"}, "here: outcome = 'won'"),
+        ({"goal": [1.0]}, "here: goal"),
+        ({"seed": "many"}, "here: seed = 'many': accepted: a whole number"),
     ],
 )
 def test_a_foreign_line_is_refused(record: EpisodeRecord, change: dict, message: str) -> None:
-    data = {**json.loads(record.to_json()), **change}
-    with pytest.raises(ValueError, match=r"accepted|=") as error:
-        EpisodeRecord.from_json(json.dumps(data))
+    with pytest.raises(UsageError) as error:
+        EpisodeRecord.from_data({**record.as_data(), **change}, "here")
     assert message in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("line", ["", "{", "[]", "3"])
-def test_what_is_no_record_is_refused(line: str) -> None:
-    with pytest.raises(ValueError, match=r"not JSON|schema = None"):
-        EpisodeRecord.from_json(line)

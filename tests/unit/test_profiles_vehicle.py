@@ -434,3 +434,49 @@ def test_a_base_that_leads_in_a_circle_is_refused(tmp_path: Path) -> None:
     two.write_text(f'base = "{one}"', encoding="utf-8")
     with pytest.raises(UsageError, match="leads back to"):
         load_profile("vehicles", str(one), VehicleProfile)
+
+
+# --- hostile files
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x = " + "[" * 5_000, "nested too deep: accepted: 100 levels"),
+        ("x = " + "[" * 200 + "]" * 200, "nested too deep: accepted: 100 levels"),
+        ("[" + ".".join("a" * 5_000) + "]", "nested too deep: accepted: 100 levels"),
+        ("x = " + "9" * 6_000, "not valid TOML: Exceeds the limit"),
+        ("".join(f"k{i} = 1\n" for i in range(400_000)), "at most 1,048,576 bytes"),
+        ("".join(f"k{i} = 1\n" for i in range(10_000)), "k0: unknown field; fields: "),
+        ("\0", "not valid TOML"),
+    ],
+    ids=lambda value: value[:12],
+)
+def test_hostile_files_get_one_line(tmp_path: Path, text: str, words: str) -> None:
+    message = refusal(tmp_path, text)
+    assert words in message
+    assert len(message) < 300
+
+
+def test_a_long_chain_of_bases_is_refused(tmp_path: Path) -> None:
+    for i in range(3_000):
+        (tmp_path / f"{i}.toml").write_text(f'base = "{tmp_path / str(i + 1)}.toml"\n')
+    assert (
+        refusal(tmp_path, f'base = "{tmp_path}/0.toml"')
+        == "base: accepted: at most 10 below each other"
+    )
+
+
+def test_a_vehicle_that_cannot_hover_is_refused(tmp_path: Path) -> None:
+    assert refusal(tmp_path, edit("body.mass_kg", "mass_kg = 5.0")) == (
+        "body.mass_kg = 5: cannot hover: needs 49.03 newton, has 28.28 "
+        "(4 x rotor.thrust_max_n 7.07)"
+    )
+    path = tmp_path / "light.toml"
+    path.write_text(edit("body.mass_kg", "mass_kg = 2.8"))
+    assert load_profile("vehicles", str(path), VehicleProfile).thrust_n == 4 * 7.07
+
+
+def test_a_sensor_that_hardly_ever_samples_is_refused(tmp_path: Path) -> None:
+    message = refusal(tmp_path, edit("sensors.barometer.rate_hz", "rate_hz = 5e-324"))
+    assert message == "sensors.barometer.rate_hz = 5e-324: accepted: 1 <= value <= 250 Hz"

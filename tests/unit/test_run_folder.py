@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import add_arrays, replace_file
+from airl_mav.core.files import add_arrays, json_line, replace_file
 from airl_mav.core.provenance import git_state
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, LATENCY_FILE, RunFolder, load
@@ -85,8 +85,9 @@ def test_a_line_cut_short_is_passed_over_and_cut_off(tmp_path: Path) -> None:
     lines = folder.path / EPISODES_FILE
     whole = lines.read_bytes()
     record, trajectory, latency = demo_episode(2, demo_arena(3))
-    for cut in (1, 40, len(record.to_json())):
-        lines.write_bytes(whole + record.to_json().encode()[:cut])
+    line = json_line(record.as_data())
+    for cut in (1, 40, len(line) - 1):
+        lines.write_bytes(whole + line[:cut])
         assert [episode.index for episode in load(folder.path).episodes] == [0, 1]
         resumed, run = RunFolder.resume(folder.path)
         assert len(run.episodes) == 2

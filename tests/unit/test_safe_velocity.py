@@ -13,6 +13,7 @@ from airl_mav.envs.delay import bounded, speed_bound
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity
+from airl_mav.profiles.vehicle import load_vehicle
 
 POSITIVE = st.floats(0.01, 100.0)
 
@@ -33,11 +34,12 @@ def test_published_values() -> None:
 
 
 def test_the_greatest_acceleration_is_the_lesser_of_two() -> None:
-    assert max_acceleration(100.0, 1.0, 45.0) == pytest.approx(9.80665)
-    lift = 2.0 * 9.80665  # hovers at half thrust: tilts 60 degrees and keeps its height
-    assert max_acceleration(lift, 1.0, 80.0) == pytest.approx(9.80665 * math.tan(math.radians(60)))
-    with pytest.raises(ValueError, match="above"):
-        max_acceleration(9.0, 1.0, 45.0)
+    quad = load_vehicle("quad")
+    assert max_acceleration(quad) == pytest.approx(9.80665)  # its tilt limit is 45 degrees
+    # Hovers at half thrust: tilts 60 degrees and keeps its height.
+    body = quad.body.model_copy(update={"mass_kg": quad.thrust_n / (2.0 * 9.80665)})
+    heavy = quad.model_copy(update={"body": body, "parameters": {"MPC_TILTMAX_AIR": 80.0}})
+    assert max_acceleration(heavy) == pytest.approx(9.80665 * math.tan(math.radians(60)))
 
 
 PI = {"computer": "ras-pi-4", "workload": "template-5x32"}

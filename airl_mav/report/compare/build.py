@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.versioned import write_json
+from airl_mav.core.files import read_json, write_json
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
@@ -168,7 +167,7 @@ def run_folders(path: Path) -> list[Path]:
     for file, key in ((LADDER_FILE, "levels"), (MATRIX_FILE, "cells")):
         if (path / file).exists():
             try:
-                parts = json.loads((path / file).read_bytes())[key]
+                parts = read_json(path / file, None, "table of runs")[key]
                 names = [n for part in parts for n in part.get("folders", [part.get("folder")])]
                 return [path / name for name in names]
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

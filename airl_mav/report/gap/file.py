@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.gap import HardwareGap
 from airl_mav.flight.paper import PaperFigures, PrintedGaps
 from airl_mav.flight.statistics import Aggregate, Estimate
@@ -108,5 +108,5 @@ def read_gap(path: Path) -> GapStudy:
     Raises:
         UsageError: The folder holds none, or its runs cannot be read.
     """
-    held = read_versioned(path / GAP_FILE, _HELD, SCHEMA, "hardware gap")
+    held = read_typed(path / GAP_FILE, _HELD, SCHEMA, "hardware gap")
     return build_gap(path, held.facts, held.arenas)

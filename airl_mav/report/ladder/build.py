@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from airl_mav.core.versioned import read_versioned, write_json
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import Comparison, compare
 from airl_mav.flight.record import EpisodeRecord, run_sha256
@@ -271,5 +271,5 @@ def read_ladder(path: Path) -> Ladder:
     Raises:
         UsageError: The folder holds none, or its runs cannot be read.
     """
-    held = read_versioned(path / LADDER_FILE, _HELD, SCHEMA, "ladder")
+    held = read_typed(path / LADDER_FILE, _HELD, SCHEMA, "ladder")
     return build_ladder(path, held.facts, held.levels)
