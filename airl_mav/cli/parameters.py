@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Literal
 
-from airl_mav.cli.parameters_command import ParametersCommand
-from airl_mav.core.errors import UsageError
+from pydantic import Field
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.external.airframe_check import (
@@ -29,15 +34,42 @@ KINDS: dict[str, Kind] = {
 """How the parameters are found, and written, by kind of firmware."""
 
 
-def run(command: ParametersCommand) -> int:
-    """Write or print the parameters; return the exit status."""
-    airframe_of, file_of = KINDS[command.firmware]
-    airframe = airframe_of(load_vehicle(command.vehicle))
+class ParametersOptions(ProfileModel):
+    """Write what real firmware must be set to, to fly a vehicle: for firmware that you start.
+
+    For PX4 a file that QGroundControl loads, for ArduPilot one for its --defaults. Firmware that
+    airl-sitl starts is set by itself.
+
+    Examples:
+        airl parameters px4-hitl --out quad.params
+        airl parameters ardupilot --vehicle my-quad.toml
+    """
+
+    firmware: Annotated[Literal["px4", "px4-hitl", "ardupilot"], POSITIONAL] = Field(
+        description="whose parameters"
+    )
+    vehicle: str = Field(
+        default="quad", description="vehicle profile: a shipped name, or a path to a .toml"
+    )
+    out: Path | None = Field(default=None, description="file to write; by default printed")
+
+
+OPTIONS = ParametersOptions
+
+
+def run(options: ParametersOptions) -> int:
+    """Write or print the parameters. Returns exit status 0.
+
+    Raises:
+        UsageError: The vehicle's profile lacks what the firmware needs, or there is no such folder.
+    """
+    airframe_of, file_of = KINDS[options.firmware]
+    airframe = airframe_of(load_vehicle(options.vehicle))
     text = file_of({**airframe.frame, **airframe.settings})
-    if command.out is None:
+    if options.out is None:
         sys.stdout.write(text)
         return 0
-    if not command.out.parent.is_dir():
-        raise UsageError(f"--out {command.out}: no folder {command.out.parent}")
-    replace_file(command.out, text.encode())
+    if not options.out.parent.is_dir():
+        raise FieldError("out", f"{options.out}", problem=f"no folder {options.out.parent}")
+    replace_file(options.out, text.encode())
     return 0

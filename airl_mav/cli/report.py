@@ -3,69 +3,83 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
+from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.report_command import ReportCommand
+from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel
 from airl_mav.rehearsal.run_folder import RUN_FILE
-from airl_mav.report.compare.build import COMPARE_FILE, load_compared, run_folders
-from airl_mav.report.compare.page import build_comparison
-from airl_mav.report.compare.terminal import print_comparison
-from airl_mav.report.gap.file import GAP_FILE, read_gap
-from airl_mav.report.gap.terminal import show_gap
-from airl_mav.report.ladder.build import LADDER_FILE, read_ladder
-from airl_mav.report.ladder.page import build_page
-from airl_mav.report.ladder.terminal import print_ladder
-from airl_mav.report.rebuild import rebuild
-from airl_mav.report.terminal import print_report
+from airl_mav.report.comparison.model import comparison_file, kind_of
+from airl_mav.report.comparison.runs import compare_folders
+from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
+from airl_mav.report.run_report import show_report
 
 
-def run(command: ReportCommand, console: Console | None = None) -> int:
-    """Build the report.
+class ReportOptions(ProfileModel):
+    """Print the tables of a run, a gap or a ladder and write its page again; or compare runs.
 
-    Args:
-        command: What was asked for.
-        console: Where to print; None means standard output.
+    Two or more runs are compared: what differs in what was flown, quality of flight with intervals,
+    paired differences on shared seeds, latencies, paths, energy. The first is the reference.
 
-    Returns:
-        Exit status, 0.
+    Examples:
+        airl report runs/20261122T101530Z-sitl-static-obstacles
+        airl report runs/A runs/B --names before after --out runs/before-after
+    """
+
+    runs: Annotated[tuple[Path, ...], POSITIONAL] = Field(
+        default=(),
+        description="run folders, or the folder of a gap, a ladder, a curve or a table",
+    )
+    names: tuple[str, ...] = Field(
+        default=(),
+        description="what compared runs are called, in their order; by default what tells them"
+        " apart",
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of a comparison; by default runs/<UTC time>-compare. A report goes into"
+        " its run's own folder",
+    )
+
+
+OPTIONS = ReportOptions
+
+
+def run(options: ReportOptions, console: Console | None = None) -> int:
+    """Build the report. Returns exit status 0.
 
     Raises:
-        UsageError: A folder holds neither, an arena of it cannot be made any more, or runs cannot
-            be compared.
+        UsageError: A folder holds nothing to report, an arena of it cannot be made any more, or
+            runs cannot be compared.
     """
     console = console or Console()
-    ladder_there = (command.run / LADDER_FILE).exists()
-    if command.others or (not ladder_there and len(run_folders(command.run)) > 1):
-        return _compare(command, console)
-    for option, value in (("--out", command.out), ("--names", " ".join(command.names))):
+    if not options.runs:
+        raise FieldError("runs", "()", "one run folder or more")
+    first = options.runs[0]
+    if len(options.runs) > 1 or kind_of(first) == "matrix":
+        return _compare(options, console)
+    for field, value in (("out", options.out), ("names", " ".join(options.names))):
         if value:
-            raise UsageError(f"{option} {value}: accepted: with two runs or more")
-    if (command.run / GAP_FILE).exists():
-        show_gap(read_gap(command.run), console)
-        return 0
-    if ladder_there:
-        ladder = read_ladder(command.run)
-        print_ladder(ladder, console, build_page(ladder))
-        return 0
-    flown, page = rebuild(command.run)
-    print_report(flown, console, page)
+            raise FieldError(field, f"{value}", "with two runs or more")
+    if kind_of(first) is None:
+        show_report(first, console)
+    else:
+        show_comparison(*rebuild_comparison(first), first, console)
     return 0
 
 
-def _compare(command: ReportCommand, console: Console) -> int:
+def _compare(options: ReportOptions, console: Console) -> int:
     """Compare runs."""
-    out = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
+    out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
     if (out / RUN_FILE).exists():
-        raise UsageError(f"--out {out}: holds a run; accepted: another folder")
-    if out.is_dir() and any(out.iterdir()) and not (out / COMPARE_FILE).exists():
-        raise UsageError(f"--out {out}: holds something else; accepted: a new or empty folder")
-    compared = load_compared([command.run, *command.others], command.names)
-    try:
-        page = build_comparison(compared, out)
-    except OSError as error:
-        raise UsageError(f"--out {out}: {error.strerror}") from None
-    print_comparison(compared, console, page)
+        raise FieldError("out", f"{out}", "another folder: it holds a run")
+    held = comparison_file(out, "compare").exists()
+    if out.is_dir() and any(out.iterdir()) and not held:
+        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+    comparison, runs = compare_folders(list(options.runs), options.names)
+    show_comparison(comparison, runs, out, console)
     return 0

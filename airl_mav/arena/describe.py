@@ -1,0 +1,53 @@
+"""An arena as a table for people."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from rich.table import Table
+
+from airl_mav.arena.generate import free_area_fraction
+from airl_mav.arena.geometry import Arena, Shape, Tour
+from airl_mav.arena.zones import zone_of
+from airl_mav.profiles.arena import ArenaSpec
+
+
+def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
+    """Return what is in the arena."""
+    b = arena.bounds
+    table = Table(title=f"{arena.name}, seed {arena.seed}", caption=spec.description)
+    table.add_column("what")
+    table.add_column("value", justify="right")
+    size = f"{b.north_max - b.north_min:g} x {b.east_max - b.east_min:g} x {b.height:g} m"
+    table.add_row("floor north x east, walls", size)
+    table.add_row("start from the south-west corner", f"{-b.north_min:g} N {-b.east_min:g} E m")
+    table.add_row("static obstacles", _shapes(arena, moving=False))
+    table.add_row("moving obstacles", _shapes(arena, moving=True))
+    if arena.tours:
+        speeds = ", ".join(f"{_speed_m_s(tour):.2f}" for tour in arena.tours)
+        periods = ", ".join(f"{tour.times_s[-1]:.0f}" for tour in arena.tours)
+        table.add_row("  speeds", f"{speeds} m/s")
+        table.add_row("  tours repeat after", f"{periods} s")
+    north, east = (float(value) for value in arena.goal)
+    zone = zone_of(spec, arena.goal)
+    where = "beyond the zones" if zone is None else f"zone {zone}"
+    table.add_row("goal from the start", f"{north:.2f} N {east:.2f} E m")
+    table.add_row("  distance", f"{math.hypot(north, east):.2f} m, {where}")
+    table.add_row("floor free of static obstacles", f"{free_area_fraction(arena):.1%}")
+    return table
+
+
+def _shapes(arena: Arena, *, moving: bool) -> str:
+    """Return how many obstacles of each shape there are: "7 (4 box, 3 sphere)"."""
+    n = arena.n_static
+    shapes = arena.obstacles.shape[n:] if moving else arena.obstacles.shape[:n]
+    kinds = [f"{k} {shape.name.lower()}" for shape in Shape if (k := int((shapes == shape).sum()))]
+    return f"{len(shapes)} ({', '.join(kinds)})" if kinds else "0"
+
+
+def _speed_m_s(tour: Tour) -> float:
+    """Return the speed on the legs of a tour [m/s], stops left out; it was drawn once."""
+    length = np.hypot(*np.diff(tour.points, axis=0).T)
+    moves = length > 0.0
+    return float(length[moves].sum() / np.diff(tour.times_s)[moves].sum())
