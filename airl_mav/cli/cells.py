@@ -20,8 +20,8 @@ from airl_mav.core.ports import Ports
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
-from airl_mav.report.matrix import MATRIX_FILE
-from airl_mav.report.tables import OUTCOME_WORDS
+from airl_mav.report.comparison.model import KIND_NAMES, Kind, comparison_file
+from airl_mav.report.table import count_outcomes
 
 if TYPE_CHECKING:
     from airl_mav.cli.evaluate_task import Task
@@ -73,26 +73,18 @@ def _only(key: str, what: str, names: Sequence[str]) -> str:
     return names[0]
 
 
-def check_root(root: Path, *, but: str | None = None) -> None:
+def check_root(root: Path, *, but: Kind | None = None) -> None:
     """Raise UsageError for a campaign's folder that holds something else.
 
     Args:
         root: Where the campaign is to go.
-        but: Name of the file by which a campaign of the same kind is known.
+        but: The kind of comparison that the campaign makes.
     """
-    # Imported late: they draw and reckon, and a typo must not wait for them.
-    from airl_mav.report.gap.file import GAP_FILE
-    from airl_mav.report.ladder.build import LADDER_FILE
-
-    others = {
-        RUN_FILE: "a single run",
-        MATRIX_FILE: "a table of policies x arenas",
-        LADDER_FILE: "a ladder",
-        GAP_FILE: "a hardware gap",
-    }
+    others = {root / RUN_FILE: "single run"}
+    others |= {comparison_file(root, k): name for k, name in KIND_NAMES.items() if k != but}
     for file, what in others.items():
-        if file != but and (root / file).exists():
-            raise UsageError(f"--out {root}: holds {what}; accepted: another folder")
+        if file.exists():
+            raise UsageError(f"--out {root}: holds a {what}; accepted: another folder")
 
 
 def check_cells(cells: Sequence[Cell]) -> None:
@@ -212,21 +204,16 @@ def _fly(root: Path, cell: Cell, console: Console, reports: bool) -> tuple[Flown
 
 def _report(path: Path, *, new: int) -> None:
     """Write a cell's page, unless it is there already."""
-    from airl_mav.report.html import REPORT_FILE
-    from airl_mav.report.rebuild import rebuild
+    from airl_mav.report.document import REPORT_FILE
+    from airl_mav.report.run_report import write_report
 
     if new or not (path / REPORT_FILE).exists():
-        rebuild(path)
+        write_report(path)
 
 
 def _in_words(held: FlownCell, new: int) -> str:
     """Return how a cell's flights ended."""
-    outcomes = [episode.outcome for episode in held.episodes]
-    told = ", ".join(
-        f"{outcomes.count(outcome):,} {words}"
-        for outcome, words in OUTCOME_WORDS.items()
-        if outcome in outcomes
-    )
+    told = count_outcomes([episode.outcome for episode in held.episodes])
     return told if new else f"{told} (flown before)"
 
 

@@ -21,13 +21,8 @@ from airl_mav.policy.card import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.rehearsal.workers import GREATEST_WORKERS
-from airl_mav.report.matrix import (
-    MATRIX_FILE,
-    MATRIX_TABLE_FILE,
-    Cell,
-    matrix_tables,
-    write_matrix,
-)
+from airl_mav.report.comparison.model import RunEntry, kind_of
+from airl_mav.report.table import count_outcomes
 
 if TYPE_CHECKING:
     from airl_mav.cli.evaluate_task import Result as EvaluationResult
@@ -173,7 +168,7 @@ def warn_of_known_seeds(command: EvaluateCommand, policy: PolicyInfo, console: C
 
 def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
     """Evaluate one policy in one arena and show the run."""
-    if command.out is not None and (command.out / MATRIX_FILE).exists():
+    if command.out is not None and kind_of(command.out) == "matrix":
         raise UsageError(f"--out {command.out}: holds a table of policies x arenas")
     result = task.fly(command.out, console)
     _write_on_card(command, task, result)
@@ -187,45 +182,42 @@ def _fly_one(command: EvaluateCommand, task: Task, console: Console) -> int:
 
 def _fly_matrix(command: EvaluateCommand, tasks: Sequence[Task], console: Console) -> int:
     """Evaluate every policy in every arena and show the tables."""
-    from airl_mav.report.html import REPORT_FILE
-    from airl_mav.report.rebuild import rebuild
-    from airl_mav.report.terminal import print_table
+    from airl_mav.report.comparison.matrix import matrix_recipe
+    from airl_mav.report.comparison.show import build_comparison, show_comparison
+    from airl_mav.report.document import REPORT_FILE
+    from airl_mav.report.run_report import write_report
 
     root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-evaluate"
     if (root / RUN_FILE).exists():
         raise UsageError(f"--out {root}: holds a single run; accepted: another folder")
     facts = {key: getattr(command, key) for key in SHARED}
-    cells: list[Cell] = []
+    cells: list[RunEntry] = []
     code = 0
     for task in tasks:
         result = task.fly(root / f"{task.policy.name}-{task.arena_name}", console)
         _write_on_card(command, task, result)
         if result.episodes:
-            shown = (result.path / REPORT_FILE).exists() and not result.new
-            if not shown:
-                rebuild(result.path)
+            if result.new or not (result.path / REPORT_FILE).exists():
+                write_report(result.path)
             cells.append(_cell(task, result))
-            write_matrix(root, facts, cells)
-            _say_how_it_went(cells[-1], console)
+            _say_how_it_went(task, result, console)
             _say_fingerprint(result, console)
         if code := result.code:
             break
-    for view in matrix_tables(cells):
-        console.print()
-        print_table(view, console, wrap=True)
     if cells:
-        console.print(
-            f"\ntables  {root / MATRIX_TABLE_FILE}", soft_wrap=True, markup=False, highlight=False
-        )
+        recipe = matrix_recipe(facts, cells)
+        show_comparison(*build_comparison(root, "matrix", recipe), root, console)
     return code
 
 
-def _say_how_it_went(cell: Cell, console: Console) -> None:
+def _say_how_it_went(task: Task, result: EvaluationResult, console: Console) -> None:
     """Print one line; a table of many flights takes a while."""
-    counts = cell.quality.outcomes.items()
-    told = ", ".join(f"{count} {outcome.value}" for outcome, count in counts if count)
+    told = count_outcomes([episode.outcome for episode in result.episodes])
     console.print(
-        f"{cell.policy} in {cell.arena}: {told}", soft_wrap=True, markup=False, highlight=False
+        f"{task.policy.name} in {task.arena_name}: {told}",
+        soft_wrap=True,
+        markup=False,
+        highlight=False,
     )
 
 
@@ -235,15 +227,15 @@ def _say_fingerprint(result: EvaluationResult, console: Console) -> None:
         console.print(f"sha256 of the flights  {sha256}", soft_wrap=True, highlight=False)
 
 
-def _cell(task: Task, result: EvaluationResult) -> Cell:
+def _cell(task: Task, result: EvaluationResult) -> RunEntry:
     """Return a task's row and column of the table."""
     card = task.policy.card
     trained_in = None if card is None else card.training.arena
-    return Cell(
-        policy=task.policy.name,
-        arena=task.arena_name,
+    return RunEntry(
+        name=result.path.name,
         folder=result.path.name,
-        trained_in=None if trained_in is None else Path(trained_in).stem,
+        label=task.policy.name,
+        group=task.arena_name,
         rules=task.rules,
-        quality=aggregate(result.episodes),
+        trained_in=None if trained_in is None else Path(trained_in).stem,
     )

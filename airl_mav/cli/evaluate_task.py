@@ -26,8 +26,8 @@ from airl_mav.rehearsal.evaluation_lockstep import fly_lockstep
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.rehearsal.workers import WorkerError
-from airl_mav.report.overview import write_overview
-from airl_mav.report.rebuild import pictured_arenas
+from airl_mav.report.flights_above import write_overview
+from airl_mav.report.run_report import pictured_arenas
 from companion.watchdog import WatchdogSettings
 
 FlyRest = Callable[[RunFolder, Sequence[EpisodeRecord], Watch], None]

@@ -17,7 +17,7 @@ from airl_mav.rehearsal.workers import GREATEST_WORKERS
 if TYPE_CHECKING:
     from airl_mav.cli.cells import FlownCell
     from airl_mav.cli.gap_plan import GapPlan
-    from airl_mav.report.gap.build import HeldArena
+    from airl_mav.report.comparison.model import RunEntry
 
 
 def run(command: GapCommand, console: Console | None = None) -> int:
@@ -38,41 +38,41 @@ def run(command: GapCommand, console: Console | None = None) -> int:
     # Imported late: the kernels take a second to load, and a typo must not wait for them.
     from airl_mav.cli.cells import check_root, fly_cells
     from airl_mav.cli.gap_plan import plan_gap
-    from airl_mav.report.gap.file import GAP_FILE
 
     plan = plan_gap(command)
     name = f"{plan.policy.name}-{plan.target.name}"
     root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-gap-{_plain(name)}"
-    check_root(root, but=GAP_FILE)
+    check_root(root, but="gap")
     for remark in plan.remarks:
         console.print(remark, style="yellow", soft_wrap=True, markup=False, highlight=False)
     flown, code = fly_cells(root, [planned.cell for planned in plan.cells], console)
     if flown:
-        from airl_mav.report.gap.build import build_gap
-        from airl_mav.report.gap.terminal import show_gap
+        from airl_mav.report.comparison.gap import gap_recipe
+        from airl_mav.report.comparison.show import build_comparison, show_comparison
 
-        show_gap(build_gap(root, plan.facts, _held(plan, flown)), console)
+        recipe = gap_recipe(plan.facts, _entries(plan, flown))
+        show_comparison(*build_comparison(root, "gap", recipe), root, console)
     return code
 
 
-def _held(plan: GapPlan, flown: Sequence[FlownCell]) -> list[HeldArena]:
-    """Return where the flights of each column lie, of those columns that have any."""
-    from airl_mav.report.gap.build import Held, HeldArena
+def _entries(plan: GapPlan, flown: Sequence[FlownCell]) -> list[RunEntry]:
+    """Return the runs of the gap that have any flights, in the order of the tables."""
+    from airl_mav.report.comparison.model import RunEntry
 
     by_key = {held.cell.key: held for held in flown}
-    columns: dict[str, list[Held]] = {}
-    for planned in plan.cells:
-        if (held := by_key.get(planned.cell.key)) is not None:
-            columns.setdefault(planned.arena, []).append(
-                Held(
-                    role=planned.role,
-                    title=planned.title,
-                    folder=held.folder,
-                    planned=planned.cell.command.episodes,
-                    rules=held.rules,
-                )
-            )
-    return [HeldArena(arena, tuple(held)) for arena, held in columns.items()]
+    return [
+        RunEntry(
+            name=planned.cell.key,
+            folder=held.folder,
+            label=planned.title,
+            role=planned.role,
+            group=planned.arena,
+            planned=planned.cell.command.episodes,
+            rules=held.rules,
+        )
+        for planned in plan.cells
+        if (held := by_key.get(planned.cell.key)) is not None
+    ]
 
 
 def _plain(name: str) -> str:

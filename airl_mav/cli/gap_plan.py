@@ -23,7 +23,7 @@ from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import explain
-from airl_mav.report.gap.build import Role
+from airl_mav.report.comparison.gap import Role
 
 TRAINING_LATENCY_SEED = 1
 """The latencies of the training's conditions are other draws than those of the target: with the

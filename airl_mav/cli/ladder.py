@@ -13,9 +13,7 @@ from airl_mav.cli.ladder_command import LadderCommand
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.registry import find_policy
-from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.rehearsal.workers import GREATEST_WORKERS
-from airl_mav.report.matrix import MATRIX_FILE
 
 FACTS = ("vehicle", "computer", "workload", "latency", "seed")
 """Options that head a ladder, beside policy and arena."""
@@ -37,25 +35,22 @@ def run(command: LadderCommand, console: Console | None = None) -> int:
     console = console or Console()
     arena = _check(command)
     # Imported late: the kernels take a second to load, and a typo must not wait for them.
+    from airl_mav.cli.cells import check_root
     from airl_mav.cli.ladder_levels import Climb
 
     climb = Climb(command, arena)
     name = f"{climb.policy.name}-{Path(arena).stem}"
     root = command.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-ladder-{name}"
-    for file, what in ((RUN_FILE, "a single run"), (MATRIX_FILE, "a table of policies x arenas")):
-        if (root / file).exists():
-            raise UsageError(f"--out {root}: holds {what}; accepted: another folder")
+    check_root(root, but="ladder")
     held, code = climb.fly(root, console)
     if len(held) > 1:
-        from airl_mav.report.ladder.build import build_ladder, write_ladder
-        from airl_mav.report.ladder.page import build_page
-        from airl_mav.report.ladder.terminal import print_ladder
+        from airl_mav.report.comparison.ladder import ladder_recipe
+        from airl_mav.report.comparison.show import build_comparison, show_comparison
 
         facts: dict[str, Any] = {"policy": climb.policy.name, "arena": arena}
         facts |= {key: getattr(command, key) for key in FACTS} | {"rules": climb.rules}
-        ladder = build_ladder(root, facts, held)
-        write_ladder(ladder)
-        print_ladder(ladder, console, build_page(ladder))
+        recipe = ladder_recipe(facts, held)
+        show_comparison(*build_comparison(root, "ladder", recipe), root, console)
     if code == EXIT_INTERRUPTED:
         console.print(
             f"interrupted: the same command with --out {root} goes on",

@@ -10,10 +10,10 @@ from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_task import Result, prepare
 from airl_mav.cli.ladder_command import LadderCommand, LevelName
 from airl_mav.policy.registry import find_policy
-from airl_mav.report.html import REPORT_FILE
-from airl_mav.report.ladder.build import Held
-from airl_mav.report.rebuild import rebuild
-from airl_mav.report.tables import OUTCOME_WORDS
+from airl_mav.report.comparison.model import RunEntry
+from airl_mav.report.document import REPORT_FILE
+from airl_mav.report.run_report import write_report
+from airl_mav.report.table import count_outcomes
 
 
 class Climb:
@@ -51,7 +51,7 @@ class Climb:
             ports=command.ports,
         )
 
-    def fly(self, root: Path, console: Console) -> tuple[list[Held], int]:
+    def fly(self, root: Path, console: Console) -> tuple[list[RunEntry], int]:
         """Fly what is left of all levels.
 
         Returns:
@@ -60,14 +60,15 @@ class Climb:
         Raises:
             UsageError: A folder holds another run.
         """
-        held: list[Held] = []
+        held: list[RunEntry] = []
         code = 0
         for level in self._command.levels:
             result = self._tasks[level].fly(root / level, console)
             if result.episodes:
                 if result.new or not (result.path / REPORT_FILE).exists():
-                    rebuild(result.path)
-                held.append(Held(level, (level,), self._command.episodes_at(level)))
+                    write_report(result.path)
+                planned = self._command.episodes_at(level)
+                held.append(RunEntry(level, level, planned=planned))
                 _say_how_it_went(level, result, console)
             if code := result.code:
                 break
@@ -76,10 +77,5 @@ class Climb:
 
 def _say_how_it_went(level: str, result: Result, console: Console) -> None:
     """Print one line."""
-    outcomes = [episode.outcome for episode in result.episodes]
-    told = ", ".join(
-        f"{outcomes.count(outcome)} {words}"
-        for outcome, words in OUTCOME_WORDS.items()
-        if outcome in outcomes
-    )
+    told = count_outcomes([episode.outcome for episode in result.episodes])
     console.print(f"{level}: {told}", soft_wrap=True, markup=False, highlight=False)

@@ -285,14 +285,14 @@ def _rehearse_in_lockstep(
 def conclude(path: Path, console: Console) -> None:
     """Print the tables and write the report of what was flown."""
     # Imported late: the figures take a second to load, and nobody waits for them before a flight.
-    from airl_mav.report.rebuild import rebuild
-    from airl_mav.report.terminal import print_report
+    from airl_mav.report.loading import load_run
+    from airl_mav.report.run_report import print_report, write_report
 
-    flown, page = rebuild(path)
-    if page is None:
+    run = load_run(path)
+    if not run.episodes:
         _say(console, f"no episode was finished; logs in {path}")
         return
-    print_report(flown, console, page)
+    print_report(run, console, write_report(run))
 
 
 def _interrupt(*_: object) -> NoReturn:

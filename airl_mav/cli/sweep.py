@@ -55,7 +55,7 @@ def run(command: SweepCommand, console: Console | None = None) -> int:
     name = Path(command.sweep).stem
     path = (command.out or Path("runs") / f"sweep-{name}").absolute()
     if command.dry_run:
-        from airl_mav.report.sweep.terminal import print_plan
+        from airl_mav.report.sweep import print_plan
 
         print_plan(name, config, computer, path, console)
         return 0
@@ -73,10 +73,11 @@ def run(command: SweepCommand, console: Console | None = None) -> int:
         sweep = summarize(folder, made, computer)
         write_sweep(sweep)
         if sweep.ended:
-            from airl_mav.report.sweep.page import build_page
-            from airl_mav.report.sweep.terminal import print_sweep
+            from airl_mav.report.document import print_document, write_document
+            from airl_mav.report.sweep import document_of
 
-            print_sweep(sweep, console, build_page(sweep))
+            document = document_of(sweep)
+            print_document(document, console, write_document(document, path))
     if code:
         told = "interrupted" if code == EXIT_INTERRUPTED else "not all trials have ended"
         console.print(
