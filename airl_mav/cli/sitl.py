@@ -12,8 +12,7 @@ from airl_mav.cli.options import RENAMED, run_command, scenario_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.fly import EXIT_CODES, fly_live
-from airl_mav.report.rebuild import rebuild
-from airl_mav.report.terminal import print_report
+from airl_mav.report.run_report import show_report
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -60,8 +59,7 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
             scenario, options.out, progress, announce=partial(_announce, scenario, console)
         )
     if flown.episodes:
-        loaded, page = rebuild(flown.path)
-        print_report(loaded, console, page)
+        show_report(flown.path, console)
     else:
         _say(console, f"no episode was finished; logs in {flown.path}")
     return EXIT_CODES[flown.ended]

@@ -19,8 +19,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.signals import stop_on_signals
-from airl_mav.report.sweep.page import build_page
-from airl_mav.report.sweep.terminal import print_plan, print_sweep
+from airl_mav.report.document import print_document, write_document
+from airl_mav.report.sweep import document_of, print_plan
 from airl_mav.scenario.model import Workers
 from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.run import run_sweep
@@ -128,7 +128,8 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
         if error is not None:
             progress.note(error, "yellow")
     if sweep.ended:
-        print_sweep(sweep, console, build_page(sweep))
+        document = document_of(sweep)
+        print_document(document, console, write_document(document, path))
     if sweep.ended == sweep.planned:
         return 0
     told = "interrupted" if error is None else "not all trials have ended"

@@ -29,7 +29,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, ComparisonRecipe, Kind, RunEntry
 from airl_mav.report.comparison.show import build_comparison, write_comparison
-from airl_mav.report.measures import OUTCOME_WORDS
+from airl_mav.report.table import OUTCOME_LABELS
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
 
@@ -251,7 +251,7 @@ def outcome_line(run: CellRun) -> str:
     outcomes = [episode.outcome for episode in run.episodes]
     told = ", ".join(
         f"{outcomes.count(outcome):,} {words}"
-        for outcome, words in OUTCOME_WORDS.items()
+        for outcome, words in OUTCOME_LABELS.items()
         if outcome in outcomes
     )
     return told if run.new else f"{told} (flown before)"

@@ -12,7 +12,7 @@ from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
-from airl_mav.report.rebuild import rebuild
+from airl_mav.report.run_report import write_report
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,13 @@ class Run:
         """Whether all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
-    def report(self) -> Path | None:
-        """Write the page and pictures of the run; return the page, None without episodes.
+    def report(self) -> Path:
+        """Write the page and pictures of the run; return the page.
 
         Raises:
-            UsageError: A profile of the run cannot be found any more.
+            UsageError: No episode was finished, or a profile of the run cannot be found any more.
         """
-        _, page = rebuild(self.path)
-        return page
+        return write_report(self.path)
 
 
 def load_run(path: Path | str) -> Run:

@@ -1,13 +1,13 @@
-"""The same seeds flown twice: what differs, with its interval and its number of pairs.
+"""Paired comparison of two runs on the same seeds, with 95 % intervals and numbers of pairs.
 
-Pairs by seed take out what the arenas add to the spread: two runs that differ little show it after
+Pairing by seed removes the spread that the arenas add: two runs that differ little show it after
 far fewer flights than two runs of different seeds.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,14 @@ from scipy import optimize, stats
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import BOOTSTRAP_SEED, CONFIDENCE, RESAMPLES, Estimate
+from airl_mav.flight.statistics import (
+    BOOTSTRAP_SEED,
+    CONFIDENCE,
+    NO_ESTIMATE,
+    RESAMPLES,
+    Estimate,
+    median_of,
+)
 
 Pair = tuple[EpisodeRecord, EpisodeRecord]
 """One seed: the flight of the reference, then the other one."""
@@ -49,19 +56,29 @@ class Change:
     other: float | None
     difference: Estimate
     """Other minus reference; its n is the number of pairs behind all three figures."""
+    median: Estimate | None = None
+    """Median over the pairs of the difference of each one [%]. One long flight moves a mean, but
+    not a median. None for the success rate."""
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """A run against a reference, by pairs of flights with the same seed."""
+class PairedComparison:
+    """A run against a reference, over pairs of flights with the same seed.
+
+    The difference of a mean is `100 (other - reference) / reference` percent, over the common
+    successes; that of the success rate is in percentage points, over all pairs.
+    """
 
     agreement: Agreement
     success_rate: Change
-    """Fractions, 0 to 1, over all pairs; their difference in percentage points."""
+    """Fractions, 0 to 1."""
     flight_time_s: Change
-    """Means over the common successes, as those below; differences in percent of the reference."""
     distance_m: Change
     energy_j: Change
+    """Of the vehicle, without its computer."""
+    computer_energy_j: Change
+    total_energy_j: Change
+    """Vehicle and computer together."""
 
 
 def pair_by_seed(
@@ -82,7 +99,7 @@ def _by_seed(episodes: Sequence[EpisodeRecord]) -> dict[int, EpisodeRecord]:
     flown = [episode for episode in episodes if episode.outcome is not Outcome.ABORTED]
     by_seed = {episode.seed: episode for episode in flown}
     if len(by_seed) != len(flown):
-        raise ValueError("a seed is there twice")
+        raise ValueError("a run holds a seed twice")
     return by_seed
 
 
@@ -130,7 +147,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     if min(gained, lost) < 0 or gained + lost > n:
         raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
     if n == 0:
-        return Estimate(None, None, None, 0)
+        return NO_ESTIMATE
     value = (gained - lost) / n
     z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
     # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
@@ -186,7 +203,7 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
         raise ValueError("reference: must be > 0")
     n = first.size
     if n == 0:
-        return Estimate(None, None, None, 0)
+        return NO_ESTIMATE
     value = float(_percent(first, second))
     if n == 1:
         return Estimate(value, None, None, 1)
@@ -212,7 +229,9 @@ def _percent(
     return difference
 
 
-def compare(reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) -> Comparison:
+def compare_pairs(
+    reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]
+) -> PairedComparison:
     """Compare a run with a reference on the seeds that both hold.
 
     Raises:
@@ -221,36 +240,70 @@ def compare(reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) 
     pairs = pair_by_seed(reference, other)
     agreement = count_agreement(pairs)
     good = common_successes(pairs)
-    return Comparison(
+
+    def change(metric: Callable[[Quality], float]) -> Change:
+        return compare_means([metric(a) for a, _ in good], [metric(b) for _, b in good])
+
+    return PairedComparison(
         agreement=agreement,
-        success_rate=_rates(agreement),
-        flight_time_s=_means([(a.flight_time_s, b.flight_time_s) for a, b in good]),
-        distance_m=_means([(a.distance_m, b.distance_m) for a, b in good]),
-        energy_j=_means([(a.energy_j, b.energy_j) for a, b in good]),
+        success_rate=_compare_rates(agreement),
+        flight_time_s=change(lambda quality: quality.flight_time_s),
+        distance_m=change(lambda quality: quality.distance_m),
+        energy_j=change(lambda quality: quality.energy_j),
+        computer_energy_j=change(lambda quality: quality.computer_energy_j),
+        total_energy_j=change(total_energy_j),
     )
 
 
-def _rates(agreement: Agreement) -> Change:
-    """Return both rates and their difference in percentage points."""
+def total_energy_j(quality: Quality) -> float:
+    """Return the energy of vehicle and computer together [J]."""
+    return quality.energy_j + quality.computer_energy_j
+
+
+def _compare_rates(agreement: Agreement) -> Change:
+    """Return both success rates and their difference in percentage points."""
     n = agreement.n
     if n == 0:
-        return Change(None, None, Estimate(None, None, None, 0))
+        return Change(None, None, NO_ESTIMATE)
     d = tango(agreement.only_other, agreement.only_reference, n)
     return Change(
         (agreement.both + agreement.only_reference) / n,
         (agreement.both + agreement.only_other) / n,
-        Estimate(_points(d.value), _points(d.low), _points(d.high), n),
+        d.scaled(100.0),
     )
 
 
-def _points(fraction: float | None) -> float | None:
-    return None if fraction is None else 100.0 * fraction
+def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
+    """Return how the means of paired values (n,) differ [%], and the median over the pairs.
+
+    There is no difference where a value of the reference is 0, as of a computer of no watts.
+    """
+    first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
+    if not first.size:
+        return Change(None, None, NO_ESTIMATE, NO_ESTIMATE)
+    means = float(first.mean()), float(second.mean())
+    if not (first > 0.0).all():
+        return Change(*means, NO_ESTIMATE, NO_ESTIMATE)
+    return Change(*means, relative_difference(first, second), median_ratio(first, second))
 
 
-def _means(values: Sequence[tuple[float, float]]) -> Change:
-    """Return both means and their difference in percent."""
-    first, second = np.array(values, np.float64).reshape(-1, 2).T
-    difference = relative_difference(first, second)
-    if not difference.n:
-        return Change(None, None, difference)
-    return Change(float(first.mean()), float(second.mean()), difference)
+def median_ratio(reference: ArrayLike, other: ArrayLike) -> Estimate:
+    """Return the median over pairs of `100 (other / reference - 1)` [%]; see `median_of`.
+
+    Args:
+        reference: Values (n,), > 0.
+        other: Values (n,) of the same seeds.
+    """
+    first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
+    return median_of(100.0 * (second / first - 1.0))
+
+
+def percent_change(reference: float, other: float) -> float:
+    """Return `100 (other - reference) / reference` [%]: above 0 where the other has more.
+
+    Raises:
+        ValueError: The reference is not > 0.
+    """
+    if not reference > 0.0:
+        raise ValueError(f"reference = {reference}: must be > 0")
+    return 100.0 * (other - reference) / reference

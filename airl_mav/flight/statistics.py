@@ -28,6 +28,17 @@ class Estimate:
     n: int
     """Number of episodes behind the figure."""
 
+    def scaled(self, factor: float) -> Estimate:
+        """Return the same in another unit."""
+        value, low, high = (
+            None if each is None else factor * each for each in (self.value, self.low, self.high)
+        )
+        return Estimate(value, low, high, self.n)
+
+
+NO_ESTIMATE = Estimate(None, None, None, 0)
+"""Nothing to work a figure out from."""
+
 
 @dataclass(frozen=True)
 class Aggregate:
@@ -39,6 +50,8 @@ class Aggregate:
     distance_m: Estimate
     energy_j: Estimate
     computer_energy_j: Estimate
+    total_energy_j: Estimate
+    """Vehicle and computer together."""
     mean_speed_m_s: Estimate
     outcomes: dict[Outcome, int]
     """Number of episodes by outcome, aborted ones included."""
@@ -47,7 +60,7 @@ class Aggregate:
 def wilson(successes: int, n: int) -> Estimate:
     """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927)."""
     if n == 0:
-        return Estimate(None, None, None, 0)
+        return NO_ESTIMATE
     interval = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(successes / n, float(interval.low), float(interval.high), n)
 
@@ -59,7 +72,7 @@ def bootstrap_mean(values: ArrayLike) -> Estimate:
     """
     data = np.asarray(values, np.float64)
     if not data.size:
-        return Estimate(None, None, None, 0)
+        return NO_ESTIMATE
     mean = float(data.mean())
     if data.size == 1:
         return Estimate(mean, None, None, 1)
@@ -86,7 +99,7 @@ def median_of(values: ArrayLike) -> Estimate:
     data = np.sort(np.asarray(values, np.float64))
     n = data.size
     if not n:
-        return Estimate(None, None, None, 0)
+        return NO_ESTIMATE
     # The greatest number of values that may be left out on either side.
     out = int(stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1
     middle = float(np.median(data))
@@ -112,6 +125,7 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
         distance_m=bootstrap_mean([quality.distance_m for quality in good]),
         energy_j=bootstrap_mean([quality.energy_j for quality in good]),
         computer_energy_j=bootstrap_mean([quality.computer_energy_j for quality in good]),
+        total_energy_j=bootstrap_mean([q.energy_j + q.computer_energy_j for q in good]),
         mean_speed_m_s=bootstrap_mean([quality.mean_speed_m_s for quality in good]),
         outcomes=outcomes,
     )

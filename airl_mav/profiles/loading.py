@@ -18,7 +18,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "studies", "conformance"]
+Kind = Literal[
+    "vehicles", "computers", "arenas", "training", "sweeps", "studies", "conformance", "published"
+]
 _SINGULAR: dict[Kind, str] = {
     "vehicles": "vehicle",
     "computers": "computer",
@@ -27,6 +29,7 @@ _SINGULAR: dict[Kind, str] = {
     "sweeps": "sweep",
     "studies": "study",
     "conformance": "conformance",
+    "published": "publication",
 }
 Model = TypeVar("Model", bound=BaseModel)
 

@@ -12,7 +12,7 @@ from airl_mav.latency.omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.tables import Column, TableView, ms, percentile_cell
+from airl_mav.report.table import Column, TableView, ms, percentile_cell
 
 
 def run_ages(run: LoadedRun) -> CommandAges:

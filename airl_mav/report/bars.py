@@ -11,9 +11,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.figures import quiet
-from airl_mav.report.palette import look
-from airl_mav.report.theme import INK, MARK, MUTED, Picture, new_figure, render
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    Picture,
+    label_axes,
+    legend_below,
+    line_style,
+    new_figure,
+    plain_axes,
+    render,
+)
 
 
 @dataclass(frozen=True)
@@ -53,33 +61,25 @@ def bars_picture(
         for i, bar in enumerate(group.bars):
             at = g + (i - 0.5 * (len(series) - 1)) * width
             if bar.rate.value is not None:
-                _draw_bar(ax, at, width, bar.rate, look(i).colour)
+                _draw_bar(ax, at, width, bar.rate, line_style(i).colour)
             if bar.paper_percent is not None:
                 marked = True
                 ax.plot(at, bar.paper_percent, marker="D", ms=6, color=MARK, mfc="none", mew=1.5)
     ax.set_xticks(np.arange(len(groups)), [group.name for group in groups])
     ax.set_ylim(0, 108)
     ax.set_yticks([0, 25, 50, 75, 100])
-    ax.set_ylabel(unit, fontsize=8.5, color=MUTED)
-    ax.set_title(title, loc="left", fontsize=10.5, color=INK, pad=6)
-    quiet(ax)
+    label_axes(ax, "", unit, title)
+    plain_axes(ax)
     ax.grid(False, axis="x")
     ax.tick_params(axis="x", labelsize=8.5, labelcolor=INK)
     handles: list[Patch | Line2D] = [
-        Patch(color=look(i).colour, label=text) for i, text in enumerate(series)
+        Patch(color=line_style(i).colour, label=text) for i, text in enumerate(series)
     ]
     if marked:
         handles.append(
             Line2D([], [], ls="none", marker="D", color=MARK, mfc="none", label="the paper")
         )
-    figure.legend(
-        handles=handles,
-        loc="outside lower left",
-        ncols=3,
-        frameon=False,
-        fontsize=8,
-        labelcolor=INK,
-    )
+    legend_below(figure, 3, handles=handles)
     told = ", ".join(group.name for group in groups)
     return render(figure, name, f"{title}: {', '.join(series)} in {told}")
 

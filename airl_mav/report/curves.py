@@ -8,9 +8,16 @@ from dataclasses import dataclass
 from matplotlib.axes import Axes
 
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.figures import quiet
-from airl_mav.report.palette import look
-from airl_mav.report.theme import INK, MARK, MUTED, Picture, new_figure, render
+from airl_mav.report.theme import (
+    MARK,
+    Picture,
+    label_axes,
+    legend_below,
+    line_style,
+    new_figure,
+    plain_axes,
+    render,
+)
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,7 @@ def curves_picture(
     figure = new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
     ax: Axes = figure.subplots()
     for index, line in enumerate(series):
-        colour, dashes = look(index)
+        colour, dashes = line_style(index)
         known = [(x, e) for x, e in line.points if e.value is not None]
         x = [at for at, _ in known]
         y = [e.value or 0.0 for _, e in known]
@@ -62,11 +69,9 @@ def curves_picture(
     if paper:
         at, values = zip(*paper, strict=True)
         ax.plot(at, values, ls="none", marker="D", ms=5, color=MARK, mfc="none", label="the paper")
-    ax.set_title(title, loc="left", fontsize=10.5, color=INK, pad=6)
-    ax.set_xlabel(labels[0], fontsize=8.5, color=MUTED)
-    ax.set_ylabel(labels[1], fontsize=8.5, color=MUTED)
+    label_axes(ax, *labels, title)
     ax.set_xlim(left=0.0)
-    quiet(ax)
-    figure.legend(loc="outside lower left", frameon=False, fontsize=8, labelcolor=INK)
+    plain_axes(ax)
+    legend_below(figure, 1)
     told = ", ".join(line.name for line in series)
     return render(figure, name, f"{title} over {labels[0]}: {told}")

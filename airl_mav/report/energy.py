@@ -13,9 +13,19 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import Power
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.figures import quiet
-from airl_mav.report.tables import NONE, OUTCOME_WORDS, Column, TableView, failures_first
-from airl_mav.report.theme import INK, MARK, MUTED, SERIES, SERIES_SOFT, Picture, new_figure, render
+from airl_mav.report.run_tables import failures_first
+from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    MUTED,
+    SERIES,
+    SERIES_SOFT,
+    Picture,
+    new_figure,
+    plain_axes,
+    render,
+)
 
 ENERGY_NAME = "energy"
 
@@ -145,7 +155,7 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     whole = flight.airframe_j + flight.computer_j
     return (
         f"{flight.record.index}",
-        OUTCOME_WORDS[flight.record.outcome],
+        OUTCOME_LABELS[flight.record.outcome],
         f"{time_s:.2f}",
         f"{flight.airframe_j / 1e3:.2f}",
         *parts,
@@ -195,7 +205,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
         step = -(-len(ranked) // 20)
         ax.set_xticks(x[::step], [f"{f.record.index}" for f in ranked[::step]])
     ax.set_xlabel(label, fontsize=8.5, color=MUTED)
-    quiet(ax)
+    plain_axes(ax)
     ax.grid(False, axis="x")
     figure.legend(
         loc="outside upper left", ncols=4, frameon=False, fontsize=8.5, labelcolor=INK,

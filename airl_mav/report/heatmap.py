@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -14,8 +15,17 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from airl_mav.report.figures import quiet
-from airl_mav.report.theme import INK, MARK, MUTED, RULE
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    MUTED,
+    RULE,
+    Picture,
+    label_axes,
+    new_figure,
+    plain_axes,
+    render,
+)
 
 CELL_WIDTH_IN, CELL_HEIGHT_IN = 1.12, 0.62
 MARGIN_IN = (1.15, 1.05)
@@ -49,11 +59,11 @@ class HeatMap:
     """Rows from bottom to top, columns from left to right; a field that is missing stays empty."""
 
     title: str
-    rows: Sequence[int]
+    rows: Sequence[int | str]
     row_title: str
-    columns: Sequence[int]
+    columns: Sequence[int | str]
     column_title: str
-    fields: Mapping[tuple[int, int], Field]
+    fields: Mapping[Any, Field]
     """By (row, column)."""
     unit: str
     limits: tuple[float, float]
@@ -76,6 +86,19 @@ def colours() -> Colormap:
     return ListedColormap(colormaps["YlGnBu"](np.linspace(0.06, 0.92, 256)), name="fields")
 
 
+def heat_picture(name: str, alt: str, heat: HeatMap) -> Picture:
+    """Draw a heat map by itself.
+
+    Args:
+        name: File name without suffix.
+        alt: What it shows.
+        heat: What to draw.
+    """
+    figure = new_figure(*heat.size_in)
+    draw_heat_map(figure, heat)
+    return render(figure, name, alt)
+
+
 def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
     """Draw a heat map with its colour bar; return the axes of the fields."""
     ax: Axes = figure.subplots()
@@ -88,12 +111,11 @@ def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
     ax.set_ylim(-0.5, len(heat.rows) - 0.5)
     ax.set_xticks(range(len(heat.columns)), [f"{column}" for column in heat.columns])
     ax.set_yticks(range(len(heat.rows)), [f"{row}" for row in heat.rows])
-    ax.set_xlabel(heat.column_title, fontsize=8.5, color=MUTED)
-    ax.set_ylabel(heat.row_title, fontsize=8.5, color=MUTED)
+    label_axes(ax, heat.column_title, heat.row_title)
     ax.set_title(heat.title, loc="left", fontsize=10.5, color=INK, pad=16 if heat.note else 6)
     if heat.note:
         ax.text(0.0, 1.0, heat.note, transform=ax.transAxes, va="bottom", fontsize=8.5, color=MUTED)
-    quiet(ax, grid=False)
+    plain_axes(ax, grid=False)
     ax.tick_params(labelsize=9, labelcolor=INK)
     bar = figure.colorbar(ScalarMappable(norm, shades), ax=ax, fraction=0.06, pad=0.02)
     bar.outline.set_visible(False)

@@ -18,8 +18,8 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.figures import OUTCOME_COLOURS, speed_colours
-from airl_mav.report.tables import OUTCOME_WORDS
+from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
+from airl_mav.report.table import OUTCOME_LABELS
 from airl_mav.report.theme import DARK
 
 POINTS = 240
@@ -77,7 +77,7 @@ def scene_json(
             "moving": _both(MOVING_COLOURS[0]),
         },
         "outcomes": {
-            outcome.value: {"words": OUTCOME_WORDS[outcome], "colour": _both(colour)}
+            outcome.value: {"words": OUTCOME_LABELS[outcome], "colour": _both(colour)}
             for outcome, colour in OUTCOME_COLOURS.items()
         },
         "arenas": described,

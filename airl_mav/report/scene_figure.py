@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Bounds, Shape
-from airl_mav.report.figures import (
+from airl_mav.report.run_figures import (
     OUTCOME_COLOURS,
     OUTCOME_MARKERS,
     coloured_pieces,
@@ -26,7 +26,7 @@ from airl_mav.report.figures import (
     speed_colours,
 )
 from airl_mav.report.scene import SceneFlight
-from airl_mav.report.tables import OUTCOME_WORDS
+from airl_mav.report.table import OUTCOME_LABELS
 from airl_mav.report.theme import HALO, INK, MUTED, RULE, Picture, new_figure, render
 
 SCENE_NAME = "flight-3d"
@@ -111,7 +111,7 @@ def scene_figure(flight: SceneFlight, top_speed: float) -> Picture:
         mew=0.9,
         ls="none",
         zorder=6,
-        label=f"end: {OUTCOME_WORDS[record.outcome]}",
+        label=f"end: {OUTCOME_LABELS[record.outcome]}",
     )
     ax.set_aspect("equal")
     ax.autoscale_view()
@@ -123,7 +123,7 @@ def scene_figure(flight: SceneFlight, top_speed: float) -> Picture:
     )  # fmt: skip
     speed_bar(bar)
     figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=8.5, labelcolor=INK)
-    words = f"{OUTCOME_WORDS[record.outcome]}, {record.reason}"
+    words = f"{OUTCOME_LABELS[record.outcome]}, {record.reason}"
     alt = f"Flight {record.index} in its arena, seen from above and behind the start: {words}"
     return render(figure, SCENE_NAME, alt)
 

@@ -9,11 +9,14 @@ from __future__ import annotations
 import base64
 import io
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from PIL import Image
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
@@ -133,3 +136,69 @@ def themed(svg: str) -> str:
     svg = _FONT.sub(r"\1 system-ui, sans-serif", svg)
     head = svg.index(">", svg.index("<svg")) + 1
     return svg[svg.index("<svg") : head] + style + svg[head:]
+
+
+def plain_axes(ax: Axes, *, grid: bool = True) -> None:
+    """Style an axes: thin rules, small ticks, no box."""
+    ax.set_facecolor("none")
+    ax.tick_params(colors=MUTED, labelsize=8, length=0, which="both")
+    for side, spine in ax.spines.items():
+        spine.set_visible(grid and side == "bottom")
+        spine.set_color(RULE)
+    if grid:
+        ax.grid(True, color=RULE, linewidth=0.6)
+        ax.set_axisbelow(True)
+
+
+def label_axes(ax: Axes, x: str, y: str = "", title: str = "") -> None:
+    """Set the labels of an axes, and its title if it has one."""
+    ax.set_xlabel(x, fontsize=8.5, color=MUTED)
+    if y:
+        ax.set_ylabel(y, fontsize=8.5, color=MUTED)
+    if title:
+        ax.set_title(title, loc="left", fontsize=10.5, color=INK, pad=6)
+
+
+def legend_below(figure: Figure | SubFigure, columns: int = 3, **options: Any) -> None:
+    """Put a legend under a figure."""
+    look: dict[str, Any] = {"frameon": False, "fontsize": 8, "labelcolor": INK}
+    figure.legend(loc="outside lower left", ncols=columns, **(look | options))
+
+
+class LineStyle(NamedTuple):
+    """How one of several lines or bars is drawn."""
+
+    colour: str
+    dashes: str
+    """A matplotlib line style: printed without colour, lines still differ."""
+
+
+LINE_COLOURS = (
+    *("#2f7fc4", "#cf6a12", "#2c9a5b", "#a35bb8"),
+    *("#c8435f", "#8d7b1c", "#1697a6", "#7d6b60"),
+)
+"""Of middling lightness: legible on light and on dark paper."""
+
+DASHES = ("-", "--", "-.", ":")
+
+
+def line_style(index: int) -> LineStyle:
+    """Return the style of the line with a number, from 0; 32 are different."""
+    step = index // len(LINE_COLOURS)
+    return LineStyle(LINE_COLOURS[index % len(LINE_COLOURS)], DASHES[(index + step) % len(DASHES)])
+
+
+def montage(pictures: Sequence[Picture], columns: int) -> bytes:
+    """Return one PNG with all pictures (one or more), row by row."""
+    images = [Image.open(io.BytesIO(picture.png)).convert("RGB") for picture in pictures]
+    rows = [images[start : start + columns] for start in range(0, len(images), columns)]
+    width = max(sum(image.width for image in row) for row in rows)
+    heights = [max(image.height for image in row) for row in rows]
+    whole = Image.new("RGB", (width, sum(heights)), PAPER)
+    for number, row in enumerate(rows):
+        for place, image in enumerate(row):
+            left = sum(before.width for before in row[:place])
+            whole.paste(image, (left, sum(heights[:number])))
+    png = io.BytesIO()
+    whole.save(png, format="png", optimize=True)
+    return png.getvalue()

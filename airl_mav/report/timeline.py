@@ -16,8 +16,8 @@ from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
 from airl_mav.latency.stages import STAGES, Samples, Stage
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.figures import long_tail, quiet
-from airl_mav.report.tables import US_PER_MS, Column, TableView, ms
+from airl_mav.report.run_figures import long_tail
+from airl_mav.report.table import US_PER_MS, Column, TableView, ms
 from airl_mav.report.theme import (
     INK,
     MARK,
@@ -28,6 +28,7 @@ from airl_mav.report.theme import (
     SERIES_SOFT,
     Picture,
     new_figure,
+    plain_axes,
     render,
 )
 
@@ -189,7 +190,7 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     elif np.ptp(found) == 0:
         value = found[0] / US_PER_MS
         ax.set_ylim(0.0, 2.0 * value if value > 0.0 else 1.0)
-    quiet(ax)
+    plain_axes(ax)
     ax.grid(False, axis="x")
 
 

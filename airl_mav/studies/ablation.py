@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -13,27 +14,26 @@ from rich.console import Console
 from airl_mav.cli import train
 from airl_mav.cli.cells import Cell
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.flight.paper import ABLATION
 from airl_mav.flight.statistics import Aggregate
+from airl_mav.profiles.published import load_published
 from airl_mav.report.bars import Bar, Group, bars_picture
-from airl_mav.report.tables import NONE, Column, TableView
+from airl_mav.report.document import Section
+from airl_mav.report.table import NONE, Column, TableView
+from airl_mav.studies.findings import Findings
 from airl_mav.studies.parts import (
     AGGREGATE,
-    facts_of,
-    made_of,
+    findings_of,
     quality_of,
     rate,
-    runs_of,
     slug,
 )
-from airl_mav.studies.sheet import Gallery, Section, Sheet
 from airl_mav.studies.study import Flown, Study, StudyConfig
 
 Sense = Literal["none", "velocity", "goal", "depth"]
 SENSES: tuple[Sense, ...] = get_args(Sense)
 """What is made zero; the paper's words for the goal: position."""
 
-SENSE_WORDS: dict[Sense, str] = {
+SENSE_LABELS: dict[Sense, str] = {
     "none": "all senses",
     "velocity": "no velocity",
     "goal": "no goal",
@@ -114,7 +114,7 @@ def cells(config: AblationConfig, root: Path) -> list[Cell]:
     return [
         Cell(
             _key(each, sense),
-            f"{each.layout} layout in {each.name}, {SENSE_WORDS[sense]}",
+            f"{each.layout} layout in {each.name}, {SENSE_LABELS[sense]}",
             config.command(each.found(root), each.arena, ablate=None if sense == "none" else sense),
         )
         for each in config.policies
@@ -122,19 +122,18 @@ def cells(config: AblationConfig, root: Path) -> list[Cell]:
     ]
 
 
-def sheet(config: AblationConfig, flown: Mapping[str, Flown]) -> Sheet:
+def findings(config: AblationConfig, flown: Mapping[str, Flown]) -> Findings:
     """Say which sense matters."""
     layouts = list(dict.fromkeys(each.layout for each in config.policies))
-    sections = [_section(config, layout, flown) for layout in layouts]
-    return Sheet(
-        key="ablation",
+    return findings_of(
+        "ablation",
+        config,
+        flown,
         title="Sensor ablation",
         question="Which of its senses does a policy need? One input is made zero, without training "
         "again.",
-        answers=tuple(_in_words(each, flown) for each in config.policies),
-        sections=tuple(sections),
-        facts=facts_of(config, flown),
-        runs=runs_of(flown),
+        answers=[_answer(each, flown) for each in config.policies],
+        sections=[section for layout in layouts for section in _sections(config, layout, flown)],
         data={
             "policies": [
                 {
@@ -151,7 +150,6 @@ def sheet(config: AblationConfig, flown: Mapping[str, Flown]) -> Sheet:
                 for each in config.policies
             ]
         },
-        provenance=made_of(flown),
     )
 
 
@@ -159,13 +157,15 @@ def _quality(each: PolicyConfig, sense: Sense, flown: Mapping[str, Flown]) -> Ag
     return quality_of(flown[_key(each, sense)])
 
 
-def _section(config: AblationConfig, layout: str, flown: Mapping[str, Flown]) -> Section:
+def _sections(
+    config: AblationConfig, layout: str, flown: Mapping[str, Flown]
+) -> tuple[Section, ...]:
     """Return a layout's tables and bars."""
     held = [each for each in config.policies if each.layout == layout]
     columns = (
         Column("arena", number=False),
         Column("policy", number=False),
-        *(Column(SENSE_WORDS[sense], "%") for sense in SENSES),
+        *(Column(SENSE_LABELS[sense], "%") for sense in SENSES),
     )
     rows: list[tuple[str, ...]] = []
     for each in held:
@@ -184,10 +184,11 @@ def _section(config: AblationConfig, layout: str, flown: Mapping[str, Flown]) ->
         "Obstacles it has one figure for velocity and position, for Dynamic Obstacles depth alone.",
     )
     title = f"Layout {layout}"
-    picture = bars_picture(
+    draw = partial(
+        bars_picture,
         f"ablation-{layout}",
         f"success, layout {layout}",
-        [SENSE_WORDS[sense] for sense in SENSES],
+        [SENSE_LABELS[sense] for sense in SENSES],
         [
             Group(
                 each.name,
@@ -202,11 +203,14 @@ def _section(config: AblationConfig, layout: str, flown: Mapping[str, Flown]) ->
     times = TableView(
         f"times-{layout}",
         f"Layout {layout}: flight time of those that reach the goal",
-        (Column("arena", number=False), *(Column(SENSE_WORDS[s], "s") for s in SENSES)),
+        (Column("arena", number=False), *(Column(SENSE_LABELS[s], "s") for s in SENSES)),
         tuple((each.name, *(_time(_quality(each, s, flown)) for s in SENSES)) for each in held),
     )
     success = TableView(f"success-{layout}", title, columns, tuple(rows), notes)
-    return Section(title, (success, times), (Gallery("Success by sense", (picture,)),))
+    return (
+        Section(title, tables=(success, times)),
+        Section("Success by sense", 3, draw=lambda: [draw()], in_terminal=False),
+    )
 
 
 def _time(quality: Aggregate) -> str:
@@ -215,19 +219,16 @@ def _time(quality: Aggregate) -> str:
 
 
 def _paper(arena: str, sense: Sense) -> float | None:
-    for known, rates in ABLATION.items():
-        if known == arena:
-            return rates.get(sense)
-    return None
+    return load_published().ablation.get(arena, {}).get(sense)
 
 
-def _in_words(each: PolicyConfig, flown: Mapping[str, Flown]) -> str:
+def _answer(each: PolicyConfig, flown: Mapping[str, Flown]) -> str:
     """Return the senses of a policy by what their loss costs."""
     rates = {
         sense: 100.0 * (_quality(each, sense, flown).success_rate.value or 0.0) for sense in SENSES
     }
     lost = sorted(SENSES[1:], key=lambda sense: rates[sense])
-    told = ", ".join(f"{SENSE_WORDS[sense]} {rates[sense]:.1f} %" for sense in lost)
+    told = ", ".join(f"{SENSE_LABELS[sense]} {rates[sense]:.1f} %" for sense in lost)
     return f"Layout {each.layout}, {each.name}: {rates['none']:.1f} % with all; {told}."
 
 
@@ -235,7 +236,7 @@ ABLATION_STUDY = Study(
     key="ablation",
     model=AblationConfig,
     cells=cells,
-    sheet=sheet,
+    findings=findings,
     quick={
         "episodes": 40,
         "policies": [

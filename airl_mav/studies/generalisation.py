@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from airl_mav.cli.cells import Cell
-from airl_mav.flight.paired import compare
-from airl_mav.flight.paper import ARENAS, BEST_OF_SWEEP, GENERALISATION
-from airl_mav.report.grid import grid_picture
-from airl_mav.report.matrix import Cell as MatrixCell
-from airl_mav.report.matrix import matrix_tables
-from airl_mav.report.tables import Column, TableView
+from airl_mav.flight.paired import compare_pairs
+from airl_mav.profiles.published import load_published
+from airl_mav.report.comparison.build import compare
+from airl_mav.report.comparison.matrix import matrix_tables, success_map
+from airl_mav.report.comparison.model import RunEntry
+from airl_mav.report.document import Section
+from airl_mav.report.heatmap import heat_picture
+from airl_mav.report.measures import with_interval
+from airl_mav.report.table import Column, TableView
+from airl_mav.studies.findings import Findings
 from airl_mav.studies.parts import (
     AGGREGATE,
-    facts_of,
-    made_of,
+    findings_of,
     quality_of,
-    runs_of,
     slug,
-    with_range,
 )
-from airl_mav.studies.sheet import Gallery, Section, Sheet
 from airl_mav.studies.study import Flown, Study, StudyConfig
 
 
@@ -64,71 +63,56 @@ def cells(config: GeneralisationConfig, _root: Path) -> list[Cell]:
     ]
 
 
-def sheet(config: GeneralisationConfig, flown: Mapping[str, Flown]) -> Sheet:
+def findings(config: GeneralisationConfig, flown: Mapping[str, Flown]) -> Findings:
     """Say who flies well where."""
-    matrix = [_matrix_cell(flown[_key(p, a)]) for p in config.policies for a in config.arenas]
-    rates = np.array(
-        [
-            [quality_of(flown[_key(p, a)]).success_rate.value or 0.0 for a in config.arenas]
-            for p in config.policies
-        ]
-    )
-    rows = [_name(policy) for policy in config.policies]
-    picture = grid_picture(
-        "generalisation",
-        "success [%]; a star: trained there",
-        rows,
-        [_name(arena) for arena in config.arenas],
-        100.0 * rates,
-        [
-            [
-                f"{100.0 * rates[r, c]:.1f}{'*' if _home(flown[_key(p, a)]) else ''}"
-                for c, a in enumerate(config.arenas)
-            ]
-            for r, p in enumerate(config.policies)
+    held = [flown[_key(p, a)] for p in config.policies for a in config.arenas]
+    matrix = compare(
+        {each.cell.key: each.run for each in held},
+        (),
+        kind="matrix",
+        entries=[
+            RunEntry(
+                each.cell.key,
+                each.held.folder,
+                label=each.held.policy.name,
+                group=each.held.arena_name,
+                rules=each.held.rules,
+                trained_in=_trained_in(each),
+            )
+            for each in held
         ],
-        (0.0, 100.0),
-    )
-    return Sheet(
-        key="generalisation",
+    ).runs
+    alt = "Success rate of every policy in every arena"
+    return findings_of(
+        "generalisation",
+        config,
+        flown,
         title="Generalisation",
         question="Does a policy fly well in arenas that it was not trained in?",
-        answers=tuple(_in_words(config, flown)),
+        answers=_answers(config, flown),
         sections=(
+            Section("Policies by arenas", tables=(*matrix_tables(matrix), _paper_table())),
             Section(
-                "Policies by arenas",
-                (*matrix_tables(matrix), _paper_table()),
-                (Gallery("Success at a glance", (picture,)),),
+                "Success at a glance",
+                3,
+                draw=lambda: [heat_picture("generalisation", alt, success_map(matrix))],
+                in_terminal=False,
             ),
         ),
-        facts=facts_of(config, flown),
-        runs=runs_of(flown),
         data={
             "policies": list(config.policies),
             "arenas": list(config.arenas),
             "cells": [
                 {
-                    "policy": cell.policy,
-                    "arena": cell.arena,
-                    "trained_in": cell.trained_in,
-                    "folder": cell.folder,
+                    "policy": cell.label,
+                    "arena": cell.entry.group,
+                    "trained_in": cell.entry.trained_in,
+                    "folder": cell.entry.folder,
                     **AGGREGATE.dump_python(cell.quality, mode="json"),
                 }
                 for cell in matrix
             ],
         },
-        provenance=made_of(flown),
-    )
-
-
-def _matrix_cell(flown: Flown) -> MatrixCell:
-    return MatrixCell(
-        policy=flown.held.policy.name,
-        arena=flown.held.arena_name,
-        folder=flown.held.folder,
-        trained_in=_trained_in(flown),
-        rules=flown.held.rules,
-        quality=quality_of(flown),
     )
 
 
@@ -144,22 +128,24 @@ def _home(flown: Flown) -> bool:
 
 def _paper_table() -> TableView:
     """Return the paper's table."""
+    published = load_published()
+    arenas = tuple(published.best_networks)
     columns = (
         Column("trained in", number=False),
-        *(Column(arena, "%") for arena in ARENAS),
+        *(Column(arena, "%") for arena in arenas),
     )
     rows = tuple(
         (
-            f"{arena} ({BEST_OF_SWEEP[arena][0]})",
-            *(f"{rates[flown_in]:.0f}" for flown_in in ARENAS),
+            f"{arena} ({published.best_networks[arena].network})",
+            *(f"{rates[flown_in]:.0f}" for flown_in in arenas),
         )
-        for arena, rates in GENERALISATION.items()
+        for arena, rates in published.generalisation.items()
     )
     notes = ("Section V.C, success by arena flown in.",)
     return TableView("the-paper", "The paper's generalisation table", columns, rows, notes)
 
 
-def _in_words(config: GeneralisationConfig, flown: Mapping[str, Flown]) -> list[str]:
+def _answers(config: GeneralisationConfig, flown: Mapping[str, Flown]) -> list[str]:
     """Return for every policy with an arena of its own how it does in easier and harder ones."""
     lines = []
     for policy in config.policies:
@@ -187,14 +173,14 @@ def _in_words(config: GeneralisationConfig, flown: Mapping[str, Flown]) -> list[
 
 def _against(home: Flown, away: Flown) -> str:
     """Return the difference in success from home, on the same seeds."""
-    change = compare(home.run.episodes, away.run.episodes).success_rate
-    return with_range(change.difference, 1.0, 1, "+")
+    change = compare_pairs(home.run.episodes, away.run.episodes).success_rate
+    return with_interval(change.difference, 1, "+")
 
 
 GENERALISATION_STUDY = Study(
     key="generalisation",
     model=GeneralisationConfig,
     cells=cells,
-    sheet=sheet,
+    findings=findings,
     quick={"episodes": 30},
 )

@@ -14,12 +14,11 @@ from airl_mav.cli.cells import Cell
 from airl_mav.cli.gap_command import GapCommand
 from airl_mav.cli.gap_plan import GapPlan, plan_gap
 from airl_mav.core.errors import UsageError
-from airl_mav.report.gap.build import GapStudy
-from airl_mav.report.gap.file import read_gap
-from airl_mav.report.gap.tables import all_tables
-from airl_mav.report.gap.words import answers
-from airl_mav.studies.parts import facts_of, fan_data, fan_gallery, fan_table, made_of, runs_of
-from airl_mav.studies.sheet import Section, Sheet
+from airl_mav.report.comparison.gap import gap_tables
+from airl_mav.report.comparison.model import Comparison, load_comparison
+from airl_mav.report.document import Section
+from airl_mav.studies.findings import Findings
+from airl_mav.studies.parts import fan_data, fan_gallery, fan_table, findings_of
 from airl_mav.studies.study import FanConfig, Flown, Study, StudyConfig
 
 GAP_FOLDER = "gap"
@@ -81,46 +80,40 @@ def _plan(config: MitigationConfig) -> GapPlan:
     return plan_gap(config.gap_command())
 
 
-def sheet(config: MitigationConfig, flown: Mapping[str, Flown]) -> Sheet:
+def findings(config: MitigationConfig, flown: Mapping[str, Flown]) -> Findings:
     """Say what mitigation does to the gap."""
-    study = _study(flown)
-    (arena,) = study.arenas
+    gap = _gap(flown)
+    (arena,) = gap.groups
     fans = [(each.cell.title.removesuffix(", one goal"), each) for each in flown.values()]
-    return Sheet(
-        key="mitigation",
+    return findings_of(
+        "mitigation",
+        config,
+        flown,
         title="Mitigation of the hardware gap",
         question="Does a policy that was trained as late as the onboard computer decides fly there "
         "as in training?",
-        answers=tuple(answers(study)),
+        answers=gap.answers,
         sections=(
-            Section("Hardware gap", tuple(all_tables(arena))),
-            Section(
-                "Flights to one goal",
-                (fan_table("Flights to one goal", fans),),
-                (fan_gallery("fan-mitigation", f"{config.fan.flights} flights each", fans),),
-            ),
+            Section("Hardware gap", tables=tuple(gap_tables(gap, arena))),
+            Section("Flights to one goal", tables=(fan_table("Flights to one goal", fans),)),
+            fan_gallery("fan-mitigation", f"{config.fan.flights} flights each", fans),
         ),
-        facts=(
-            *facts_of(config, flown),
-            ("the gap by itself", f"{GAP_FOLDER}/gap.html beside this page"),
-        ),
-        runs=runs_of(flown),
+        facts=(("the gap by itself", f"{GAP_FOLDER}/gap.html beside this page"),),
         data={"gap": f"{GAP_FOLDER}/gap.json", "one_goal": fan_data(fans)},
-        provenance=made_of(flown),
     )
 
 
-def _study(flown: Mapping[str, Flown]) -> GapStudy:
+def _gap(flown: Mapping[str, Flown]) -> Comparison:
     """Read the gap that was measured before."""
     root = next(iter(flown.values())).run.path.parent
-    return read_gap(root / GAP_FOLDER)
+    return load_comparison(root / GAP_FOLDER, "gap")
 
 
 MITIGATION_STUDY = Study(
     key="mitigation",
     model=MitigationConfig,
     cells=cells,
-    sheet=sheet,
+    findings=findings,
     quick={"episodes": 40, "fan": {"flights": 12}},
     prepare=prepare,
 )

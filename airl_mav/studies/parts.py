@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import re
+import shlex
+import sys
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from airl_mav.flight.gap import HardwareGap, MetricGap
-from airl_mav.flight.paired import Change
+from airl_mav.flight.paired import Change, PairedComparison
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Aggregate, Estimate, bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
-from airl_mav.report.compare.page import first_arena
-from airl_mav.report.fan import Panel, fan_pictures, fan_sheet
-from airl_mav.report.html import provenance
-from airl_mav.report.tables import NONE, Column, TableView, ms, rate_digits
-from airl_mav.studies.sheet import Gallery
+from airl_mav.report.document import Document, Facts, RunLink, Section, provenance_facts
+from airl_mav.report.flights_above import Panel, flight_pictures
+from airl_mav.report.loading import arena_of
+from airl_mav.report.measures import rate_with_interval, with_interval
+from airl_mav.report.table import NONE, Column, TableView
+from airl_mav.studies.findings import Findings
 from airl_mav.studies.study import Flown, StudyConfig
 
 AGGREGATE = TypeAdapter(Aggregate)
-GAP = TypeAdapter(HardwareGap)
+GAP = TypeAdapter(PairedComparison)
 ESTIMATE = TypeAdapter(Estimate)
 
 GAP_METRICS = (
@@ -31,28 +34,12 @@ GAP_METRICS = (
     ("distance_m", "distance"),
     ("energy_j", "energy, vehicle"),
 )
-"""Field of a `HardwareGap`, and its title."""
+"""Field of a `PairedComparison`, and its title."""
 
 
 def slug(text: str) -> str:
     """Return words as part of a folder's name."""
     return re.sub(r"[^\w.]+", "-", text).strip("-")
-
-
-def signed(value: float | None, digits: int = 1) -> str:
-    """Return a difference with its sign."""
-    return NONE if value is None else f"{value:+.{digits}f}"
-
-
-def with_range(estimate: Estimate, scale: float = 1.0, digits: int = 1, sign: str = "") -> str:
-    """Return a figure with its 95 % interval in brackets."""
-    if estimate.value is None:
-        return NONE
-    text = f"{scale * estimate.value:{sign}.{digits}f}"
-    if estimate.low is not None and estimate.high is not None:
-        low, high = scale * estimate.low, scale * estimate.high
-        text += f" [{low:{sign}.{digits}f}, {high:{sign}.{digits}f}]"
-    return text
 
 
 def change(estimate: Estimate, unit: str) -> str:
@@ -67,7 +54,7 @@ def change(estimate: Estimate, unit: str) -> str:
 
 def rate(estimate: Estimate) -> str:
     """Return a rate in percent with its interval."""
-    return with_range(estimate, 100.0, rate_digits(estimate))
+    return rate_with_interval(estimate)
 
 
 def percent(value: float | None, digits: int = 1) -> str:
@@ -85,40 +72,39 @@ def t2_of(flown: Flown) -> Summary:
     return flown.t2
 
 
-def t2_ms(flown: Flown) -> str:
-    """Return the mean latency t2 of a cell's decisions in ms."""
-    return ms(t2_of(flown).mean, 0)
-
-
-def metric(gap: HardwareGap, key: str) -> MetricGap:
-    """Return the gap of one metric."""
-    found: MetricGap = getattr(gap, key)
+def metric(gap: PairedComparison, key: str) -> Change:
+    """Return the difference of one metric."""
+    found: Change = getattr(gap, key)
     return found
 
 
-def gap_cells(gap: HardwareGap) -> tuple[str, ...]:
-    """Return a gap as cells: success, time, distance, energy, and its number of pairs."""
-    changes: list[Change] = [metric(gap, key).change for key, _ in GAP_METRICS]
-    return (
-        with_range(gap.success_rate.difference, 1.0, 1, "+"),
-        *(with_range(change.difference, 1.0, 1, "+") for change in changes),
-        f"{changes[0].difference.n:,}",
+def findings_of(
+    key: str,
+    config: StudyConfig,
+    flown: Mapping[str, Flown],
+    *,
+    title: str,
+    question: str,
+    answers: Sequence[str],
+    sections: Sequence[Section],
+    data: Mapping[str, Any],
+    facts: Facts = (),
+) -> Findings:
+    """Return what a study found, with what all of them say of their flights."""
+    first = next(iter(flown.values())).run.info
+    document = Document(
+        name="study",
+        title=title,
+        kicker="Study",
+        lead=question,
+        answers=tuple(answers),
+        sections=tuple(sections),
+        facts=(*facts_of(config, flown), *facts, ("command", shlex.join(["python", *sys.argv]))),
+        runs=tuple(RunLink(f.cell.title, f.held.folder, None) for f in flown.values()),
+        provenance=provenance_facts(first.machine, first.git, first.versions),
+        footer="figures as data in study.json beside this page",
     )
-
-
-GAP_COLUMNS = (
-    Column("success", "points"),
-    Column("flight time", "%"),
-    Column("distance", "%"),
-    Column("energy", "%"),
-    Column("pairs"),
-)
-"""Heads of `gap_cells`."""
-
-GAP_NOTE = (
-    "Differences on the same seeds, 95 % intervals in brackets; time, distance and energy over the "
-    "common successes, whose number is that of the pairs."
-)
+    return Findings(key, document, data)
 
 
 def facts_of(config: StudyConfig, flown: Mapping[str, Flown]) -> tuple[tuple[str, str], ...]:
@@ -134,16 +120,6 @@ def facts_of(config: StudyConfig, flown: Mapping[str, Flown]) -> tuple[tuple[str
         ("rules", "; ".join(rules)),
         ("between commands", first.run.info.setup.between_commands),
     )
-
-
-def runs_of(flown: Mapping[str, Flown]) -> tuple[tuple[str, str], ...]:
-    """Return title and folder of every cell."""
-    return tuple((each.cell.title, each.held.folder) for each in flown.values())
-
-
-def made_of(flown: Mapping[str, Flown]) -> list[tuple[str, str]]:
-    """Return machine and versions of the first cell."""
-    return provenance(next(iter(flown.values())).run.info)
 
 
 # --- fans: many flights to one goal
@@ -177,28 +153,25 @@ def aside(path: Trajectory, episode: EpisodeRecord) -> float:
     return float(np.abs(across).max(initial=0.0))
 
 
-def fan_gallery(prefix: str, title: str, fans: Sequence[tuple[str, Flown]]) -> Gallery:
+def fan_gallery(prefix: str, title: str, fans: Sequence[tuple[str, Flown]]) -> Section:
     """Draw fans side by side on the same axes."""
-    panels = []
-    for name, flown in fans:
-        success = quality_of(flown).success_rate
-        length = path_lengths(flown)
+
+    def panel(name: str, flown: Flown) -> Panel:
+        success, length = quality_of(flown).success_rate, path_lengths(flown)
         told = "" if length.value is None else f", mean path {length.value:.1f} m"
-        panels.append(
-            Panel(
-                title=name,
-                detail=f"{100.0 * (success.value or 0.0):.0f} % of {success.n} reached it{told}",
-                episodes=flown.run.episodes,
-                paths=flown.run.trajectories,
-                arena=first_arena(flown.run),
-            )
-        )
-    return Gallery(
+        detail = f"{100.0 * (success.value or 0.0):.0f} % of {success.n} reached it{told}"
+        run = flown.run
+        arena = arena_of(run, run.episodes[0])
+        return Panel(name, detail, run.episodes, run.trajectories, arena)
+
+    return Section(
         title,
-        tuple(fan_pictures(prefix, panels)),
-        "The same arena, start and goal in every flight, all panels on the same axes; obstacles "
-        "that move are drawn where they begin.",
-        (f"{prefix}.png", fan_sheet(panels)),
+        3,
+        draw=lambda: flight_pictures(prefix, [panel(*fan) for fan in fans]),
+        sheet=f"{prefix}.png",
+        note="The same arena, start and goal in every flight, all panels on the same axes; "
+        "obstacles that move are drawn where they begin.",
+        in_terminal=False,
     )
 
 
@@ -215,9 +188,9 @@ def fan_table(title: str, fans: Sequence[tuple[str, Flown]]) -> TableView:
         (
             name,
             rate(quality_of(flown).success_rate),
-            with_range(path_lengths(flown), 1.0, 2),
-            with_range(quality_of(flown).flight_time_s, 1.0, 2),
-            with_range(widest_aside(flown), 1.0, 2),
+            with_interval(path_lengths(flown), 2),
+            with_interval(quality_of(flown).flight_time_s, 2),
+            with_interval(widest_aside(flown), 2),
         )
         for name, flown in fans
     )

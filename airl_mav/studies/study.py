@@ -25,7 +25,8 @@ from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import pool, stage_samples
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.studies.sheet import DATA_FILE, Sheet, print_sheet, write_sheet
+from airl_mav.report.document import print_document
+from airl_mav.studies.findings import DATA_FILE, Findings, write_findings
 
 
 class StudyConfig(ProfileModel):
@@ -103,7 +104,7 @@ class Study(Generic[Config]):
     model: type[Config]
     cells: Callable[[Config, Path], Sequence[Cell]]
     """The cells, given the study's folder."""
-    sheet: Callable[[Config, Mapping[str, Flown]], Sheet]
+    findings: Callable[[Config, Mapping[str, Flown]], Findings]
     """What was found, given all cells by their key."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """What `--quick` changes in the configuration."""
@@ -168,9 +169,9 @@ def run_study(
         if cell.folder not in runs:
             runs[cell.folder] = load(root / cell.folder)
     flown = {cell.cell.key: Flown(cell.cell, cell, runs[cell.folder]) for cell in held}
-    sheet = study.sheet(config, flown)
-    page = write_sheet(sheet, root, shlex.join(["python", *sys.argv]))
-    print_sheet(sheet, console, page)
+    findings = study.findings(config, flown)
+    page = write_findings(findings, root, shlex.join(["python", *sys.argv]))
+    print_document(findings.document, console, page)
     return 0
 
 

@@ -9,30 +9,29 @@ from pydantic import Field, model_validator
 
 from airl_mav.cli.cells import Cell
 from airl_mav.core.fields import ProfileModel
-from airl_mav.flight.gap import HardwareGap, hardware_gap, relative_gap
-from airl_mav.flight.paper import SYSTEM_EVALUATION, PaperFigures, SystemEvaluation, gap_of
-from airl_mav.report.tables import NONE, Column, TableView
+from airl_mav.flight.paired import PairedComparison, compare_pairs, percent_change
+from airl_mav.profiles.published import PublishedRun, PublishedTable, load_published, published_gap
+from airl_mav.report.comparison.tables import signed
+from airl_mav.report.document import Section
+from airl_mav.report.measures import with_interval
+from airl_mav.report.table import NONE, Column, TableView
+from airl_mav.studies.findings import Findings
 from airl_mav.studies.parts import (
     AGGREGATE,
     GAP,
     GAP_METRICS,
     change,
-    facts_of,
     fan_data,
     fan_gallery,
     fan_table,
-    made_of,
+    findings_of,
     metric,
     percent,
     quality_of,
     rate,
-    runs_of,
-    signed,
     slug,
     t2_of,
-    with_range,
 )
-from airl_mav.studies.sheet import Section, Sheet
 from airl_mav.studies.study import FanConfig, Flown, Study, StudyConfig
 
 
@@ -107,31 +106,26 @@ def _fan_key(each: ArenaConfig, computer: str) -> str:
     return f"{_key(each, computer)}-one-goal"
 
 
-def sheet(config: SystemConfig, flown: Mapping[str, Flown]) -> Sheet:
+def findings(config: SystemConfig, flown: Mapping[str, Flown]) -> Findings:
     """Say what the onboard computer costs in each arena."""
     sections, answers, data = [], [], []
     for each in config.arenas:
         first, second = (flown[_key(each, computer)] for computer in config.computers)
-        gap = hardware_gap(first.run.episodes, second.run.episodes)
-        paper = next((p for arena, p in SYSTEM_EVALUATION.items() if arena == each.name), None)
+        gap = compare_pairs(first.run.episodes, second.run.episodes)
+        paper = _published(each.name)
         fans = [(Path(c).stem, flown[_fan_key(each, c)]) for c in config.computers]
         tables = [_table(config, each, first, second, gap)]
         if paper is not None:
             tables.append(_paper_table(paper))
-        sections.append(
+        title = f"{each.name}: {each.fan.flights} flights to one goal"
+        sections += [
             Section(
                 each.name,
-                (*tables, fan_table(f"{each.name}: flights to one goal", fans)),
-                (
-                    fan_gallery(
-                        f"fan-{slug(each.name)}",
-                        f"{each.name}: {each.fan.flights} flights to one goal",
-                        fans,
-                    ),
-                ),
-            )
-        )
-        answers.append(_in_words(each, first, second, gap, paper))
+                tables=(*tables, fan_table(f"{each.name}: flights to one goal", fans)),
+            ),
+            fan_gallery(f"fan-{slug(each.name)}", title, fans),
+        ]
+        answers.append(_answer(each, first, second, gap, paper))
         data.append(
             {
                 "arena": each.arena,
@@ -144,24 +138,32 @@ def sheet(config: SystemConfig, flown: Mapping[str, Flown]) -> Sheet:
                 "one_goal": fan_data(fans),
             }
         )
-    return Sheet(
-        key="system",
+    return findings_of(
+        "system",
+        config,
+        flown,
         title="System evaluation",
         question="What does each arena's policy lose on the onboard computer?",
-        answers=tuple(answers),
-        sections=tuple(sections),
-        facts=(
-            *facts_of(config, flown),
-            ("computers", f"{config.reference} (the reference), {config.target}"),
-        ),
-        runs=runs_of(flown),
+        answers=answers,
+        sections=sections,
+        facts=(("computers", f"{config.reference} (the reference), {config.target}"),),
         data={"reference": config.reference, "target": config.target, "arenas": data},
-        provenance=made_of(flown),
     )
 
 
+def _published(arena: str) -> PublishedTable | None:
+    """Return the published system evaluation in an arena, if there is one."""
+    tables = load_published().tables
+    return next((t for t in tables if t.arena == arena and t.title.startswith("system")), None)
+
+
+def _columns(paper: PublishedTable) -> tuple[PublishedRun, PublishedRun]:
+    """Return the columns of reference and target."""
+    return paper.columns["reference"], paper.columns["target"]
+
+
 def _table(
-    config: SystemConfig, each: ArenaConfig, first: Flown, second: Flown, gap: HardwareGap
+    config: SystemConfig, each: ArenaConfig, first: Flown, second: Flown, gap: PairedComparison
 ) -> TableView:
     """Return both computers side by side, each by itself, and the gap on the same seeds."""
     reference, target = (Path(computer).stem for computer in config.computers)
@@ -174,7 +176,7 @@ def _table(
     )
     a, b = quality_of(first), quality_of(second)
     t2 = t2_of(first).mean, t2_of(second).mean
-    slower = NONE if not t2[0] or t2[1] is None else f"{relative_gap(t2[0], t2[1]):+,.0f} %"
+    slower = NONE if not t2[0] or t2[1] is None else f"{percent_change(t2[0], t2[1]):+,.0f} %"
     success = gap.success_rate.difference
     rows = [
         ("mean t2 [ms]", *(NONE if x is None else f"{x / 1e3:.1f}" for x in t2), slower, NONE),
@@ -193,9 +195,9 @@ def _table(
         ("computer_energy_j", "energy, computer", "kJ", 1e-3),
         ("total_energy_j", "energy, both", "kJ", 1e-3),
     ):
-        both = metric(gap, key).change
+        both = metric(gap, key)
         own = (
-            (with_range(getattr(q, key), scale, 2) for q in (a, b))
+            (with_interval(getattr(q, key).scaled(scale), 2) for q in (a, b))
             if hasattr(a, key)
             else (
                 percent(None if m is None else scale * m, 2) for m in (both.reference, both.other)
@@ -219,19 +221,18 @@ def _table(
     return TableView(slug(title), title, columns, tuple(rows), notes)
 
 
-def _paper_table(paper: SystemEvaluation) -> TableView:
+def _paper_table(paper: PublishedTable) -> TableView:
     """Return the paper's table, its gaps by our definition and as it prints them."""
     columns = (
         Column("the paper", number=False),
-        Column(paper.reference.label),
-        Column(paper.target.label),
+        *(Column(column.label) for column in _columns(paper)),
         Column("gap"),
         Column("as printed"),
     )
-    gaps = gap_of(paper.reference, paper.target)
+    gaps = published_gap(*_columns(paper))
 
     def row(title: str, field: str, digits: int, gap: float, printed: float) -> tuple[str, ...]:
-        values = (_of(figures, field) for figures in (paper.reference, paper.target))
+        values = (_of(figures, field) for figures in _columns(paper))
         unit = "points" if field == "success_percent" else "%"
         return (
             title,
@@ -240,7 +241,7 @@ def _paper_table(paper: SystemEvaluation) -> TableView:
             f"{printed:g} {unit}",
         )
 
-    printed = paper.printed
+    printed = paper.printed["target"]
     rows = (
         row(
             "latency [ms]",
@@ -260,36 +261,37 @@ def _paper_table(paper: SystemEvaluation) -> TableView:
         row("distance [m]", "distance_m", 2, gaps.distance_percent, printed.distance_percent),
         row("energy, vehicle [kJ]", "energy_kj", 2, gaps.energy_percent, printed.energy_percent),
     )
-    notes = (f"The paper's {paper.table}; its best policy there: {paper.policy}.",)
-    return TableView(slug(paper.table), f"The paper: {paper.table}", columns, rows, notes)
+    notes = (f"The paper's {paper.title}; its best policy there: {paper.policy}.",)
+    return TableView(slug(paper.title), f"The paper: {paper.title}", columns, rows, notes)
 
 
-def _of(figures: PaperFigures, field: str) -> float | None:
+def _of(figures: PublishedRun, field: str) -> float | None:
     value: float | None = getattr(figures, field)
     return value
 
 
-def _in_words(
+def _answer(
     each: ArenaConfig,
     first: Flown,
     second: Flown,
-    gap: HardwareGap,
-    paper: SystemEvaluation | None,
+    gap: PairedComparison,
+    paper: PublishedTable | None,
 ) -> str:
     told = ", ".join(
-        f"{title} {change(metric(gap, key).change.difference, '%')}" for key, title in GAP_METRICS
+        f"{title} {change(metric(gap, key).difference, '%')}" for key, title in GAP_METRICS
     )
     a, b = (quality_of(side).success_rate for side in (first, second))
-    pairs = metric(gap, "flight_time_s").change.difference.n
+    pairs = metric(gap, "flight_time_s").difference.n
     sentence = (
         f"{each.name}: success {rate(a)} to {rate(b)} %; on the {pairs:,} common successes {told}."
     )
     if paper is None:
         return sentence
-    gaps = gap_of(paper.reference, paper.target)
+    gaps = published_gap(*_columns(paper))
+    success = (f"{column.success_percent:g}" for column in _columns(paper))
     return (
-        f"{sentence} The paper: success {paper.reference.success_percent:g} to "
-        f"{paper.target.success_percent:g} %, {signed(gaps.flight_time_percent)}, "
+        f"{sentence} The paper: success {' to '.join(success)} %, "
+        f"{signed(gaps.flight_time_percent)}, "
         f"{signed(gaps.distance_percent)}, {signed(gaps.energy_percent)} %."
     )
 
@@ -298,6 +300,6 @@ SYSTEM_STUDY = Study(
     key="system",
     model=SystemConfig,
     cells=cells,
-    sheet=sheet,
+    findings=findings,
     quick={"episodes": 40},
 )

@@ -12,10 +12,10 @@ from scipy import stats
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import write_json
-from airl_mav.flight.paper import BEST_OF_SWEEP
 from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
 from airl_mav.profiles.computer import ComputerProfile, Latency
+from airl_mav.profiles.published import load_published
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
@@ -116,12 +116,10 @@ class Sweep:
         return sum(cell.planned for cell in self.cells)
 
 
-def paper_best(arena: str) -> tuple[str, float] | None:
-    """Return network and success rate, 0 to 1, of the paper's best cell in an arena."""
-    for name, (network, percent) in BEST_OF_SWEEP.items():
-        if name == arena:
-            return network, percent / 100.0
-    return None
+def published_best(arena: str) -> tuple[str, float] | None:
+    """Return network and success rate, 0 to 1, of the published best network in an arena."""
+    best = load_published().best_networks.get(arena)
+    return None if best is None else (best.network, best.success_percent / 100.0)
 
 
 def _rate(cell: Cell) -> float:
@@ -223,7 +221,7 @@ def write_sweep(sweep: Sweep) -> None:
 
 
 def _best(sweep: Sweep, arena: str) -> dict[str, Any] | None:
-    best, paper = sweep.best(arena), paper_best(arena)
+    best, paper = sweep.best(arena), published_best(arena)
     if best is None:
         return None
     return {

@@ -271,9 +271,9 @@ FORKS = """
 import json, os, sys
 from airl_mav.cli import evaluate_task, main, report
 from airl_mav.rehearsal import chunks
-from airl_mav.report import html
+from airl_mav.report import run_page
 
-chunks.EVERY_S, chunks.PAUSE, html.MAX_PICTURED = 0.02, 0.0, 1
+chunks.EVERY_S, chunks.PAUSE, run_page.MAX_PICTURED = 0.02, 0.0, 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:
         exec(script)

@@ -41,9 +41,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal import chunks, run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
-from airl_mav.report import html
-from airl_mav.report.rebuild import rebuild
-from airl_mav.scenario.model import Ports
+from airl_mav.report import run_page
+from airl_mav.report.run_report import write_report
 from tests.support.linear_policy import ACTIONS, SPEC, weights, write_linear
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, wait_until
@@ -55,7 +54,7 @@ DENSE: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "s
 
 
 def no_page(run_: LoadedRun, *_: Any, **__: Any) -> Path:
-    """Stand in for `build_report`, where a test looks at the printed table alone."""
+    """Stand in for `build_page`, where a test looks at the printed table alone."""
     return run_.path / "report.html"
 
 
@@ -70,10 +69,10 @@ def evaluate(
     command = EvaluateCommand(policies=tuple(str(policy) for policy in policies), **options)
     with ExitStack() as stack:
         if table:
-            stack.enter_context(patch("airl_mav.report.rebuild.build_report", no_page))
+            stack.enter_context(patch("airl_mav.report.run_report.build_page", no_page))
         elif not page:
             stack.enter_context(patch("airl_mav.cli.report.run"))
-            stack.enter_context(patch("airl_mav.report.rebuild.rebuild"))
+            stack.enter_context(patch("airl_mav.report.run_report.write_report"))
         code = run(command, console)
     return code, console.export_text()
 
@@ -98,7 +97,7 @@ def same_runs(one: LoadedRun, other: LoadedRun) -> bool:
 @pytest.fixture(scope="module", autouse=True)
 def _few_pictures() -> Iterator[None]:
     """Pictures take longer than flights."""
-    with patch.object(html, "MAX_PICTURED", 3):
+    with patch.object(run_page, "MAX_PICTURED", 3):
         yield
 
 
@@ -354,9 +353,9 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
         assert absent not in text
     # Seven stages and their timeline, energy, all flights, the worst in space; a map and a time
     # figure for each flight that is pictured.
-    assert html.MAX_PICTURED < EPISODES
-    assert page.images == 7 + 4 + 2 * html.MAX_PICTURED
-    assert f"Pictures of {html.MAX_PICTURED} of {EPISODES} flights" in page.words
+    assert run_page.MAX_PICTURED < EPISODES
+    assert page.images == 7 + 4 + 2 * run_page.MAX_PICTURED
+    assert f"Pictures of {run_page.MAX_PICTURED} of {EPISODES} flights" in page.words
     pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
     assert pictured >= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
 
@@ -366,10 +365,10 @@ def test_a_long_table_is_cut_short_and_says_so(
 ) -> None:
     run_, text = greedy
     assert f"25 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in text
-    monkeypatch.setattr(html, "MAX_LISTED", 5)
-    monkeypatch.setattr(html, "MAX_PICTURED", 1)
+    monkeypatch.setattr(run_page, "MAX_LISTED", 5)
+    monkeypatch.setattr(run_page, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
-    _, path = rebuild(tmp_path / "copy")
+    path = write_report(tmp_path / "copy")
     assert path is not None
     page = Page(path.read_text(encoding="utf-8"))
     assert f"5 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in page.words
@@ -428,10 +427,10 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
 SCRIPT = """
 import sys
 from airl_mav.rehearsal import chunks
-from airl_mav.report import rebuild
+from airl_mav.report import run_report
 chunks.EVERY_S, chunks.MOST = 60.0, 5
 # The table is printed; the page takes longer than the flights.
-rebuild.build_report = lambda run, *_, **__: run.path / "report.html"
+run_report.build_page = lambda run, *_, **__: run.path / "report.html"
 from airl_mav.cli.main import main
 main()
 """
@@ -637,20 +636,22 @@ def test_seeds_of_the_training_are_pointed_out(tmp_path: Path) -> None:
 def test_a_table_of_policies_and_arenas(
     linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "MAX_PICTURED", 0)
+    monkeypatch.setattr(run_page, "MAX_PICTURED", 0)
     out, arenas = tmp_path / "matrix", ("no-obstacles", "static-obstacles")
     code, text = evaluate("greedy", linear, arena=arenas, episodes=8, seed=3, page=True, out=out)
     assert code == 0
     told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
-    assert (told["schema"], told["level"], told["episodes"], told["seed"]) == (1, "gym", 8, 3)
-    assert [(c["policy"], c["arena"]) for c in told["cells"]] == [
+    facts = told["facts"]
+    assert (told["schema"], facts["level"], facts["episodes"], facts["seed"]) == (2, "gym", 8, 3)
+    cells = [{**run["entry"], **run["quality"]} for run in told["runs"]]
+    assert [(c["label"], c["group"]) for c in cells] == [
         ("greedy", "no-obstacles"),
         ("greedy", "static-obstacles"),
         ("linear", "no-obstacles"),
         ("linear", "static-obstacles"),
     ]
     markdown = (out / "matrix.md").read_text(encoding="utf-8")
-    for cell in told["cells"]:
+    for cell in cells:
         run_ = load(out / cell["folder"])
         assert [e.seed for e in run_.episodes] == list(range(3, 11))
         reached = sum(e.outcome is Outcome.SUCCESS for e in run_.episodes)
@@ -658,7 +659,7 @@ def test_a_table_of_policies_and_arenas(
         assert cell["success_rate"]["value"] == reached / 8
         assert cell["success_rate"]["low"] == pytest.approx(low)
         shown = f"{100 * reached / 8:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
-        star = " *" if (cell["policy"], cell["arena"]) == ("linear", "no-obstacles") else ""
+        star = " *" if (cell["label"], cell["group"]) == ("linear", "no-obstacles") else ""
         assert shown in text
         assert shown.replace("[", "\\[").replace("]", "\\]") + star.replace("*", "\\*") in markdown
         assert (out / cell["folder"] / "report.html").exists()
@@ -688,10 +689,10 @@ def test_a_table_goes_on_where_it_was_left(
     assert code == 130
     assert "interrupted" in text
     told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
-    assert len(told["cells"]) == 2
+    assert len(told["runs"]) == 2
     assert evaluate("greedy", linear, **options)[0] == 0
     told = json.loads((out / "matrix.json").read_text(encoding="utf-8"))
-    assert [c["success_rate"]["n"] for c in told["cells"]] == [5, 5, 5, 5]
+    assert [r["quality"]["success_rate"]["n"] for r in told["runs"]] == [5, 5, 5, 5]
 
 
 def test_arenas_are_those_of_the_trainings(linear: Path, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card
 from airl_mav.rehearsal.evaluation import Evaluation
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
-from airl_mav.report import html
+from airl_mav.report import run_page
 from tests.flight.test_evaluate import Page, same_runs
 from tests.support.linear_policy import write_linear
 from tests.support.processes import Running, is_running, running, wait_until
@@ -48,7 +48,7 @@ def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple
     with ExitStack() as stack:
         if not page:
             stack.enter_context(patch("airl_mav.cli.report.run"))
-            stack.enter_context(patch("airl_mav.report.rebuild.rebuild"))
+            stack.enter_context(patch("airl_mav.report.run_report.write_report"))
         code = run(command, console)
     return code, console.export_text()
 
@@ -56,7 +56,7 @@ def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple
 @pytest.fixture(scope="module", autouse=True)
 def _few_pictures() -> Iterator[None]:
     """Pictures take longer than flights."""
-    with patch.object(html, "MAX_PICTURED", 1):
+    with patch.object(run_page, "MAX_PICTURED", 1):
         yield
 
 
@@ -148,8 +148,8 @@ def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> 
     code, text = evaluate("greedy", arena=arenas, episodes=1, workers=1, out=tmp_path / "m")
     assert code == 0
     told = json.loads((tmp_path / "m" / "matrix.json").read_text())
-    assert told["level"] == "lockstep"
-    assert [c["success_rate"]["n"] for c in told["cells"]] == [1, 1]
+    assert told["facts"]["level"] == "lockstep"
+    assert [r["quality"]["success_rate"]["n"] for r in told["runs"]] == [1, 1]
     assert len(re.findall(r"sha256 of the flights  [0-9a-f]{64}\n", text)) == 2
     assert load(tmp_path / "m" / f"greedy-{ARENA}").episodes == reference[0].episodes[:1]
 

@@ -25,8 +25,9 @@ from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import list_profiles
+from airl_mav.report.document import write_document
 from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_map
-from airl_mav.report.sweep.page import build_page
+from airl_mav.report.sweep import document_of
 from airl_mav.report.theme import new_figure, render_png
 from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.size_fit import fit_times, neighbours
@@ -388,7 +389,7 @@ def test_the_page_holds_every_cell_and_names_the_best_and_the_papers(
     asked = None if computer is None else Computer(computer, load_computer(computer))
     sweep = summarize(folder, MADE, asked)
     write_sweep(sweep)
-    page = build_page(sweep).read_text(encoding="utf-8")
+    page = write_document(document_of(sweep), tmp_path).read_text(encoding="utf-8")
     data = json.loads((tmp_path / "sweep.json").read_text(encoding="utf-8"))
     assert (data["trials_ended"], data["trials_planned"]) == (89, 90)
     assert len(data["cells"]) == 45
@@ -412,5 +413,5 @@ def test_the_page_holds_every_cell_and_names_the_best_and_the_papers(
     # Opens offline.
     assert not re.findall(r"(?:src|href)=\"(?!data:)[^\"]+\"", page)
     assert ("t2, estimated" in page) == (computer is not None)
-    for file in ("sweep.md", "sweep.png"):
+    for file in ("sweep.md", "sweep-no-obstacles.png", "sweep-trade-off.png"):
         assert (tmp_path / file).stat().st_size > 1000

@@ -20,19 +20,19 @@ from airl_mav.cli.report import run
 from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
-from airl_mav.rehearsal.run_folder import RunFolder
-from airl_mav.report.compare.build import Compared, keyed, lettered, load_compared
-from airl_mav.report.compare.figures import _steps
-from airl_mav.report.compare.page import build_comparison, panel_of
-from airl_mav.report.compare.tables import (
-    flown_table,
-    latency_table,
-    pairing_tables,
-    pairs_in_words,
-    quality_table,
+from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder
+from airl_mav.report.comparison.figures import cumulated, flight_panels
+from airl_mav.report.comparison.model import Comparison
+from airl_mav.report.comparison.runs import compare_folders
+from airl_mav.report.comparison.show import write_comparison
+from airl_mav.report.comparison.tables import (
+    facts_table,
+    pair_sentences,
+    runs_table,
+    stages_table,
 )
-from airl_mav.report.fan import fan_pictures
-from airl_mav.report.palette import look
+from airl_mav.report.flights_above import flight_pictures
+from airl_mav.report.theme import line_style
 from tests.report.test_report import Page
 from tests.support.run_demo import demo_setup, write_demo_run
 
@@ -61,13 +61,20 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def compared(runs: dict[str, Path]) -> Compared:
-    return load_compared(list(runs.values()), [f"the flights of {name}" for name in runs])
+def loaded(runs: dict[str, Path]) -> tuple[Comparison, dict[str, LoadedRun]]:
+    return compare_folders(list(runs.values()), [f"the flights of {name}" for name in runs])
 
 
 @pytest.fixture(scope="module")
-def page(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_comparison(compared, tmp_path_factory.mktemp("page"))
+def compared(loaded: tuple[Comparison, dict[str, LoadedRun]]) -> Comparison:
+    return loaded[0]
+
+
+@pytest.fixture(scope="module")
+def page(
+    loaded: tuple[Comparison, dict[str, LoadedRun]], tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    return write_comparison(*loaded, tmp_path_factory.mktemp("page"))
 
 
 def lines(path: Path) -> dict[int, dict[str, Any]]:
@@ -78,11 +85,11 @@ def lines(path: Path) -> dict[int, dict[str, Any]]:
 
 def test_differences_are_those_of_the_files(runs: dict[str, Path], page: Path) -> None:
     data = json.loads((page.parent / "compare.json").read_text())
-    assert data["schema"] == 1
+    assert data["schema"] == 2
     first, second = lines(runs["fast"]), lines(runs["slow"])
-    found = data["comparisons"][0]
+    found = data["contrasts"][0]["paired"]
     reached = [(first[s]["outcome"] == "success", second[s]["outcome"] == "success") for s in first]
-    assert found["pairs"] == len(reached) == EPISODES
+    assert sum(found["agreement"].values()) == len(reached) == EPISODES
     assert found["agreement"]["only_reference"] == sum(a and not b for a, b in reached) > 0
     rates = np.mean(reached, axis=0)
     difference = found["success_rate"]["difference"]
@@ -98,61 +105,62 @@ def test_differences_are_those_of_the_files(runs: dict[str, Path], page: Path) -
         assert found[key]["difference"]["n"] == len(common)
 
 
-def test_only_the_same_episode_makes_a_pair(compared: Compared) -> None:
-    slow, later, elsewhere, apart = compared.pairings
-    assert (slow.pairs, slow.strangers) == (EPISODES, 0)
+def test_only_the_same_episode_makes_a_pair(compared: Comparison) -> None:
+    slow, later, elsewhere, apart = compared.contrasts
+    assert (slow.pairs, slow.unmatched) == (EPISODES, 0)
     # Seeds 34 to 43 of 20 to 43.
-    assert (later.pairs, later.strangers) == (10, 0)
+    assert (later.pairs, later.unmatched) == (10, 0)
     # The same seeds, other arenas and goals.
-    assert (elsewhere.pairs, elsewhere.strangers) == (0, 4)
-    assert (apart.pairs, apart.strangers) == (0, 0)
-    said = pairs_in_words(compared)
+    assert (elsewhere.pairs, elsewhere.unmatched) == (0, 4)
+    assert (apart.pairs, apart.unmatched) == (0, 0)
+    said = pair_sentences(compared)
     assert "24 pairs" in said[0]
     assert "share no episode" in said[2]
     assert "4 flights" in said[2]
     assert "share no episode" in said[3]
-    assert len(pairing_tables(compared)) == 2
 
 
 def test_only_what_differs_is_told_side_by_side(runs: dict[str, Path]) -> None:
-    compared = load_compared([runs["fast"], runs["slow"]])
+    compared = compare_folders([runs["fast"], runs["slow"]])[0]
     assert set(compared.different) >= {"computer", "decision latency t2"}
     assert not {"policy", "arena", "seeds", "level", "goal radius"} & set(compared.different)
     assert compared.same["seeds"] == "20 to 43"
     assert compared.same["hold t3"] == "0.5 s"
-    view = flown_table(compared)
-    assert [column.title for column in view.columns] == ["", *(s.name for s in compared.sides)]
+    view = facts_table(compared)
+    assert [column.title for column in view.columns] == ["", *(r.heading for r in compared.runs)]
     for row in view.rows:
         assert len(set(row[1:])) > 1, row[0]
-    many = load_compared(list(runs.values()))
-    assert flown_table(many).columns[0].title == "run"
+    many = compare_folders(list(runs.values()))[0]
+    assert facts_table(many).columns[0].title == "run"
 
 
 def test_names_tell_runs_apart(runs: dict[str, Path], tmp_path: Path) -> None:
-    names = [s.name for s in load_compared([runs["fast"], runs["slow"]]).sides]
+    names = [s.name for s in compare_folders([runs["fast"], runs["slow"]])[0].runs]
     assert names == ["workstation", "ras-pi-4, 396 ms"]
     # Nothing but the seeds differs: folders.
-    assert [s.name for s in load_compared([runs["fast"], runs["later"]]).sides] == ["fast", "later"]
-    given = load_compared([runs["fast"], runs["slow"]], ("desk", "drone"))
-    assert [p.name for p in given.pairings] == ["drone"]
-    assert lettered(given) == given == keyed(given)
+    assert [s.name for s in compare_folders([runs["fast"], runs["later"]])[0].runs] == [
+        "fast",
+        "later",
+    ]
+    given = compare_folders([runs["fast"], runs["slow"]], ("desk", "drone"))[0]
+    assert [c.entry.target for c in given.contrasts] == ["drone"]
+    assert [run.heading for run in given.runs] == ["desk", "drone"]
 
 
-def test_long_names_get_letters(compared: Compared) -> None:
-    assert [side.name for side in lettered(compared).sides] == list("ABCDE")
-    assert [p.name for p in lettered(compared).pairings] == list("BCDE")
-    assert keyed(compared).sides[1].name == f"B  {compared.sides[1].name}"
+def test_long_names_get_letters(compared: Comparison) -> None:
+    assert [run.mark for run in compared.runs] == list("ABCDE")
+    assert compared.runs[1].heading == f"B  {compared.runs[1].name}"
 
 
-def test_latency_cells_are_what_numpy_says(runs: dict[str, Path], compared: Compared) -> None:
-    view = latency_table(compared)
+def test_latency_cells_are_what_numpy_says(runs: dict[str, Path], compared: Comparison) -> None:
+    view = stages_table(compared.runs)
     (start,) = [i for i, row in enumerate(view.rows) if row[0] == "t2 infer"]
     row = dict(zip([c.title for c in view.columns], view.rows[start + 1], strict=True))
     with np.load(runs["slow"] / "latency.npz") as stamps:
         groups = sorted({name.partition("/")[0] for name in stamps.files})
         pairs = [(stamps[f"{g}/action_ready_us"], stamps[f"{g}/infer_start_us"]) for g in groups]
     raw = np.concatenate([(end - begin)[(end >= 0) & (begin >= 0)] for end, begin in pairs]) / 1e3
-    assert row["run"] == compared.sides[1].name
+    assert row["run"] == "B"
     assert row["n"] == f"{len(raw):,}"
     assert row["mean"] == f"{raw.mean():.2f}"
     assert row["p90"] == f"{np.percentile(raw, 90, method='inverted_cdf'):.2f}"
@@ -166,7 +174,7 @@ def test_stages_of_a_rehearsal_and_of_the_twin_stand_together(
     runs: dict[str, Path], tmp_path: Path
 ) -> None:
     write_demo_run(tmp_path / "sitl", episodes=2)
-    view = latency_table(load_compared([runs["fast"], tmp_path / "sitl"]))
+    view = stages_table(compare_folders([runs["fast"], tmp_path / "sitl"])[0].runs)
     counts: dict[str, int] = {}
     stage = ""
     for row in view.rows:
@@ -176,8 +184,8 @@ def test_stages_of_a_rehearsal_and_of_the_twin_stand_together(
     assert counts["t2 infer"] == counts["setpoint → motor"] == counts["end to end"] == 2
 
 
-def test_quality_of_each_run(runs: dict[str, Path], compared: Compared) -> None:
-    for row, path in zip(quality_table(compared).rows, runs.values(), strict=True):
+def test_quality_of_each_run(runs: dict[str, Path], compared: Comparison) -> None:
+    for row, path in zip(runs_table(compared.runs).rows, runs.values(), strict=True):
         flown = lines(path).values()
         good = [e["quality"] for e in flown if e["outcome"] == "success"]
         assert row[1] == f"{len(flown)}"
@@ -188,7 +196,7 @@ def test_quality_of_each_run(runs: dict[str, Path], compared: Compared) -> None:
 @pytest.mark.parametrize("n", [1, 7, 4000])
 def test_a_drawn_distribution_passes_through_its_samples(n: int) -> None:
     samples = np.random.default_rng(n).integers(1, 10**6, n)
-    at_ms, share = _steps(samples)
+    at_ms, share = cumulated(samples)
     assert len(at_ms) <= 401
     assert share[0] == 0.0
     assert share[-1] == 100.0
@@ -198,36 +206,40 @@ def test_a_drawn_distribution_passes_through_its_samples(n: int) -> None:
 
 
 def test_looks_differ() -> None:
-    assert len({look(i) for i in range(32)}) == 32
+    assert len({line_style(i) for i in range(32)}) == 32
 
 
-def test_panels_share_their_axes(compared: Compared) -> None:
-    pictures = fan_pictures("fan", [panel_of(side) for side in compared.sides[:3]])
+def test_panels_share_their_axes(loaded: tuple[Comparison, dict[str, LoadedRun]]) -> None:
+    compared, runs = loaded
+    pictures = flight_pictures("fan", flight_panels(compared.runs[:3], runs))
     ticks = [set(re.findall(r">(−?\d+)</text>", picture.svg)) for picture in pictures]
     assert ticks[0] == ticks[1] == ticks[2]
     assert {len(base64.b64decode(p.data_uri().partition(",")[2])) > 0 for p in pictures} == {True}
 
 
-def test_the_page_is_whole_and_reaches_nothing_else(page: Path, compared: Compared) -> None:
+def test_the_page_is_whole_and_reaches_nothing_else(page: Path, compared: Comparison) -> None:
     text = page.read_text(encoding="utf-8")
     parsed = Page(text)
-    assert all(ref.startswith("data:image/svg+xml;base64,") for ref in parsed.references)
+    images = [ref for ref in parsed.references if not ref.startswith("..") and ref[0] != "/"]
+    assert all(ref.startswith("data:image/svg+xml;base64,") for ref in images)
     assert not parsed.tags & {"script", "link", "iframe", "object"}
     assert all(image["alt"] for image in parsed.images)
     # Four measures, two distributions, a fan each, energy.
-    assert len(parsed.images) == 4 + 2 + len(compared.sides) + 1
+    assert len(parsed.images) == 4 + 2 + len(compared.runs) + 1
     words = " ".join(parsed.words)
-    for side in compared.sides:
-        assert side.name in words
+    for run_ in compared.runs:
+        assert run_.name in words
     for name in ("differences", "latency", "trajectories", "energy"):
         with Image.open(page.parent / f"compare-{name}.png") as image:
             assert min(image.size) > 200
     assert not list(page.parent.glob("*.partial"))
 
 
-def test_it_is_the_same_when_it_is_made_again(compared: Compared, page: Path) -> None:
+def test_it_is_the_same_when_it_is_made_again(
+    loaded: tuple[Comparison, dict[str, LoadedRun]], page: Path
+) -> None:
     before = {p.name: p.read_bytes() for p in page.parent.iterdir()}
-    build_comparison(compared, page.parent)
+    write_comparison(*loaded, page.parent)
     assert {p.name: p.read_bytes() for p in page.parent.iterdir()} == before
 
 
@@ -253,15 +265,16 @@ def test_the_command_prints_and_writes(runs: dict[str, Path], tmp_path: Path) ->
 def test_a_table_of_policies_and_arenas_stands_for_its_runs(
     runs: dict[str, Path], tmp_path: Path
 ) -> None:
-    cells = [{"folder": "fast"}, {"folder": "slow"}]
     root = tmp_path / "matrix"
     root.mkdir()
-    (root / "matrix.json").write_text(json.dumps({"cells": cells}))
-    for cell in cells:
-        (root / cell["folder"]).symlink_to(runs[cell["folder"]])
+    for name in ("fast", "slow"):
+        (root / name).symlink_to(runs[name])
+    entries = [{"entry": {"name": name, "folder": name}} for name in ("fast", "slow")]
+    held = {"schema": 2, "title": "", "facts": {}, "runs": entries, "contrasts": []}
+    (root / "matrix.json").write_text(json.dumps(held))
     assert "workstation" in ask(root, out=tmp_path / "out")
-    (root / "matrix.json").write_text('{"cells": 3}')
-    with pytest.raises(UsageError, match=r"matrix\.json: cannot be read"):
+    (root / "matrix.json").write_text('{"schema": 2, "runs": 3}')
+    with pytest.raises(UsageError, match=r"matrix\.json: title: Field required"):
         ask(root, runs["fast"], out=tmp_path / "other")
 
 

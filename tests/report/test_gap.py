@@ -11,30 +11,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from airl_mav.flight.gap import (
-    HardwareGap,
-    MetricGap,
-    hardware_gap,
-    median_ratio,
-    metric_gap,
-    relative_gap,
-)
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paper import (
-    ABLATION,
-    BEST_OF_SWEEP,
-    DEGRADATION,
-    GENERALISATION,
-    MITIGATION,
-    SYSTEM_EVALUATION,
-    PaperFigures,
-    gap_of,
+from airl_mav.flight.paired import (
+    Change,
+    PairedComparison,
+    compare_means,
+    compare_pairs,
+    median_ratio,
+    percent_change,
 )
 from airl_mav.flight.quality import Leg, Quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import BOOTSTRAP_SEED, RESAMPLES
+from airl_mav.flight.statistics import BOOTSTRAP_SEED, RESAMPLES, Estimate
+from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 
 # --- one gap
+
+
+def median_of(change: Change) -> Estimate:
+    assert change.median is not None
+    return change.median
 
 
 def flight(
@@ -89,7 +85,7 @@ TARGET = [
 
 
 def test_a_gap_worked_out_by_hand() -> None:
-    gap = hardware_gap(REFERENCE, TARGET)
+    gap = compare_pairs(REFERENCE, TARGET)
     # Seeds 1, 2, 3, 4, 6 make pairs; 5 was aborted. Both reached the goal with 1 and 2 alone.
     assert astuple(gap.agreement) == (2, 2, 1, 0)
     success = gap.success_rate
@@ -97,44 +93,45 @@ def test_a_gap_worked_out_by_hand() -> None:
     assert success.difference.value == pytest.approx(-20.0)  # points, not percent
     assert success.difference.n == 5
     time = gap.flight_time_s
-    assert (time.change.reference, time.change.other) == (15.0, 18.0)
-    assert time.change.difference.value == pytest.approx(20.0)  # 18 / 15
-    assert time.median.value == pytest.approx(27.5)  # between +50 and +5 %
-    assert time.change.difference.n == time.median.n == 2
-    assert gap.distance_m.change.difference.value == pytest.approx(20.0)
-    assert gap.energy_j.change.difference.value == pytest.approx(25.0)  # 2500 / 2000
-    computer = gap.computer_energy_j.change
+    assert (time.reference, time.other) == (15.0, 18.0)
+    assert time.difference.value == pytest.approx(20.0)  # 18 / 15
+    assert median_of(time).value == pytest.approx(27.5)  # between +50 and +5 %
+    assert time.difference.n == median_of(time).n == 2
+    assert gap.distance_m.difference.value == pytest.approx(20.0)
+    assert gap.energy_j.difference.value == pytest.approx(25.0)  # 2500 / 2000
+    computer = gap.computer_energy_j
     assert (computer.reference, computer.other) == (75.0, 36.0)
     assert computer.difference.value == pytest.approx(-52.0)
-    total = gap.total_energy_j.change
+    total = gap.total_energy_j
     assert (total.reference, total.other) == (2075.0, 2536.0)
     assert total.difference.value == pytest.approx(100.0 * 461.0 / 2075.0)
 
 
 def test_the_other_way_round_is_another_gap() -> None:
-    back = hardware_gap(TARGET, REFERENCE)
+    back = compare_pairs(TARGET, REFERENCE)
     assert back.success_rate.difference.value == pytest.approx(20.0)
-    assert back.flight_time_s.change.difference.value == pytest.approx(100.0 * (15.0 / 18.0 - 1.0))
+    assert back.flight_time_s.difference.value == pytest.approx(100.0 * (15.0 / 18.0 - 1.0))
 
 
 def test_nothing_in_common_is_no_gap() -> None:
-    gap = hardware_gap([flight(1, GOOD)], [flight(1, HIT)])
+    gap = compare_pairs([flight(1, GOOD)], [flight(1, HIT)])
     assert gap.success_rate.difference.value == -100.0
-    for field in fields(HardwareGap):
+    for field in fields(PairedComparison):
         metric = getattr(gap, field.name)
-        if isinstance(metric, MetricGap):
-            assert metric.change.difference.value is metric.median.value is None
-            assert metric.change.difference.n == 0
-    none = hardware_gap([], [])
+        if isinstance(metric, Change) and metric is not gap.success_rate:
+            assert metric.median is not None
+            assert metric.difference.value is metric.median.value is None
+            assert metric.difference.n == 0
+    none = compare_pairs([], [])
     assert none.success_rate.difference.value is None
 
 
 def test_a_computer_without_watts_has_means_and_no_gap() -> None:
     free, other = [flight(1, GOOD, watts=0.0)], [flight(1, GOOD, time_s=2.0)]
-    computer = hardware_gap(free, other).computer_energy_j
-    assert (computer.change.reference, computer.change.other) == (0.0, 4.0)
-    assert computer.change.difference.value is computer.median.value is None
-    assert hardware_gap(free, other).total_energy_j.change.difference.value is not None
+    computer = compare_pairs(free, other).computer_energy_j
+    assert (computer.reference, computer.other) == (0.0, 4.0)
+    assert computer.difference.value is median_of(computer).value is None
+    assert compare_pairs(free, other).total_energy_j.difference.value is not None
 
 
 # --- intervals
@@ -144,7 +141,7 @@ def test_the_interval_of_the_means_is_scipys_bootstrap_over_pairs() -> None:
     rng = np.random.default_rng(1)
     first = rng.gamma(5.0, 2.0, 60)
     second = first * rng.lognormal(0.3, 0.2, 60)
-    gap = metric_gap(first, second).change.difference
+    gap = compare_means(first, second).difference
     pairs = stats.bootstrap(
         (first, second),
         lambda a, b, axis=-1: 100.0 * (b.mean(axis=axis) / a.mean(axis=axis) - 1.0),
@@ -181,10 +178,10 @@ def test_one_long_flight_moves_the_mean_and_not_the_median() -> None:
     first = np.full(50, 8.0)
     second = np.full(50, 8.0)
     second[7] = 70.0
-    gap = metric_gap(first, second)
-    assert gap.change.difference.value == pytest.approx(100.0 * 62.0 / 400.0)
-    assert gap.median.value == 0.0
-    assert (gap.median.low, gap.median.high) == (0.0, 0.0)
+    gap = compare_means(first, second)
+    assert gap.difference.value == pytest.approx(100.0 * 62.0 / 400.0)
+    assert median_of(gap).value == 0.0
+    assert (median_of(gap).low, median_of(gap).high) == (0.0, 0.0)
 
 
 @given(
@@ -193,26 +190,31 @@ def test_one_long_flight_moves_the_mean_and_not_the_median() -> None:
 )
 def test_a_gap_has_no_unit(pairs: list[tuple[float, float]], scale: float) -> None:
     first, second = np.array(pairs).T
-    plain, scaled = metric_gap(first, second), metric_gap(scale * first, scale * second)
-    assert scaled.change.difference.value == pytest.approx(plain.change.difference.value, abs=1e-9)
-    assert scaled.median.value == pytest.approx(plain.median.value, abs=1e-9)
+    plain, scaled = compare_means(first, second), compare_means(scale * first, scale * second)
+    assert scaled.difference.value == pytest.approx(plain.difference.value, abs=1e-9)
+    assert median_of(scaled).value == pytest.approx(median_of(plain).value, abs=1e-9)
 
 
 def test_a_gap_of_two_figures() -> None:
-    assert relative_gap(11.0, 396.0) == pytest.approx(3500.0)
-    assert relative_gap(100.0, 87.0) == pytest.approx(-13.0)
+    assert percent_change(11.0, 396.0) == pytest.approx(3500.0)
+    assert percent_change(100.0, 87.0) == pytest.approx(-13.0)
     with pytest.raises(ValueError, match="must be > 0"):
-        relative_gap(0.0, 1.0)
+        percent_change(0.0, 1.0)
 
 
-# --- the paper
+# --- published figures
+
+PUBLISHED = load_published()
+MITIGATION = PUBLISHED.tables[0]
+SYSTEM = {table.arena: table for table in PUBLISHED.tables[1:]}
 
 
-@pytest.mark.parametrize("arena", sorted(SYSTEM_EVALUATION))
+@pytest.mark.parametrize("arena", sorted(SYSTEM))
 def test_the_papers_system_evaluation_follows_from_its_columns(arena: str) -> None:
     """So its figures are copied right, and its definition is ours; its success is in points."""
-    table = next(table for name, table in SYSTEM_EVALUATION.items() if name == arena)
-    found, printed = gap_of(table.reference, table.target), table.printed
+    table = SYSTEM[arena]
+    found = published_gap(table.columns["reference"], table.columns["target"])
+    printed = table.printed["target"]
     assert found.latency_percent == pytest.approx(printed.latency_percent, rel=1e-4)
     assert found.flight_time_percent == pytest.approx(printed.flight_time_percent, abs=0.05)
     assert found.distance_percent == pytest.approx(printed.distance_percent, abs=0.1)
@@ -221,45 +223,49 @@ def test_the_papers_system_evaluation_follows_from_its_columns(arena: str) -> No
 
 
 def test_the_papers_mitigation_is_measured_from_the_delay_trained_policy() -> None:
-    m = MITIGATION
-    without = gap_of(m.delay_trained, m.unmitigated)
+    m = MITIGATION.columns
+    without = published_gap(m["training"], m["target"])
     assert without.flight_time_percent == pytest.approx(37.73, abs=0.02)
     assert without.distance_percent == pytest.approx(16.03, abs=0.02)
     assert without.energy_percent == pytest.approx(15.49, abs=0.02)
-    mitigated = gap_of(m.delay_trained, m.mitigated)
+    mitigated = published_gap(m["training"], m["mitigated"])
     assert abs(mitigated.flight_time_percent) == pytest.approx(0.5, abs=0.06)
     assert abs(mitigated.distance_percent) == pytest.approx(1.37, abs=0.02)
     assert abs(mitigated.energy_percent) == pytest.approx(0.1, abs=0.02)
-    undelayed = gap_of(m.undelayed, m.unmitigated)
+    undelayed = published_gap(m["reference"], m["target"])
     assert undelayed.flight_time_percent == pytest.approx(86.6, abs=0.05)
     assert undelayed.distance_percent == pytest.approx(33.2, abs=0.05)
     assert undelayed.energy_percent == pytest.approx(48.8, abs=0.05)
-    assert gap_of(m.undelayed, m.mitigated).flight_time_percent == pytest.approx(34.7, abs=0.05)
+    both = published_gap(m["reference"], m["mitigated"])
+    assert both.flight_time_percent == pytest.approx(34.7, abs=0.05)
 
 
 def test_the_papers_success_gaps_there_are_percent_of_the_target() -> None:
-    m = MITIGATION
+    m = MITIGATION.columns
 
-    def of_target(target: PaperFigures) -> float:
-        assert m.delay_trained.success_percent is not None
+    def of_target(target: PublishedRun) -> float:
+        trained = m["training"].success_percent
+        assert trained is not None
         assert target.success_percent is not None
-        return relative_gap(target.success_percent, m.delay_trained.success_percent)
+        return percent_change(target.success_percent, trained)
 
-    assert of_target(m.mitigated) == pytest.approx(m.printed_with.success, abs=0.01)
-    assert of_target(m.unmitigated) == pytest.approx(m.printed_without.success, abs=0.01)
-    assert gap_of(m.delay_trained, m.mitigated).success == -2.0
-    assert gap_of(m.delay_trained, m.unmitigated).success == -12.0
+    for role in ("mitigated", "target"):
+        printed = MITIGATION.printed[role].success
+        assert of_target(m[role]) == pytest.approx(printed, abs=0.01)
+    assert published_gap(m["training"], m["mitigated"]).success == -2.0
+    assert published_gap(m["training"], m["target"]).success == -12.0
 
 
 def test_the_paper_agrees_with_itself_where_it_does() -> None:
     """The texts: +97 % time, +21 % distance, +43 % energy at 300 ms; the same best networks."""
-    worst = gap_of(DEGRADATION[0], DEGRADATION[-1])
+    curve = PUBLISHED.degradation
+    worst = published_gap(curve[0], curve[-1])
     assert worst.flight_time_percent == pytest.approx(97.0, abs=1.0)
     assert worst.distance_percent == pytest.approx(21.0, abs=1.0)
     assert worst.energy_percent == pytest.approx(43.0, abs=0.2)
-    assert DEGRADATION[0].flight_time_s == MITIGATION.undelayed.flight_time_s
-    for arena, (_, success) in BEST_OF_SWEEP.items():
-        assert SYSTEM_EVALUATION[arena].reference.success_percent == success
-        assert ABLATION[arena]["none"] == success
-    for trained, rates in GENERALISATION.items():
-        assert rates[trained] == BEST_OF_SWEEP[trained][1]
+    assert curve[0].flight_time_s == MITIGATION.columns["reference"].flight_time_s
+    for arena, best in PUBLISHED.best_networks.items():
+        assert SYSTEM[arena].columns["reference"].success_percent == best.success_percent
+        assert PUBLISHED.ablation[arena]["none"] == best.success_percent
+    for trained, rates in PUBLISHED.generalisation.items():
+        assert rates[trained] == PUBLISHED.best_networks[trained].success_percent

@@ -31,13 +31,14 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.report.gap import terminal as gap_terminal
-from airl_mav.report.gap.build import GapStudy, worst_seeds
-from airl_mav.report.gap.file import GAP_FILE, read_gap, write_gap
-from airl_mav.report.gap.tables import columns_table, detail_table, gaps_table
-from airl_mav.report.gap.words import answers
-from airl_mav.scenario.model import DEFAULT_POLICY
+from airl_mav.report.comparison import show
+from airl_mav.report.comparison.gap import columns_table, gap_recipe, gaps_table, worst_seeds
+from airl_mav.report.comparison.model import load_comparison, save_comparison
+from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
+from airl_mav.report.comparison.tables import contrast_table
+from airl_mav.report.measures import ALL_MEASURES
 
+GAP_FILE = "gap.json"
 EPISODES = 24
 ROLES = ("reference", "target", "mitigated", "training", "mitigated-reference")
 
@@ -71,7 +72,11 @@ def measure(mitigated: str, *, page: bool = False, **options: Any) -> tuple[int,
     """
     console = Console(record=True, width=80, file=io.StringIO())
     words: dict[str, Any] = {"mitigated": mitigated, "episodes": EPISODES}
-    with nullcontext() if page else patch.object(gap_terminal, "build_page", lambda s, _: s.path):
+    with (
+        nullcontext()
+        if page
+        else patch.object(show, "write_document", lambda _, folder: folder / "gap.html")
+    ):
         code = run(GapCommand(**(words | options)), console)
     return code, console.export_text()
 
@@ -97,8 +102,23 @@ def lines(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def gap_of(data: dict[str, Any], key: str) -> dict[str, Any]:
-    (found,) = [gap for gap in data["arenas"][0]["gaps"] if gap["key"] == key]
+    arena = data["runs"][0]["entry"]["group"]
+    groups = {run["entry"]["name"]: run["entry"]["group"] for run in data["runs"]}
+    (found,) = [
+        {**contrast["entry"], **contrast["paired"], **contrast}
+        for contrast in data["contrasts"]
+        if contrast["entry"]["key"] == key and groups[contrast["entry"]["target"]] == arena
+    ]
     return dict(found)
+
+
+def columns_of(data: dict[str, Any], group: str = "static-obstacles") -> list[dict[str, Any]]:
+    """Return the runs of an arena."""
+    return [
+        {**run["quality"], **run["entry"], **run}
+        for run in data["runs"]
+        if run["entry"]["group"] == group
+    ]
 
 
 # --- what it flies
@@ -106,13 +126,10 @@ def gap_of(data: dict[str, Any], key: str) -> dict[str, Any]:
 
 def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None:
     out, _ = whole
-    (arena,) = data_of(out)["arenas"]
-    assert [column["role"] for column in arena["columns"]] == list(ROLES)
-    assert [column["letter"] for column in arena["columns"]] == list("abcde")
-    runs = {
-        c["role"]: json.loads((out / c["folder"] / "run.json").read_text())
-        for c in arena["columns"]
-    }
+    columns = columns_of(data_of(out))
+    assert [column["role"] for column in columns] == list(ROLES)
+    assert [column["mark"] for column in columns] == list("ABCDE")
+    runs = {c["role"]: json.loads((out / c["folder"] / "run.json").read_text()) for c in columns}
     policies = {role: info["setup"]["policy"]["name"] for role, info in runs.items()}
     assert policies == dict.fromkeys(ROLES, "mitigated") | {
         "reference": DEFAULT_POLICY,
@@ -153,11 +170,11 @@ def test_the_training_conditions_are_other_draws_of_the_same_latency(
 
 def test_t2_is_that_of_the_flights(whole: tuple[Path, str]) -> None:
     out, _ = whole
-    for column in data_of(out)["arenas"][0]["columns"]:
+    for column in columns_of(data_of(out)):
         pooled = np.concatenate(list(drawn(out / column["folder"]).values()))
-        assert column["t2"]["n"] == len(pooled)
-        assert column["t2"]["mean_us"] == pytest.approx(pooled.mean())
-        assert column["t2"]["p50_us"] == np.sort(pooled)[(len(pooled) - 1) // 2]
+        assert column["stages"]["t2"]["n"] == len(pooled)
+        assert column["stages"]["t2"]["mean"] == pytest.approx(pooled.mean())
+        assert column["stages"]["t2"]["p50"] == np.sort(pooled)[(len(pooled) - 1) // 2]
 
 
 # --- what it says
@@ -195,21 +212,21 @@ def test_gaps_are_those_of_the_files(
             [(first[s]["quality"][metric], second[s]["quality"][metric]) for s in common]
         )
         means = values.mean(axis=0)
-        change = found[metric]["change"]
+        change = found[metric]
         assert [change["reference"], change["other"]] == pytest.approx(list(means))
         assert change["difference"]["value"] == pytest.approx(100.0 * (means[1] / means[0] - 1.0))
         assert change["difference"]["n"] == len(common)
         median = 100.0 * np.median(values[:, 1] / values[:, 0] - 1.0)
         assert found[metric]["median"]["value"] == pytest.approx(median, abs=1e-9)
-    both = found["energy_j"]["change"]["other"] + found["computer_energy_j"]["change"]["other"]
-    assert found["total_energy_j"]["change"]["other"] == pytest.approx(both)
+    both = found["energy_j"]["other"] + found["computer_energy_j"]["other"]
+    assert found["total_energy_j"]["other"] == pytest.approx(both)
 
 
 def test_the_gap_appears(whole: tuple[Path, str]) -> None:
     """Otherwise nothing of this file shows anything."""
     gap = gap_of(data_of(whole[0]), "without-mitigation")
     for metric, least in (("flight_time_s", 10.0), ("distance_m", 5.0), ("energy_j", 10.0)):
-        assert gap[metric]["change"]["difference"]["low"] > least
+        assert gap[metric]["difference"]["low"] > least
     assert gap["t2_percent"] == pytest.approx(3500.0, rel=0.02)
 
 
@@ -222,24 +239,25 @@ def test_the_same_policy_has_the_same_gap_and_none_where_it_was_trained(
     for metric in ("success_rate", "flight_time_s", "energy_j"):
         assert with_[metric] == without[metric]
     nothing = gap_of(data, "mitigation-on-target")
-    assert nothing["flight_time_s"]["change"]["difference"]["value"] == 0.0
+    assert nothing["flight_time_s"]["difference"]["value"] == 0.0
     assert gap_of(data, "cost-on-reference")["distance_m"]["median"]["value"] == 0.0
-    trained = gap_of(data, "with-mitigation-trained")["flight_time_s"]["change"]["difference"]
+    trained = gap_of(data, "with-mitigation-trained")["flight_time_s"]["difference"]
     assert trained["value"] != 0.0
     assert trained["low"] < 0.0 < trained["high"]
 
 
 def test_the_paper_stands_beside_it(whole: tuple[Path, str]) -> None:
     out, text = whole
-    (arena,) = data_of(out)["arenas"]
-    assert arena["paper_table"] == "mitigation, Static Obstacles (VII.B)"
-    labels = {c["role"]: c["paper"] and c["paper"]["label"] for c in arena["columns"]}
+    data = data_of(out)
+    tables = data["extra"]["published_tables"]
+    assert tables == {"static-obstacles": "mitigation, Static Obstacles (VII.B)"}
+    labels = {c["role"]: c["published"] and c["published"]["label"] for c in columns_of(data)}
     assert labels["target"] == "Ras-Pi 4, without mitigation"
     assert labels["mitigated-reference"] is None
-    assert gap_of(data_of(out), "without-mitigation")["paper"]["flight_time_percent"] == (
+    assert gap_of(data, "without-mitigation")["published"]["flight_time_percent"] == (
         pytest.approx(86.6, abs=0.05)
     )
-    trained = gap_of(data_of(out), "without-mitigation-trained")["paper"]
+    trained = gap_of(data, "without-mitigation-trained")["published"]
     assert trained["flight_time_percent"] == pytest.approx(37.73, abs=0.02)
     flat = " ".join(text.split())
     assert "paper paper paper paper" in flat
@@ -252,42 +270,50 @@ def test_the_answer_is_one_of_the_numbers(whole: tuple[Path, str]) -> None:
     data = data_of(out)
     (answer,) = data["answers"]
     assert " ".join(answer.split()) in " ".join(text.split())
-    change = gap_of(data_of(out), "without-mitigation")["flight_time_s"]["change"]["difference"]
+    change = gap_of(data_of(out), "without-mitigation")["flight_time_s"]["difference"]
     assert f"On ras-pi-4 (t2 39{6}" in answer or "On ras-pi-4 (t2 39" in answer
     assert (
         f"{change['value']:.1f} % longer ({change['low']:+.1f} … {change['high']:+.1f})" in answer
     )
-    rates = {
-        c["role"]: 100.0 * c["success_rate"]["value"] for c in data_of(out)["arenas"][0]["columns"]
-    }
+    rates = {c["role"]: 100.0 * c["success_rate"]["value"] for c in columns_of(data_of(out))}
     assert f"reaches {rates['target']:.1f} % of its goals, not {rates['reference']:.1f} %" in answer
     assert "mitigated there flies" in answer
     assert "against the conditions of its own training" in answer
 
 
 def test_everything_fits_into_80_columns(whole: tuple[Path, str]) -> None:
-    tables = whole[1].partition("What flew")[2].partition("tables  ")[0]
+    tables = whole[1].partition("Each run by itself")[2].partition("gap  ")[0]
     assert max(len(line.rstrip()) for line in tables.splitlines()) <= 80
     assert "…" not in tables.partition("Each by itself")[0]  # No cell is cut.
 
 
 def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
-    study = read_gap(whole[0])
-    (arena,) = study.arenas
-    rows = {row[0]: row for row in columns_table(arena, intervals="none").rows}
-    quality = arena.columns[1].quality
+    gap = load_comparison(whole[0], "gap")
+    (arena,) = gap.groups
+    table = columns_table(gap, arena)
+    rows = {row[0]: row for row in table.rows}
+    quality = gap.runs[1].quality
     assert quality.flight_time_s.value is not None
-    assert float(rows["flight time [s]"][2]) == pytest.approx(quality.flight_time_s.value, abs=5e-3)
+    shown = rows["flight time [s]"][2].partition(" ")[0]
+    assert float(shown) == pytest.approx(quality.flight_time_s.value, abs=5e-3)
     assert rows["flight time [s]"][6:] == ("24.08", "44.93", "32.44", "32.62")
-    first = gaps_table(arena).rows[0]
-    assert first[0] == "b against a: without mitigation, reference undelayed"
-    gap = arena.gaps[0].gap.flight_time_s.change.difference
-    assert gap.value is not None
-    assert first[2].startswith(f"{gap.value:+.1f} [")
-    assert "+86.6" in gaps_table(arena).rows[1]
-    detail = detail_table(arena, arena.gaps[0])
+    first = gaps_table(gap, arena).rows[0]
+    assert first[0] == "B against A\nno mitigation"
+    difference = gap.contrasts[0].paired.flight_time_s.difference
+    assert difference.value is not None
+    assert first[2].startswith(f"{difference.value:+.1f} [")
+    assert "+86.6" in gaps_table(gap, arena).rows[1]
+    detail = contrast_table(gap, gap.contrasts[0], ALL_MEASURES)
     assert len(detail.columns) == 10
     assert {len(row) for row in detail.rows} == {10}
+
+
+def test_the_file_is_the_whole_comparison(whole: tuple[Path, str], tmp_path: Path) -> None:
+    """What is read back is what is worked out from the runs, and is written again as it was."""
+    read = load_comparison(whole[0], "gap")
+    assert read == rebuild_comparison(whole[0])[0]
+    save_comparison(read, tmp_path)
+    assert (tmp_path / GAP_FILE).read_bytes() == (whole[0] / GAP_FILE).read_bytes()
 
 
 class Page(HTMLParser):
@@ -330,7 +356,7 @@ def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path
 
 def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
     text = (whole[0] / "gap.md").read_text()
-    assert text.count("\n| --- |") == 8  # What flew, the gaps, six in detail.
+    assert text.count("\n| --- |") == 8  # Each by itself, the gaps, six in detail.
     for block in re.findall(r"(?:^\|.*\|\n)+", text, re.M):
         rows = [re.findall(r"(?<!\\)\|", line) for line in block.splitlines()]
         assert len({len(row) for row in rows}) == 1
@@ -339,7 +365,7 @@ def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
 
 def test_the_worst_seeds_failed_or_took_longest(whole: tuple[Path, str]) -> None:
     out, _ = whole
-    worst = data_of(out)["arenas"][0]["worst_seeds"]
+    worst = data_of(out)["extra"]["worst_seeds"]["static-obstacles"]
     assert len(worst) == len(set(worst)) == 6
     first, second = (lines(out / f"static-obstacles-{role}") for role in ("reference", "target"))
     assert all(first[seed]["outcome"] == "success" for seed in worst)
@@ -356,7 +382,7 @@ def test_the_worst_seeds_failed_or_took_longest(whole: tuple[Path, str]) -> None
 
 
 def test_worst_seeds_of_nothing() -> None:
-    assert worst_seeds([], []) == ()
+    assert worst_seeds([], []) == []
 
 
 # --- what it goes on with
@@ -370,8 +396,8 @@ def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) ->
     assert again.count("(flown before)") == 5
     assert data_of(out) == before
     assert (
-        again.partition("What flew")[2].partition("tables  ")[0]
-        == (text.partition("What flew")[2].partition("tables  ")[0])
+        again.partition("Each run by itself")[2].partition("gap  ")[0]
+        == (text.partition("Each run by itself")[2].partition("gap  ")[0])
     )
 
 
@@ -379,7 +405,7 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     out, text = whole
     before = (out / GAP_FILE).read_bytes()
     console = Console(record=True, width=80, file=io.StringIO())
-    with patch.object(gap_terminal, "build_page", lambda s, _: s.path / "gap.html"):
+    with patch.object(show, "write_document", lambda _, folder: folder / "gap.html"):
         assert report.run(ReportCommand(out), console) == 0
     assert (out / GAP_FILE).read_bytes() == before
     assert console.export_text().strip() in text
@@ -404,7 +430,7 @@ def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigate
     assert code == 130
     assert "goes on" in text
     data = data_of(tmp_path / "root")
-    assert [gap["key"] for gap in data["arenas"][0]["gaps"]] == ["without-mitigation"]
+    assert [gap["entry"]["key"] for gap in data["contrasts"]] == ["without-mitigation"]
     assert gap_of(data, "without-mitigation") == gap_of(data_of(whole[0]), "without-mitigation")
     code, _ = measure(mitigated, out=tmp_path / "root")
     assert code == 0
@@ -416,20 +442,21 @@ def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigate
     [
         ("[", "not JSON"),
         ('{"schema": 9}', "schema = 9"),
-        ('{"schema": 1, "facts": {}}', "arenas: Field required"),
-        ('{"schema": 1, "facts": {}, "arenas": []}', "no run here"),
+        ('{"schema": 2, "title": "", "facts": {}}', "runs: Field required"),
+        ('{"schema": 2, "title": "", "facts": {}, "runs": [], "contrasts": []}', "no run here"),
+        pytest.param("[" * 100_000, "nested too deeply", id="nested"),
     ],
 )
 def test_a_damaged_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / GAP_FILE).write_text(text)
     with pytest.raises(UsageError, match=re.escape(words)) as caught:
-        read_gap(tmp_path)
+        rebuild_comparison(tmp_path)
     assert "\n" not in f"{caught.value}"
 
 
 def test_no_gap_here(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no hardware gap here"):
-        read_gap(tmp_path)
+    with pytest.raises(UsageError, match="no comparison here; accepted: the folder of a"):
+        rebuild_comparison(tmp_path)
 
 
 # --- what it can be asked for
@@ -441,13 +468,12 @@ def test_without_mitigation_and_in_two_arenas(tmp_path: Path) -> None:
     )
     assert code == 0
     data = data_of(tmp_path)
-    for arena, paper in zip(
-        data["arenas"],
-        ("system evaluation, No Obstacles (VI.B)", "mitigation, Static Obstacles (VII.B)"),
-        strict=True,
+    for arena, paper in (
+        ("no-obstacles", "system evaluation, No Obstacles (VI.B)"),
+        ("static-obstacles", "mitigation, Static Obstacles (VII.B)"),
     ):
-        assert [column["role"] for column in arena["columns"]] == ["reference", "target"]
-        assert arena["paper_table"] == paper
+        assert [c["role"] for c in columns_of(data, arena)] == ["reference", "target"]
+        assert data["extra"]["published_tables"][arena] == paper
     assert len(data["answers"]) == 2
     assert " in no-obstacles " in data["answers"][0]
     assert "no-obstacles ─" in text
@@ -467,13 +493,12 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
     code, _ = measure("none", out=tmp_path / "out", latency=latency, episodes=3)
     assert code == 0
     data = data_of(tmp_path / "out")
-    (arena,) = data["arenas"]
-    a, b = arena["columns"]
+    a, b = columns_of(data)
     # The reference is undelayed: no workload of it is as late as a measured latency says.
-    assert a["t2"]["mean_us"] == 1e3
-    assert b["t2"]["mean_us"] == pytest.approx(150e3, rel=0.02)
-    assert arena["paper_table"] is None
-    assert a["paper"] is b["paper"] is None
+    assert a["stages"]["t2"]["mean"] == 1e3
+    assert b["stages"]["t2"]["mean"] == pytest.approx(150e3, rel=0.02)
+    assert data["extra"]["published_tables"] == {}
+    assert a["published"] is b["published"] is None
     assert data["facts"]["latency"] == latency
 
 
@@ -584,19 +609,12 @@ def test_a_card_with_a_wrong_delay_is_one_line(tmp_path: Path) -> None:
 # --- the words
 
 
-def test_a_study_without_a_gap_says_nothing(whole: tuple[Path, str], tmp_path: Path) -> None:
-    data = data_of(whole[0])
-    arena = data["arenas"][0]
-    arena["columns"] = arena["columns"][:1]
-    for path in whole[0].iterdir():
-        if path.is_dir():
-            (tmp_path / path.name).symlink_to(path)
-    (tmp_path / GAP_FILE).write_text(json.dumps(data))
-    study: GapStudy = read_gap(tmp_path)
-    assert study.arenas[0].gaps == ()
-    assert answers(study) == []
-    write_gap(study, [])
-    assert data_of(tmp_path)["arenas"][0]["gaps"] == []
+def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
+    entries = [run.entry for run in load_comparison(whole[0], "gap").runs][:1]
+    gap, runs = build_comparison(whole[0], "gap", gap_recipe({}, entries))
+    assert gap.contrasts == gap.answers == ()
+    document = show.comparison_to_document(gap, runs, whole[0])
+    assert "Hardware gap" not in [section.title for section in document.sections]
 
 
 # --- as a person uses it

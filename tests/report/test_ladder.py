@@ -31,19 +31,18 @@ from airl_mav.experiments import gym_flier
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import RunFolder, load
-from airl_mav.report import html
-from airl_mav.report.ladder import page as ladder_page
-from airl_mav.report.ladder.build import LADDER_FILE, Held, Ladder, build_ladder, read_ladder
-from airl_mav.report.ladder.page import build_page, differences_figure
-from airl_mav.report.ladder.tables import (
-    MEASURES,
-    comparison_tables,
-    levels_table,
-    split_table,
-)
-from airl_mav.report.ladder.words import differences_in_words
+from airl_mav.report import run_page
+from airl_mav.report.comparison import show
+from airl_mav.report.comparison.figures import contrast_pictures
+from airl_mav.report.comparison.ladder import ladder_recipe, other_differences, split_table
+from airl_mav.report.comparison.model import Comparison, RunEntry, load_comparison
+from airl_mav.report.comparison.show import build_comparison, write_comparison
+from airl_mav.report.comparison.tables import contrast_table, runs_table
+from airl_mav.report.measures import MEASURES
+from airl_mav.report.table import TableView
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
 
+LADDER_FILE = "ladder.json"
 EPISODES, SITL_EPISODES = 24, 6
 WORDS: dict[str, Any] = {"arena": "dense-obstacles", "episodes": EPISODES, "seed": 20}
 """Where some flights reach the goal and some do not."""
@@ -92,7 +91,7 @@ def cut_short(result: Result, keep: int) -> Result:
 @pytest.fixture(scope="module", autouse=True)
 def _no_pictures() -> Iterator[None]:
     """Pictures take longer than flights."""
-    with patch.object(html, "MAX_PICTURED", 1), patch.object(ladder_levels, "rebuild"):
+    with patch.object(run_page, "MAX_PICTURED", 1), patch.object(ladder_levels, "write_report"):
         yield
 
 
@@ -110,7 +109,11 @@ def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
     """
     console = Console(record=True, width=100, file=io.StringIO())
     command = LadderCommand("greedy", **(WORDS | {"sitl_episodes": SITL_EPISODES} | options))
-    with nullcontext() if page else patch.object(ladder_page, "build_page"):
+    with (
+        nullcontext()
+        if page
+        else patch.object(show, "write_document", lambda _, folder: folder / "ladder.html")
+    ):
         code = run(command, console)
     return code, console.export_text()
 
@@ -133,6 +136,22 @@ def lines(path: Path) -> dict[int, dict[str, Any]]:
 def data_of(path: Path) -> dict[str, Any]:
     data: dict[str, Any] = json.loads((path / LADDER_FILE).read_text())
     return data
+
+
+def levels_of(data: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{**run["entry"], **run} for run in data["runs"]]
+
+
+def contrasts_of(data: dict[str, Any]) -> list[dict[str, Any]]:
+    return [{"level": c["entry"]["target"], **c["paired"]} for c in data["contrasts"]]
+
+
+def read_ladder(path: Path) -> Comparison:
+    return load_comparison(path, "ladder")
+
+
+def comparison_tables(ladder: Comparison) -> list[TableView]:
+    return [contrast_table(ladder, contrast) for contrast in ladder.contrasts]
 
 
 # --- what it flies
@@ -172,16 +191,16 @@ def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
     gym, lockstep = (lines(tmp_path / "one" / level) for level in levels)
     assert sorted(gym) == sorted(lockstep) == [20, 21]
     one, two = data_of(tmp_path / "one"), data_of(tmp_path / "two")
-    assert one["levels"][0] == two["levels"][1]
-    assert one["levels"][1] == two["levels"][0]
-    assert re.fullmatch("[0-9a-f]{64}", one["levels"][1]["sha256"])
-    (found,) = one["comparisons"]
+    assert levels_of(one)[0] == levels_of(two)[1]
+    assert levels_of(one)[1] == levels_of(two)[0]
+    assert re.fullmatch("[0-9a-f]{64}", levels_of(one)[1]["sha256"])
+    (found,) = contrasts_of(one)
     assert found["agreement"]["both"] == 2
     # In the open both fly to the goal, from nearly the same place.
     assert abs(found["distance_m"]["difference"]["value"]) < 5.0
-    assert one["levels"][0]["start"]["takeoff_s"] == 0.0
-    assert one["levels"][1]["start"]["takeoff_s"] > 4.0
-    assert 0.0 < one["levels"][1]["position_error_m"] < 1.0
+    assert levels_of(one)[0]["start"]["takeoff_s"] == 0.0
+    assert levels_of(one)[1]["start"]["takeoff_s"] > 4.0
+    assert 0.0 < levels_of(one)[1]["position_error_m"] < 1.0
     assert (tmp_path / "one" / "ladder.html").exists()
 
 
@@ -192,7 +211,7 @@ def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
 def test_differences_are_those_of_the_files(whole: tuple[Path, str], level: str) -> None:
     out, _ = whole
     gym, other = lines(out / "gym"), lines(out / level)
-    (found,) = [c for c in data_of(out)["comparisons"] if c["level"] == level]
+    (found,) = [c for c in contrasts_of(data_of(out)) if c["level"] == level]
     seeds = sorted(other)
     reached = [(gym[s]["outcome"] == "success", other[s]["outcome"] == "success") for s in seeds]
     agreement = found["agreement"]
@@ -224,11 +243,11 @@ def test_the_levels_differ_and_the_seeds_that_split_are_named(whole: tuple[Path,
     out, _ = whole
     data = data_of(out)
     # Otherwise nothing of this file shows anything: a late policy flies worse.
-    lockstep = data["comparisons"][0]
+    lockstep = contrasts_of(data)[0]
     assert lockstep["agreement"]["only_reference"] > 0
     assert lockstep["agreement"]["both"] >= 3
     flights = {level: lines(out / level) for level in ("gym", "lockstep", "sitl")}
-    named = {item["seed"]: item["outcomes"] for item in data["split"]}
+    named = {item["seed"]: item["outcomes"] for item in data["extra"]["split"]}
     for seed in flights["gym"]:
         ends = {level: e[seed]["outcome"] for level, e in flights.items() if seed in e}
         split = len({outcome == "success" for outcome in ends.values()}) > 1
@@ -241,7 +260,7 @@ def test_the_levels_differ_and_the_seeds_that_split_are_named(whole: tuple[Path,
 
 def test_what_a_decision_takes(whole: tuple[Path, str]) -> None:
     out, text = whole
-    for level in data_of(out)["levels"]:
+    for level in levels_of(data_of(out)):
         t2, period = [], []
         with np.load(out / level["name"] / "latency.npz") as stamps:
             for index in sorted({name.partition("/")[0] for name in stamps.files}):
@@ -256,15 +275,14 @@ def test_what_a_decision_takes(whole: tuple[Path, str]) -> None:
             pooled = np.concatenate(values)
             stage = level["stages"][key]
             assert stage["n"] == len(pooled)
-            assert stage["mean_us"] == pytest.approx(pooled.mean())
+            assert stage["mean"] == pytest.approx(pooled.mean())
     times = {
-        level["name"]: level["stages"]["period"]["mean_us"] / 1e3
-        for level in data_of(out)["levels"]
+        level["name"]: level["stages"]["period"]["mean"] / 1e3 for level in levels_of(data_of(out))
     }
     told = "; ".join(f"{value:.1f} ms at {name}" for name, value in times.items())
     assert f"Decision period: {told}." in " ".join(text.split())
     assert times["lockstep"] > times["gym"] + 300.0
-    assert "as if Raspberry Pi 4" in data_of(out)["levels"][1]["t2"]
+    assert "as if Raspberry Pi 4" in levels_of(data_of(out))[1]["setup"]["injection"]["label"]
 
 
 def test_seeds_that_make_the_difference_are_named(whole: tuple[Path, str]) -> None:
@@ -287,27 +305,29 @@ def test_seeds_that_make_the_difference_are_named(whole: tuple[Path, str]) -> No
 def test_no_difference_is_printed_without_its_pairs(whole: tuple[Path, str]) -> None:
     out, text = whole
     ladder = read_ladder(out)
-    for view, comparison in zip(comparison_tables(ladder), ladder.comparisons, strict=True):
+    for view, contrast in zip(comparison_tables(ladder), ladder.contrasts, strict=True):
+        agreement = contrast.paired.agreement
         titles = [column.title for column in view.columns]
-        assert titles[-3:] == ["difference", "95 % interval", "pairs"]
-        pairs = [comparison.agreement.n] + 3 * [comparison.agreement.both]
+        assert titles[-4:] == ["difference", "95 % interval", "median of pairs", "pairs"]
+        pairs = [agreement.n] + 3 * [agreement.both]
         assert [int(row[-1]) for row in view.rows] == pairs
         for row in view.rows:
-            assert re.search(r"\s+".join(map(re.escape, row)), text), row
-        assert f"only gym in {comparison.agreement.only_reference}" in view.notes[0]
+            shown = (*row[:-2], row[-1])
+            assert re.search(r"\s+".join(map(re.escape, shown)), text), row
+        assert f"only gym in {agreement.only_reference}" in view.notes[0]
     few = "Bootstrap intervals of fewer than 10 pairs are too narrow."
     lockstep, sitl = comparison_tables(ladder)
-    assert ladder.comparisons[0].agreement.both >= 10
+    assert ladder.contrasts[0].paired.agreement.both >= 10
     assert few not in lockstep.notes
     assert few in sitl.notes
-    assert any("Not the same number" in note for note in levels_table(ladder).notes)
+    assert any("Not the same number" in note for note in runs_table(ladder.runs).notes)
 
 
 def test_the_first_level_is_the_reference(whole: tuple[Path, str]) -> None:
     out, _ = whole
     names = ("lockstep", "gym")
-    turned = build_ladder(out, {}, [Held(name, (name,), EPISODES) for name in names])
-    there, back = read_ladder(out).comparisons[0], turned.comparisons[0]
+    turned = ladder_of(out, {}, [RunEntry(name, name, planned=EPISODES) for name in names])
+    there, back = read_ladder(out).contrasts[0].paired, turned.contrasts[0].paired
     assert back.agreement.only_reference == there.agreement.only_other
     assert back.flight_time_s.reference == there.flight_time_s.other
     high = there.success_rate.difference.high
@@ -316,8 +336,12 @@ def test_the_first_level_is_the_reference(whole: tuple[Path, str]) -> None:
     assert comparison_tables(turned)[0].title == "gym against lockstep"
 
 
+def ladder_of(root: Path, facts: dict[str, Any], levels: list[RunEntry]) -> Comparison:
+    return build_comparison(root, "ladder", ladder_recipe(facts, levels))[0]
+
+
 @pytest.fixture(scope="module")
-def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Ladder:
+def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
     """Flights that begin with a take-off, at two levels that are 0.3 m apart."""
     root = tmp_path_factory.mktemp("rehearsed")
     for level, aside in (("lockstep", 0.0), ("sitl", 0.3)):
@@ -336,17 +360,20 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> Ladder:
             }
             estimate["estimate/position"][path.time_us[:-1] > record.ended_us] += 50.0
             folder.save_episode(record, path, latency | estimate)
-    held = [Held(level, (level,), 3) for level in ("lockstep", "sitl")]
-    return build_ladder(root, {"policy": "scout", "arena": "static-obstacles"}, held)
+    levels = [RunEntry(level, level, planned=3) for level in ("lockstep", "sitl")]
+    return root, ladder_of(root, {"policy": "scout", "arena": "static-obstacles"}, levels)
 
 
-def test_where_navigation_begins_and_what_is_believed(rehearsed: Ladder) -> None:
-    lockstep, sitl = rehearsed.levels
+def test_where_navigation_begins_and_what_is_believed(
+    rehearsed: tuple[Path, Comparison],
+) -> None:
+    root, ladder = rehearsed
+    lockstep, sitl = ladder.runs
     assert lockstep.start is not None
     assert sitl.start is not None
     assert lockstep.start.n == 2  # The third one was aborted.
     assert lockstep.start.takeoff_s == pytest.approx(5.0, abs=0.02)
-    paths = load(rehearsed.path / "lockstep")
+    paths = load(root / "lockstep")
     at = [
         p.position[np.searchsorted(p.time_us, e.navigation_us)]
         for e, p in zip(paths.episodes, paths.trajectories.values(), strict=True)
@@ -356,13 +383,13 @@ def test_where_navigation_begins_and_what_is_believed(rehearsed: Ladder) -> None
     assert sitl.start.aside_m != pytest.approx(lockstep.start.aside_m)
     assert lockstep.position_error_m == pytest.approx(1.0, abs=1e-6)
     assert sitl.position_error_m == pytest.approx(np.hypot(0.9, 0.8), abs=1e-6)
-    words = " ".join(differences_in_words(rehearsed))
+    words = " ".join(other_differences(ladder))
     assert "Error of the estimated position: 1.00 m at lockstep; 1.20 m at sitl." in words
     assert "after 5.0 s of take-off" in words
     # The first flight of each gave up 8 ms.
     assert "could not keep pace at sitl: 8 ms" in words
     # An aborted flight makes no pair.
-    assert rehearsed.comparisons[0].agreement.n == 2
+    assert ladder.contrasts[0].paired.agreement.n == 2
 
 
 # --- what it leaves behind
@@ -427,8 +454,8 @@ def test_figures_say_what_the_tables_say(whole: tuple[Path, str]) -> None:
     for source, measure in zip(sources, MEASURES, strict=True):
         svg = base64.b64decode(source.partition(",")[2]).decode()
         assert "prefers-color-scheme:dark" in svg
-        for comparison in ladder.comparisons:
-            difference = getattr(comparison, measure.key).difference
+        for contrast in ladder.contrasts:
+            difference = measure.change(contrast.paired).difference
             assert f">{difference.value:+.2f}, n = {difference.n}<" in svg
     with Image.open(out / "ladder.png") as image:
         image.load()
@@ -439,7 +466,7 @@ def test_figures_say_what_the_tables_say(whole: tuple[Path, str]) -> None:
 def test_a_bar_lies_where_its_interval_is(whole: tuple[Path, str]) -> None:
     """The bar of the figure, in pixels, against the numbers on its axis."""
     ladder = read_ladder(whole[0])
-    picture = differences_figure(ladder, MEASURES[1])
+    picture = contrast_pictures("x", ladder, ladder.contrasts)[1]
     with Image.open(io.BytesIO(picture.png)) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
     blue = np.abs(pixels - (0x28, 0x68, 0xA8)).sum(axis=2) < 30
@@ -451,38 +478,42 @@ def test_a_bar_lies_where_its_interval_is(whole: tuple[Path, str]) -> None:
     assert len(zero)
     ends = [np.flatnonzero(blue[row])[[0, -1]] - zero.mean() for row in (lockstep_row, sitl_row)]
     limits = [
-        (c.flight_time_s.difference.low or 0.0, c.flight_time_s.difference.high or 0.0)
-        for c in ladder.comparisons
+        (d.low or 0.0, d.high or 0.0)
+        for d in (c.paired.flight_time_s.difference for c in ladder.contrasts)
     ]
     # One scale for all of it: pixels a percent.
     scale = np.ptp(ends[0]) / np.ptp(limits[0])
     assert np.ravel(ends) == pytest.approx(scale * np.ravel(limits), abs=4.0)
 
 
-def test_foreign_text_is_escaped(rehearsed: Ladder, tmp_path: Path) -> None:
+def test_foreign_text_is_escaped(rehearsed: tuple[Path, Comparison], tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>&\"'"
-    levels = tuple(replace(level, t2=f"{evil} {level.name}") for level in rehearsed.levels)
-    spoiled = replace(
-        rehearsed, path=tmp_path, facts={"policy": evil, "arena": evil, evil: evil}, levels=levels
-    )
-    text = build_page(spoiled).read_text(encoding="utf-8")
+    root, ladder = rehearsed
+    spoiled = replace(ladder, title=evil, facts={"policy": evil, "arena": evil, evil: evil})
+    runs = {run.name: load(root / run.name) for run in ladder.runs}
+    text = write_comparison(spoiled, runs, tmp_path).read_text(encoding="utf-8")
     page = Page(text)
     assert "script" not in page.tags
     assert "<script" not in text
-    assert page.text.count(evil) >= 6
+    assert page.text.count(evil) >= 5
 
 
-def test_a_level_without_any_success_still_has_a_page(rehearsed: Ladder, tmp_path: Path) -> None:
-    lockstep, _ = rehearsed.levels
-    runs = load(rehearsed.path / "sitl")
+def test_a_level_without_any_success_still_has_a_page(
+    rehearsed: tuple[Path, Comparison], tmp_path: Path
+) -> None:
+    runs = load(rehearsed[0] / "sitl")
     folder = RunFolder.create(tmp_path / "sitl", "demo", {}, setup=runs.info.setup)
     failed = replace(runs.episodes[0], outcome=Outcome.COLLISION, quality=None, navigation_us=None)
     folder.save_episode(failed, runs.trajectories[0], {})
     folder = RunFolder.create(tmp_path / "lockstep", "demo", {}, setup=runs.info.setup)
-    folder.save_episode(lockstep.episodes[0], runs.trajectories[0], runs.latency[0])
-    ladder = build_ladder(tmp_path, {}, [Held(n, (n,), 1) for n in ("lockstep", "sitl")])
-    assert [row[3:] for row in comparison_tables(ladder)[0].rows[1:]] == [("–", "–", "0")] * 3
-    assert "n = 0" in Page(build_page(ladder).read_text(encoding="utf-8")).text
+    reached = load(rehearsed[0] / "lockstep").episodes[0]
+    folder.save_episode(reached, runs.trajectories[0], runs.latency[0])
+    recipe = ladder_recipe({}, [RunEntry(n, n, planned=1) for n in ("lockstep", "sitl")])
+    ladder, loaded = build_comparison(tmp_path, "ladder", recipe)
+    rows = comparison_tables(ladder)[0].rows[1:]
+    assert [row[3:] for row in rows] == [("–", "–", "–", "0")] * 3
+    page = write_comparison(ladder, loaded, tmp_path)
+    assert "n = 0" in Page(page.read_text(encoding="utf-8")).text
 
 
 def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
@@ -498,10 +529,15 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     ("content", "named"),
     [
         ("{", "not JSON"),
-        ('{"schema": 99}', "schema = 99: accepted: 1"),
-        ('{"schema": 1, "facts": {}, "levels": [{"name": "gym"}]}', "levels.0.folders"),
+        ('{"schema": 99}', "schema = 99: accepted: 2"),
         (
-            '{"schema": 1, "facts": {}, "levels": [{"name": "g", "folders": ["g"], "planned": 1}]}',
+            '{"schema": 2, "title": "", "facts": {}, "contrasts": [], '
+            '"runs": [{"entry": {"name": "gym"}}]}',
+            "runs.0.entry.folder",
+        ),
+        (
+            '{"schema": 2, "title": "", "facts": {}, "contrasts": [], '
+            '"runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
             "no run here",
         ),
     ],
@@ -526,7 +562,7 @@ def test_an_interrupted_ladder_goes_on(
     assert code == 130
     assert f"the same command with --out {out} goes on" in text
     assert "2 of 6 at sitl" in text
-    assert data_of(out)["comparisons"][1]["success_rate"]["difference"]["n"] == 2
+    assert contrasts_of(data_of(out))[1]["success_rate"]["difference"]["n"] == 2
     # Cut again before anything was flown, then to the end.
     assert climb(out=out)[0] == 130
     code, text = climb(out=out)

@@ -22,19 +22,19 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.ages import ages_table, run_ages
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
-from airl_mav.report.html import MAX_PICTURED, build_report
-from airl_mav.report.summary import summarize_run
-from airl_mav.report.tables import (
-    TableView,
+from airl_mav.report.forensics.worst import examine_worst
+from airl_mav.report.run_page import MAX_PICTURED, build_page
+from airl_mav.report.run_report import print_report
+from airl_mav.report.run_summary import summarize_run
+from airl_mav.report.run_tables import (
     episodes_table,
     latency_table,
     quality_table,
     real_time_table,
 )
-from airl_mav.report.terminal import print_report
+from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
-from airl_mav.report.worst import judge_worst
 from tests.support.run_demo import OUTCOMES_SEEN, demo_setup, write_demo_run
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -79,7 +79,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, dict[int,
 
 @pytest.fixture(scope="module")
 def page(demo: tuple[LoadedRun, dict[int, Arena]]) -> str:
-    return build_report(*demo).read_text(encoding="utf-8")
+    return build_page(*demo).read_text(encoding="utf-8")
 
 
 def cells(view: TableView, first: str) -> dict[str, str]:
@@ -209,7 +209,7 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
 def test_the_same_run_gives_the_same_page(
     page: str, demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path
 ) -> None:
-    assert build_report(*demo, tmp_path / "again").read_text(encoding="utf-8") == page
+    assert build_page(*demo, tmp_path / "again").read_text(encoding="utf-8") == page
 
 
 def test_the_path_on_the_map_is_where_the_vehicle_was(
@@ -267,7 +267,7 @@ def test_worst_flights_come_first_and_have_causes(
     demo: tuple[LoadedRun, dict[int, Arena]],
 ) -> None:
     run, arenas = demo
-    judged = judge_worst(run, arenas, load_vehicle("quad"))
+    judged = examine_worst(run, arenas, load_vehicle("quad"))
     failed = [j.record.outcome is not Outcome.SUCCESS for j in judged]
     assert failed == sorted(failed, reverse=True)
     lost = [j.lost_s or 0.0 for j, bad in zip(judged, failed, strict=True) if not bad]
@@ -275,7 +275,7 @@ def test_worst_flights_come_first_and_have_causes(
     hits = [j for j in judged if j.record.outcome is Outcome.COLLISION]
     assert hits
     for j in hits:
-        assert "collision" in " ".join(j.cause.words)
+        assert "collision" in " ".join(j.cause.sentences)
         assert j.cause.kind != "no cause found in the data"
 
 
@@ -333,7 +333,7 @@ def test_user_text_is_escaped(demo: tuple[LoadedRun, dict[int, Arena]], tmp_path
     info = replace(run.info, name=evil, config={evil: evil}, setup=setup)
     episode = replace(run.episodes[0], reason=evil, notes=(evil,))
     spoiled = replace(run, info=info, episodes=(episode,))
-    text = build_report(spoiled, arenas, tmp_path).read_text(encoding="utf-8")
+    text = build_page(spoiled, arenas, tmp_path).read_text(encoding="utf-8")
     parsed = Page(text)
     assert "alert(1)</script>" not in text
     assert text.count("<script") == 2
@@ -354,7 +354,7 @@ def test_a_lockstep_run_and_an_aborted_flight(
         trajectories={},
         latency={0: same},
     )
-    text = " ".join(Page(build_report(bare, {}, tmp_path).read_text(encoding="utf-8")).words)
+    text = " ".join(Page(build_page(bare, {}, tmp_path).read_text(encoding="utf-8")).words)
     assert "not paced" in text
     assert "aborted" in text
     assert "nothing injected" in text
@@ -363,7 +363,7 @@ def test_a_lockstep_run_and_an_aborted_flight(
 def test_a_run_without_flights_still_has_a_page(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run", "empty", {}, setup=demo_setup())
     run = load(folder.path)
-    parsed = Page(build_report(run, {}).read_text(encoding="utf-8"))
+    parsed = Page(build_page(run, {}).read_text(encoding="utf-8"))
     assert "no flight finished" in " ".join(parsed.words)
     assert parsed.images == []
     print_report(run, Console(file=io.StringIO(), width=80))
@@ -377,7 +377,7 @@ def test_pictures_go_to_the_flights_that_failed(
     bad = next(e for e in run.episodes if e.outcome is Outcome.TIMEOUT)
     n = MAX_PICTURED + 4
     many = [replace(good if i < n - 2 else bad, index=i) for i in range(n)]
-    text = build_report(
+    text = build_page(
         replace(run, episodes=tuple(many), trajectories={}, latency={}), {}, tmp_path
     ).read_text(encoding="utf-8")
     shown = [int(i) for i in re.findall(r"<h3>Flight (\d+)</h3>", text)]
@@ -416,12 +416,12 @@ def test_a_run_in_which_nothing_arrived(
     lost = replace(run.episodes[0], outcome=Outcome.TIMEOUT, reason="9.00 m from the goal")
     for latency in (run.latency, {}):
         alone = replace(run, episodes=(lost,), latency=latency)
-        path = build_report(alone, arenas, tmp_path, vehicle=load_vehicle("quad"))
+        path = build_page(alone, arenas, tmp_path, vehicle=load_vehicle("quad"))
         text = " ".join(Page(path.read_text(encoding="utf-8")).words)
         assert "Worst flights" in text
         assert "Closest to the goal after" in text
     grounded = replace(lost, quality=None, navigation_us=None, outcome=Outcome.ABORTED)
     bare = replace(run, episodes=(grounded,), latency={}, trajectories={})
-    text = build_report(bare, {}, tmp_path / "bare").read_text(encoding="utf-8")
+    text = build_page(bare, {}, tmp_path / "bare").read_text(encoding="utf-8")
     assert "Aborted." in text
     assert 'id="scene"' not in text

@@ -16,7 +16,7 @@ from PIL import Image
 
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.html import build_report
+from airl_mav.report.run_page import build_page
 from tests.support.run_demo import write_demo_run
 
 CHROMIUM = next(
@@ -138,7 +138,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, arenas = write_demo_run(
         tmp_path_factory.mktemp("page") / "demo", episodes=3, profile="dynamic-obstacles"
     )
-    return build_report(load(folder.path), arenas, vehicle=load_vehicle("quad"))
+    return build_page(load(folder.path), arenas, vehicle=load_vehicle("quad"))
 
 
 def test_nothing_fails_and_the_view_turns(page: Path) -> None:

@@ -12,7 +12,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import scene
-from airl_mav.report.figures import coloured_pieces
+from airl_mav.report.run_figures import coloured_pieces
 from airl_mav.report.scene import (
     POINTS,
     SceneFlight,
@@ -66,7 +66,7 @@ def test_nothing_can_end_the_script_element(
 ) -> None:
     run, arenas = demo
     evil = "</script><!--<script>"
-    monkeypatch.setitem(scene.OUTCOME_WORDS, Outcome.BATTERY, evil)
+    monkeypatch.setitem(scene.OUTCOME_LABELS, Outcome.BATTERY, evil)
     text = scene_json(run, shown(run, arenas), run.episodes, 0.0)
     assert "<" not in text
     assert json.loads(text)["outcomes"]["battery"]["words"] == evil

@@ -26,7 +26,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.gap import terminal as gap_terminal
+from airl_mav.report.comparison import show
 from airl_mav.studies.ablation import ABLATION_STUDY, SENSES, AblationConfig
 from airl_mav.studies.ablation import cells as ablation_cells
 from airl_mav.studies.degradation import DEGRADATION_STUDY, DegradationConfig
@@ -160,7 +160,7 @@ def test_degradation_is_that_of_the_files(degraded: tuple[Path, str]) -> None:
             a, b = (
                 np.mean([e[s]["quality"]["flight_time_s"] for s in common]) for e in (first, second)
             )
-            change = gap["flight_time_s"]["change"]
+            change = gap["flight_time_s"]
             assert change["difference"]["value"] == pytest.approx(100.0 * (b / a - 1.0))
             assert change["difference"]["n"] == len(common)
 
@@ -170,7 +170,7 @@ def test_it_says_whether_it_is_monotone(degraded: tuple[Path, str]) -> None:
     (policy,) = data_of(out)["policies"]
     rates = [cell["success_rate"]["value"] for cell in policy["cells"]]
     assert ("success never rises" in text) == all(b <= a for a, b in pairwise(rates))
-    steps = [gap["flight_time_s"]["change"]["difference"] for gap in policy["steps"]]
+    steps = [gap["flight_time_s"]["difference"] for gap in policy["steps"]]
     few = [step for step in steps if step["n"] < 10]
     (line,) = [x for x in (out / "study.md").read_text().splitlines() if "flight time:" in x]
     assert ("ewer than 10 pairs" in line) == bool(few)
@@ -326,7 +326,7 @@ def test_system_evaluation(tmp_path: Path) -> None:
     )
     common = [s for s in first if first[s]["outcome"] == second[s]["outcome"] == "success"]
     a, b = (np.mean([e[s]["quality"]["energy_j"] for s in common]) for e in (first, second))
-    found = arena["gap"]["energy_j"]["change"]["difference"]
+    found = arena["gap"]["energy_j"]["difference"]
     assert found["value"] == pytest.approx(100.0 * (b / a - 1.0))
     # 37.37 s against 25.29 s in the paper.
     assert "+47.8 %" in text
@@ -389,7 +389,7 @@ def test_mitigation(tmp_path: Path) -> None:
         'mitigated = "static-obstacles-ppo"\nfan = { arena_seed = 4, flights = 2 }\n',
     )
     # The page of the gap takes longer than the flights.
-    with patch.object(gap_terminal, "build_page", lambda s, _: s.path):
+    with patch.object(show, "write_document", lambda _, folder: folder / "gap.html"):
         code, text = study(MITIGATION_STUDY, config, tmp_path / "out")
     assert code == 0
     assert (tmp_path / "out" / "gap" / "gap.json").exists()

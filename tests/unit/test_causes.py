@@ -9,9 +9,21 @@ import numpy as np
 import pytest
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
-from airl_mav.flight.causes import USUAL, cause_of
-from airl_mav.flight.collisions import acting, examine, hit_number
-from airl_mav.flight.evidence import (
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.forensics.camera_view import (
+    PolicyCamera,
+    bearing,
+    nearest_spot,
+    view_obstacle,
+    view_wall,
+)
+from airl_mav.report.forensics.causes import USUAL, cause_of
+from airl_mav.report.forensics.collisions import acting, examine, hit_number
+from airl_mav.report.forensics.evidence import (
     NO_CAUSE,
     Evidence,
     Standard,
@@ -20,17 +32,11 @@ from airl_mav.flight.evidence import (
     straight_m,
     time_lost_s,
 )
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.sight import Sight, bearing, nearest_spot, view_obstacle, view_wall
-from airl_mav.flight.swings import MIN_TURNS, SPOT_M, longest_swing, stretches
-from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.safe_velocity import max_acceleration
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.forensics.swings import MIN_TURNS, SPOT_M, longest_swing, stretches
 
 CAMERA = load_vehicle("quad").camera
-SIGHT = Sight.of(CAMERA)
+SIGHT = PolicyCamera.of(CAMERA)
 USUAL_RUN = Standard(pace_s_m=0.4, stretch=1.05, speed_m_s=2.5)
 
 
@@ -126,7 +132,7 @@ def crash(
 ) -> tuple[str, str]:
     record = record_of(path, Outcome.COLLISION, reason)
     cause = cause_of(Evidence(record, path, stamps, arena, SIGHT, 9.8), USUAL_RUN)
-    return cause.kind, " ".join(cause.words)
+    return cause.kind, " ".join(cause.sentences)
 
 
 AHEAD = flight_of([(0.0, 0.0, 0.0), (4.0, 8.0, 0.0)])
@@ -204,7 +210,7 @@ def test_a_collision_without_decisions_or_recording_claims_nothing() -> None:
     # Without arena or camera the times stand, and no cause is made up.
     bare = cause_of(Evidence(record, AHEAD, stamps_of(AHEAD)), USUAL_RUN)
     assert bare.kind == NO_CAUSE
-    assert "flew 1.0 m on it" in " ".join(bare.words)
+    assert "flew 1.0 m on it" in " ".join(bare.sentences)
     early = replace(record, reason="hit floor during the take-off")
     assert cause_of(Evidence(early, AHEAD, {}), USUAL_RUN).kind == "hit during the take-off"
 
@@ -296,7 +302,7 @@ def test_swinging_is_found_counted_and_timed() -> None:
     record = record_of(spin, Outcome.TIMEOUT, "7.50 m from the goal after 60 s")
     cause = cause_of(Evidence(record, spin, stamps), USUAL_RUN)
     assert cause.kind == "swung left and right on the spot"
-    words = " ".join(cause.words)
+    words = " ".join(cause.sentences)
     assert "7.5 m (radius 2 m, 20.0 m at the start); 7.5 m at the end" in words
     assert f"the vehicle stayed within {SPOT_M:g} m" in words
 
@@ -321,31 +327,31 @@ def test_circling_standing_and_late_decisions() -> None:
     record = record_of(round_and_round, Outcome.TIMEOUT, "14.00 m from the goal after 30 s")
     cause = cause_of(Evidence(record, round_and_round, {}), USUAL_RUN)
     assert cause.kind == "circled"
-    assert "4.0 times round to the left" in " ".join(cause.words)
+    assert "4.0 times round to the left" in " ".join(cause.sentences)
 
     stands = flight_of([(0.0, 0.0, 0.0), (4.0, 8.0, 0.0), (10.0, 8.0, 0.0), (15.0, 18.0, 0.0)])
     record = record_of(stands, Outcome.SUCCESS, "1.99 m from the goal")
     stood = cause_of(Evidence(record, stands, {}), USUAL_RUN)
     assert stood.kind == "stood still"
-    assert "6.0 s, 40% of the time" in " ".join(stood.words)
+    assert "6.0 s, 40% of the time" in " ".join(stood.sentences)
 
     stamps = stamps_of(stands)
     keep = (stamps["capture_us"] < 4_000_000) | (stamps["capture_us"] > 9_000_000)
     gap = cause_of(Evidence(record, stands, {k: v[keep] for k, v in stamps.items()}), USUAL_RUN)
-    assert "At 3.6 s no command came for 6.0 s; usual: 0.50 s" in " ".join(gap.words)
+    assert "At 3.6 s no command came for 6.0 s; usual: 0.50 s" in " ".join(gap.sentences)
 
 
 def test_passing_the_goal_is_told_with_the_distance() -> None:
     past = flight_of([(0.0, 0.0, 0.0), (8.0, 20.0, 2.5), (12.0, 30.0, 2.5), (17.0, 21.0, 1.0)])
     record = record_of(past, Outcome.SUCCESS, "1.41 m from the goal")
     cause = cause_of(Evidence(record, past, {}), USUAL_RUN)
-    assert "passed the goal at 2.5 m and left again" in " ".join(cause.words)
+    assert "passed the goal at 2.5 m and left again" in " ".join(cause.sentences)
     assert cause.kind == "passed the goal"
     straight = flight_of([(0.0, 0.0, 0.0), (30.0, 18.1, 0.0)])
     record = record_of(straight, Outcome.SUCCESS, "1.90 m from the goal")
     slow = cause_of(Evidence(record, straight, {}), USUAL_RUN)
     assert slow.kind == "flew slowly"
-    assert "0.6 m/s; usual in this run: 2.5 m/s" in slow.words[0]
+    assert "0.6 m/s; usual in this run: 2.5 m/s" in slow.sentences[0]
 
 
 def test_a_detour_is_one_with_or_without_need() -> None:
@@ -367,11 +373,11 @@ def test_a_usual_flight_has_no_cause_and_a_strange_one_none_made_up() -> None:
     short = cause_of(Evidence(replace(lost, time_limit_s=5.0), away, {}), USUAL_RUN)
     assert short.kind == "a time limit too short for the way"
     # 18 m of straight way at 0.4 s for each.
-    assert "the way takes 7.2 s; the limit is 5 s" in short.words[-1]
+    assert "the way takes 7.2 s; the limit is 5 s" in short.sentences[-1]
     aborted = replace(lost, outcome=Outcome.ABORTED, reason="Ctrl-C")
-    assert cause_of(Evidence(aborted, away, {}), USUAL_RUN).words == ("Ctrl-C.",)
+    assert cause_of(Evidence(aborted, away, {}), USUAL_RUN).sentences == ("Ctrl-C.",)
     empty = replace(lost, outcome=Outcome.BATTERY, reason="battery empty")
-    words = " ".join(cause_of(Evidence(empty, away, {}), USUAL_RUN).words)
+    words = " ".join(cause_of(Evidence(empty, away, {}), USUAL_RUN).sentences)
     assert "10 s at 450 W on average emptied the battery" in words
 
 

@@ -15,7 +15,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import (
     Agreement,
     common_successes,
-    compare,
+    compare_pairs,
     count_agreement,
     pair_by_seed,
     relative_difference,
@@ -260,7 +260,7 @@ def test_a_comparison_by_hand(runs: tuple[list[EpisodeRecord], list[EpisodeRecor
     # 2 and 6: both. 3: the reference alone. 4: the other alone. 5: neither.
     assert count_agreement(paired) == Agreement(2, 1, 1, 1)
     assert len(common_successes(paired)) == 2
-    found = compare(*runs)
+    found = compare_pairs(*runs)
     assert found.agreement.n == 5
     assert found.success_rate.reference == found.success_rate.other == pytest.approx(3 / 5)
     by_points = tango(1, 1, 5)
@@ -277,10 +277,10 @@ def test_a_comparison_by_hand(runs: tuple[list[EpisodeRecord], list[EpisodeRecor
 
 
 def test_runs_without_common_seeds_or_successes(flight: EpisodeRecord) -> None:
-    apart = compare([flown(flight, 1, GOOD)], [flown(flight, 2, GOOD)])
+    apart = compare_pairs([flown(flight, 1, GOOD)], [flown(flight, 2, GOOD)])
     assert apart.agreement.n == apart.success_rate.difference.n == 0
     assert apart.success_rate.reference is apart.success_rate.difference.value is None
-    failed = compare([flown(flight, 1, GOOD)], [flown(flight, 1, BAD)])
+    failed = compare_pairs([flown(flight, 1, GOOD)], [flown(flight, 1, BAD)])
     assert failed.success_rate.difference.value == -100.0
     assert failed.success_rate.difference.n == 1
     assert failed.flight_time_s.reference is failed.flight_time_s.difference.value is None

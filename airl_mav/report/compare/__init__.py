@@ -1,1 +1,0 @@
-"""Any number of runs beside each other: worked out, tabled, drawn."""

@@ -1,0 +1,250 @@
+"""From run folders to a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import compare_pairs, percent_change
+from airl_mav.flight.record import EpisodeRecord, run_sha256
+from airl_mav.flight.statistics import aggregate
+from airl_mav.latency.percentiles import summarize
+from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.model import (
+    ComparedRun,
+    Comparison,
+    ComparisonRecipe,
+    Contrast,
+    ContrastEntry,
+    Kind,
+    NavigationStart,
+    RunEntry,
+)
+from airl_mav.report.loading import load_run
+from airl_mav.report.run_tables import setup_rows
+
+SHORT_NAME = 14
+"""Runs whose names are all this short or shorter need no letters."""
+
+UNCOMPARED = ("sha256 of the flights",)
+"""Terms that always differ, and explain nothing."""
+
+MACHINE_TERMS = ("cpu", "os")
+"""What is told of the machine that flew, of what its run says."""
+
+
+def compare(
+    runs: Mapping[str, LoadedRun],
+    contrasts: Sequence[ContrastEntry] | None = None,
+    *,
+    kind: Kind = "compare",
+    title: str = "",
+    facts: Mapping[str, Any] | None = None,
+    entries: Sequence[RunEntry] = (),
+) -> Comparison:
+    """Compare runs.
+
+    Args:
+        runs: By name, in the order of the tables, one or more.
+        contrasts: Which run is compared with which reference, by their names; None: every run with
+            the first.
+        kind: Names the files of the comparison.
+        title: One line for people.
+        facts: What was asked for.
+        entries: What is known of the runs besides their flights; none: their names.
+
+    Raises:
+        UsageError: There is no run, a run holds no flight, or a seed twice.
+    """
+    if not runs:
+        raise UsageError(f"no run here; accepted: a {kind} of one run or more")
+    by_name = {entry.name: entry for entry in entries}
+    given = [by_name.get(name) or RunEntry(name, str(run.path)) for name, run in runs.items()]
+    for run in runs.values():
+        if not run.episodes:
+            raise UsageError(f"{run.path}: no flight was finished: nothing to compare")
+    if contrasts is None:
+        first = next(iter(runs))
+        contrasts = [
+            ContrastEntry(name, first, title=f"{name} against {first}")
+            for name in runs
+            if name != first
+        ]
+    marks = _marks(given)
+    compared = tuple(_compared_run(entry, marks[entry.name], runs[entry.name]) for entry in given)
+    figures = {run.name: run for run in compared}
+    return Comparison(
+        kind=kind,
+        title=title,
+        facts=dict(facts or {}),
+        runs=compared,
+        contrasts=tuple(_contrast(entry, runs, figures) for entry in contrasts),
+    )
+
+
+def load_runs(folder: Path, entries: Iterable[RunEntry]) -> dict[str, LoadedRun]:
+    """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
+    return {entry.name: load_run(folder / entry.folder) for entry in entries}
+
+
+def from_recipe(kind: Kind, recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
+    """Work a comparison out from its recipe."""
+    return compare(
+        runs,
+        recipe.contrasts,
+        kind=kind,
+        title=recipe.title,
+        facts=recipe.facts,
+        entries=recipe.entries,
+    )
+
+
+def tests_of(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the flights that say something of the policy: all but aborted ones."""
+    return [episode for episode in run.episodes if episode.outcome is not Outcome.ABORTED]
+
+
+def letter(index: int) -> str:
+    """Return A to Z, then AA, AB and so on."""
+    rest, last = divmod(index, 26)
+    return ("" if not rest else letter(rest - 1)) + chr(ord("A") + last)
+
+
+def _marks(entries: Sequence[RunEntry]) -> dict[str, str]:
+    """Return what stands for each run: letters, group by group, unless all names are short."""
+    if all(len(entry.label or entry.name) <= SHORT_NAME for entry in entries):
+        return {entry.name: entry.label or entry.name for entry in entries}
+    counts: dict[str, int] = {}
+    marks = {}
+    for entry in entries:
+        marks[entry.name] = letter(counts.get(entry.group, 0))
+        counts[entry.group] = counts.get(entry.group, 0) + 1
+    return marks
+
+
+def _compared_run(entry: RunEntry, mark: str, run: LoadedRun) -> ComparedRun:
+    """Work out one run."""
+    tests = tests_of(run)
+    samples = pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
+    planned = len(run.info.seeds) if entry.planned is None else entry.planned
+    return ComparedRun(
+        entry=entry,
+        mark=mark,
+        setup=run.info.setup,
+        planned=planned,
+        flown=len(run.episodes),
+        facts=_facts(run),
+        quality=aggregate(run.episodes),
+        stages={stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES},
+        slipped_us=sum(episode.slipped_us for episode in run.episodes),
+        start=_navigation_start(run, tests),
+        position_error_m=_position_error(run, tests),
+        sha256=run_sha256(run.episodes) if len(run.episodes) == planned else None,
+    )
+
+
+def _contrast(
+    entry: ContrastEntry, runs: Mapping[str, LoadedRun], figures: Mapping[str, ComparedRun]
+) -> Contrast:
+    """Compare a run with its reference on the episodes that both flew."""
+    reference, target = runs[entry.reference], runs[entry.target]
+    flown = {episode.seed: _task(episode) for episode in reference.episodes}
+    known = [episode for episode in target.episodes if episode.seed in flown]
+    same = [episode for episode in known if _task(episode) == flown[episode.seed]]
+    try:
+        paired = compare_pairs(reference.episodes, same)
+    except ValueError as error:
+        raise UsageError(f"{reference.path} and {target.path}: {error}") from None
+    early, late = (figures[name].stages["t2"].mean for name in (entry.reference, entry.target))
+    return Contrast(
+        entry=entry,
+        paired=paired,
+        unmatched=len(known) - len(same),
+        t2_percent=percent_change(early, late) if early and late is not None else None,
+    )
+
+
+def _task(episode: EpisodeRecord) -> tuple[str, int, tuple[float, float]]:
+    """Return what makes two flights of one seed the same task."""
+    return episode.arena, episode.arena_seed, episode.goal
+
+
+def _facts(run: LoadedRun) -> dict[str, str]:
+    """Return what was flown on what, by term: the setup, then the settings."""
+    facts = dict(setup_rows(run))
+    facts["flights"] = f"{len(tests_of(run)):,}"
+    seeds = [episode.seed for episode in run.episodes]
+    low, high = min(seeds), max(seeds)
+    facts["seeds"] = f"{low} to {high}" if low != high else f"{low}"
+    radii = dict.fromkeys(f"{episode.goal_radius_m:g} m" for episode in run.episodes)
+    limits = dict.fromkeys(f"{episode.time_limit_s:g} s" for episode in run.episodes)
+    facts["goal radius"], facts["time limit"] = ", ".join(radii), ", ".join(limits)
+    if (seed := run.info.config.get("arena_seed")) is not None:
+        facts["arena and goal of seed"] = f"{seed}"
+    if (hold := _hold(run.info.config)) is not None:
+        facts["hold t3"] = f"{hold:g} s"
+    facts["commit"] = _commit(run.info.git)
+    facts["flown on"] = ", ".join(
+        f"{run.info.machine[key]}" for key in MACHINE_TERMS if run.info.machine.get(key)
+    )
+    return {term: text for term, text in facts.items() if text and term not in UNCOMPARED}
+
+
+def _commit(git: Mapping[str, Any] | None) -> str:
+    if git is None or not git.get("commit"):
+        return ""
+    changed = " (with changes)" if git.get("changed") else ""
+    return f"{str(git['commit'])[:10]}{changed}"
+
+
+def _hold(config: Mapping[str, Any]) -> float | None:
+    """Return the hold time, in whatever table the level writes it down [s]."""
+    held = config.get("hold_s")
+    if isinstance(held, (int, float)):
+        return float(held)
+    tables = (value for value in config.values() if isinstance(value, Mapping))
+    return next((found for table in tables if (found := _hold(table)) is not None), None)
+
+
+def _navigation_start(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> NavigationStart | None:
+    """Return where navigation begins."""
+    rows = []
+    for episode in tests:
+        path = run.trajectories.get(episode.index)
+        if path is None or episode.navigation_us is None or episode.quality is None:
+            continue
+        at = path.between(episode.navigation_us, episode.navigation_us)
+        if len(at):
+            takeoff = episode.quality.takeoff
+            (north, east, down), speed = at.position[0], at.speed()[0]
+            leg = (takeoff.time_s, takeoff.distance_m, takeoff.energy_j)
+            rows.append((*leg, float(np.hypot(north, east)), -down, speed))
+    if not rows:
+        return None
+    return NavigationStart(len(rows), *(float(mean) for mean in np.mean(rows, axis=0)))
+
+
+def _position_error(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> float | None:
+    """Return the mean over flights of the mean error of the estimated position [m]."""
+    errors = []
+    for episode in tests:
+        path = run.trajectories.get(episode.index)
+        arrays = run.latency.get(episode.index, {})
+        if path is None or episode.navigation_us is None or "estimate/time_us" not in arrays:
+            continue
+        times, believed = arrays["estimate/time_us"], arrays["estimate/position"]
+        flown = (times >= episode.navigation_us) & (times <= episode.ended_us)
+        if len(path) and flown.any():
+            away = [
+                believed[flown, axis]
+                - np.interp(times[flown], path.time_us, path.position[:, axis])
+                for axis in (0, 1)
+            ]
+            errors.append(float(np.hypot(*away).mean()))
+    return float(np.mean(errors)) if errors else None

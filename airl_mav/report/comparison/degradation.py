@@ -1,0 +1,264 @@
+"""The degradation curve: what injected latency costs a policy, on the same seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from airl_mav.flight.statistics import Estimate
+from airl_mav.profiles.published import load_published, published_gap
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import compare
+from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.model import (
+    Comparison,
+    ComparisonRecipe,
+    Contrast,
+    ContrastEntry,
+    RunEntry,
+)
+from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
+from airl_mav.report.curves import Series, curves_picture
+from airl_mav.report.document import Document, Section
+from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, Measure
+from airl_mav.report.table import US_PER_MS, Column, TableView, ms
+from airl_mav.report.theme import Picture
+
+AGAINST_FIRST, STEP = "against-first", "step"
+"""Keys of the contrasts with the first latency, and with the one before."""
+
+LOSSES = (FLIGHT_TIME, DISTANCE, ENERGY)
+
+FEWEST = 10
+"""Pairs from which on a step says something."""
+
+
+def degradation_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+    """Return what a degradation curve is worked out from.
+
+    Args:
+        facts: What all runs share: `arena`, ...
+        entries: Runs by growing latency, the reference first; their `label` is the latency, their
+            `group` the policy.
+    """
+    contrasts: list[ContrastEntry] = []
+    for group in dict.fromkeys(entry.group for entry in entries):
+        line = [entry for entry in entries if entry.group == group]
+        first = line[0]
+        contrasts += [
+            ContrastEntry(
+                each.name,
+                first.name,
+                AGAINST_FIRST,
+                f"{each.label} against {first.label}",
+            )
+            for each in line[1:]
+        ]
+        contrasts += [
+            ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}") for a, b in pairwise(line)
+        ]
+    return ComparisonRecipe("Degradation by latency", dict(facts), tuple(entries), tuple(contrasts))
+
+
+def build_degradation(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
+    """Work out a curve. Raises UsageError: there is no run, or a run holds no flight."""
+    comparison = compare(
+        runs,
+        recipe.contrasts,
+        kind="degradation",
+        title=recipe.title,
+        facts=recipe.facts,
+        entries=recipe.entries,
+    )
+    told = [line for policy in comparison.groups for line in _verdict(comparison, policy)]
+    return replace(comparison, answers=tuple(told))
+
+
+def contrasts_by_key(comparison: Comparison, policy: str, key: str) -> list[Contrast]:
+    """Return the contrasts of a policy with the first latency, or with the one before each."""
+    return [c for c in comparison.contrasts_of(policy) if c.entry.key == key]
+
+
+# --- the verdict
+
+
+def _verdict(comparison: Comparison, policy: str) -> list[str]:
+    """Return whether every step costs more, and how much all of them."""
+    steps = contrasts_by_key(comparison, policy, STEP)
+    lines = [f"{policy}, {measure.title}: {_monotone(measure, steps)}" for measure in LOSSES]
+    rates = [run.quality.success_rate.value or 0.0 for run in comparison.group(policy)]
+    told = ", ".join(f"{100.0 * rate:.1f}" for rate in rates)
+    return [*lines, f"{policy}, success {_success_trend(steps)}: {told} %."]
+
+
+def _success_trend(steps: Sequence[Contrast]) -> str:
+    """Return whether the success rate rises at any step."""
+    rises = [(step.entry.title, step.paired.success_rate.difference) for step in steps]
+    if sure := [title for title, d in rises if d.low is not None and d.low > 0.0]:
+        return f"not monotone, it rises at {', '.join(sure)}"
+    if any(d.value is not None and d.value > 0.0 for _, d in rises):
+        return "rises nowhere beyond chance"
+    return "never rises"
+
+
+def _monotone(measure: Measure, steps: Sequence[Contrast]) -> str:
+    """Return whether a measure grows with every step."""
+    changes = [(step.entry.title, measure.change(step.paired).difference) for step in steps]
+    known = [(title, d) for title, d in changes if d.value is not None and d.n >= FEWEST]
+    if not known:
+        return f"fewer than {FEWEST} pairs at every step."
+    short = [title for title, d in changes if d.value is None or d.n < FEWEST]
+    told = ", ".join(f"{d.value:+.1f} % ({title})" for title, d in known)
+    if down := [title for title, d in known if (d.value or 0.0) <= 0.0]:
+        verdict = f"not monotone, it falls at {', '.join(down)}"
+    elif all(d.low is not None and d.low > 0.0 for _, d in known):
+        verdict = "monotone, every step's interval above zero"
+    else:
+        verdict = "monotone"
+    rest = f" Fewer than {FEWEST} pairs: {', '.join(short)}." if short else ""
+    return f"{verdict}: {told}.{rest}"
+
+
+# --- tables and figures
+
+
+def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
+    """Return every latency by itself."""
+    columns = (
+        Column("latency", number=False),
+        Column("t2", "ms"),
+        *(Column(measure.title, measure.unit) for measure in MEASURES),
+    )
+    rows = tuple(
+        (
+            run.label,
+            ms(run.stages["t2"].mean, 0),
+            *(measure.with_interval(measure.of(run.quality)) for measure in MEASURES),
+        )
+        for run in comparison.group(policy)
+    )
+    notes = (
+        "Means over the flights that reached the goal at that latency, 95 % intervals in brackets.",
+    )
+    return TableView(f"{policy}-by-latency", f"{policy} by latency", columns, rows, notes)
+
+
+def published_curve_table() -> TableView:
+    """Return the published curve, its losses worked out as ours."""
+    columns = (
+        Column("the paper", number=False),
+        *(Column(measure.title, measure.unit) for measure in LOSSES),
+        *(Column(title, "%") for title in ("time", "distance", "energy")),
+    )
+    rows = tuple(
+        (
+            f"{each.latency_ms:g} ms",
+            *(f"{v:.2f}" for v in (each.flight_time_s, each.distance_m, each.energy_kj)),
+            *(signed(loss) for loss in _published_losses(number)),
+        )
+        for number, each in enumerate(load_published().degradation)
+    )
+    notes = (
+        "Section VI.C: its Static Obstacles policy on a Core i9 slowed by sleep; percent: against "
+        "its base of 11 ms, worked out from its figures. It gives no success rates.",
+    )
+    return TableView("the-paper", "The paper's degradation table", columns, rows, notes)
+
+
+def _published_losses(number: int) -> tuple[float, ...]:
+    """Return the published loss of time, distance and energy at a latency [%]."""
+    curve = load_published().degradation
+    gap = published_gap(curve[0], curve[number])
+    return gap.flight_time_percent, gap.distance_percent, gap.energy_percent
+
+
+def curve_pictures(comparison: Comparison) -> list[Picture]:
+    """Draw success, and the losses of time, distance and energy, over the mean t2."""
+    at_ms = {run.name: (run.stages["t2"].mean or 0.0) / US_PER_MS for run in comparison.runs}
+    success = [
+        Series(
+            policy,
+            [
+                (at_ms[run.name], run.quality.success_rate.scaled(100.0))
+                for run in comparison.group(policy)
+            ],
+        )
+        for policy in comparison.groups
+    ]
+    axis = "mean t2 [ms]"
+    pictures = [curves_picture("degradation-success", "success rate", (axis, "%"), success)]
+    for number, measure in enumerate(LOSSES):
+        losses = [
+            Series(
+                policy,
+                [
+                    (at_ms[comparison.group(policy)[0].name], Estimate(0.0, None, None, 0)),
+                    *(
+                        (at_ms[c.entry.target], measure.change(c.paired).difference)
+                        for c in contrasts_by_key(comparison, policy, AGAINST_FIRST)
+                    ),
+                ],
+            )
+            for policy in comparison.groups
+        ]
+        published = [
+            (each.latency_ms, _published_losses(k)[number])
+            for k, each in enumerate(load_published().degradation)
+        ]
+        name = f"degradation-{measure.title.replace(', ', '-').replace(' ', '-')}"
+        pictures.append(
+            curves_picture(
+                name,
+                f"{measure.title}, against the first",
+                (axis, "%"),
+                losses,
+                published,
+            )
+        )
+    return pictures
+
+
+def policy_tables(comparison: Comparison, policy: str) -> tuple[TableView, ...]:
+    """Return every latency by itself, against the first, and against the one before."""
+    return (
+        latency_quality_table(comparison, policy),
+        *(
+            contrasts_table(comparison, contrasts_by_key(comparison, policy, key), title)
+            for key, title in (
+                (AGAINST_FIRST, f"{policy}: against {comparison.group(policy)[0].label}"),
+                (STEP, f"{policy}: step by step"),
+            )
+        ),
+    )
+
+
+def curves_section(comparison: Comparison) -> Section:
+    """Return the curves, the published one beside them."""
+    return Section(
+        "Over latency",
+        tables=(published_curve_table(),),
+        draw=lambda: curve_pictures(comparison),
+        note="Losses on the common successes with the first latency, 95 % intervals.",
+    )
+
+
+def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+    """Return everything that a degradation curve says."""
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker="Degradation by latency",
+        lead="How much worse does a policy fly as its decisions come later?",
+        sections=[
+            curves_section(comparison),
+            *(
+                Section(policy, tables=policy_tables(comparison, policy))
+                for policy in comparison.groups
+            ),
+        ],
+        facts=(*plain_facts(comparison), *common_rules(comparison)),
+    )

@@ -1,0 +1,302 @@
+"""The figures of a comparison: contrasts, distributions of latency, energy, single seeds."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
+
+from airl_mav.arena.draw import draw_arena
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.statistics import Estimate
+from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import tests_of
+from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
+from airl_mav.report.comparison.tables import letters_of, published_change
+from airl_mav.report.flights_above import Panel, path_points
+from airl_mav.report.loading import arena_of
+from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
+from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
+from airl_mav.report.table import NONE, OUTCOME_LABELS, US_PER_MS
+from airl_mav.report.theme import (
+    INK,
+    MARK,
+    MUTED,
+    PAPER,
+    RULE,
+    SERIES,
+    SERIES_SOFT,
+    Picture,
+    label_axes,
+    legend_below,
+    line_style,
+    new_figure,
+    plain_axes,
+    render,
+)
+
+ROW_IN = 0.5
+"""Height of a contrast in a figure."""
+
+CDF_STAGES = ("t2", "end_to_end")
+"""Stages whose distributions are drawn over each other."""
+
+CDF_POINTS = 400
+"""A drawn distribution has at most this many steps: more are not seen, and weigh."""
+
+NAME_COLUMNS = 26
+"""A name beside an axis is broken into lines of so many letters."""
+
+Runs = Mapping[str, LoadedRun]
+
+
+def contrast_pictures(
+    prefix: str,
+    comparison: Comparison,
+    contrasts: Sequence[Contrast],
+    *,
+    medians: bool = False,
+) -> list[Picture]:
+    """Draw contrasts with their intervals, one picture a measure, published ones beside them.
+
+    Args:
+        prefix: What the pictures' names begin with.
+        comparison: Of the contrasts.
+        contrasts: One or more, from top to bottom.
+        medians: Whether the medians of the pairs are drawn too.
+    """
+    names = [f"{letters_of(comparison, each)}\n{each.entry.short}".rstrip() for each in contrasts]
+    pictures = []
+    for measure in MEASURES:
+        figure = new_figure(4.4, 1.05 + ROW_IN * len(contrasts))
+        ax: Axes = figure.subplots()
+        ends: list[float] = [0.0]
+        for row, contrast in enumerate(contrasts):
+            change = measure.change(contrast.paired)
+            if (told := published_change(contrast, measure)) is not None:
+                ends.append(told)
+                ax.plot(told, row, "x", ms=6, mew=1.6, color=MARK, zorder=2)
+            median = change.median
+            if medians and median is not None and median.value is not None:
+                ends.append(median.value)
+                ax.plot(median.value, row, "D", ms=5, color="none", mec=SERIES, mew=1.1, zorder=3)
+            ends += _draw_estimate(ax, row, change.difference)
+        _finish_rows(ax, names, ends)
+        unit = "percentage points" if measure.difference_unit == "points" else "%"
+        label_axes(ax, f"difference [{unit}]", title=measure.title)
+        alt = f"Difference in {measure.title} with intervals: {', '.join(names)}"
+        pictures.append(render(figure, f"{prefix}-{measure.key.replace('_', '-')}", alt))
+    return pictures
+
+
+def _draw_estimate(ax: Axes, row: int, estimate: Estimate) -> list[float]:
+    """Draw an estimate with its interval and its figures; return what the axis must hold."""
+    n = f"n = {estimate.n:,}"
+    ax.annotate(
+        n if estimate.value is None else f"{estimate.value:+.2f}, {n}",
+        (1.0, row - 0.15),
+        xycoords=("axes fraction", "data"),
+        ha="right",
+        va="bottom",
+        fontsize=8,
+        color=MARK,
+    )
+    if estimate.value is None:
+        return []
+    ends = [estimate.value]
+    if estimate.low is not None and estimate.high is not None:
+        ends += [estimate.low, estimate.high]
+        ax.plot(ends[1:], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
+    ax.plot(estimate.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=4)
+    return ends
+
+
+def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
+    """Set up the axis of rows: names from top to bottom, zero as a line, all ends inside."""
+    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.5, -0.65)
+    # A row without any difference still has an axis.
+    room = 0.08 * (max(ends) - min(ends)) or 1.0
+    ax.set_xlim(min(ends) - room, max(ends) + room)
+    plain_axes(ax)
+    ax.grid(False, axis="y")
+    ax.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
+    ax.spines["bottom"].set_color(RULE)
+
+
+# --- latency
+
+
+def latency_pictures(comparison: Comparison, runs: Runs) -> list[Picture]:
+    """Draw the cumulated distributions of all runs, one picture a stage that has samples."""
+    pooled = {name: _samples(run) for name, run in runs.items()}
+    pictures = []
+    for stage in (stage for stage in ALL_STAGES if stage.key in CDF_STAGES):
+        having = [run for run in comparison.runs if pooled[run.name][stage.key].size]
+        if not having:
+            continue
+        figure = new_figure(5.2, 3.2 + 0.2 * len(having))
+        ax: Axes = figure.subplots()
+        medians, ends = [], []
+        for number, run in enumerate(comparison.runs):
+            if run not in having:
+                continue
+            at_ms, share = cumulated(pooled[run.name][stage.key])
+            colour, dashes = line_style(number)
+            n = run.stages[stage.key].n
+            label = f"{run.heading} (n = {n:,})"
+            ax.step(at_ms, share, where="post", color=colour, ls=dashes, lw=1.6, label=label)
+            medians.append(float(np.median(at_ms)))
+            ends += [float(at_ms[0]), float(at_ms[-1])]
+        if min(ends) > 0.0 and max(ends) > LONG_TAIL * min(medians):
+            ax.set_xscale("log")
+            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            ax.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            ax.set_xlim(left=0.0)
+        ax.set_ylim(0.0, 104.0)
+        ax.set_yticks([0, 25, 50, 75, 100])
+        label_axes(ax, "ms", "decisions that took no longer [%]", stage.title)
+        plain_axes(ax)
+        legend_below(figure, 1, handlelength=3)
+        told = ", ".join(run.heading for run in having)
+        alt = f"Cumulated distributions of {stage.title}: {told}"
+        name = f"{comparison.kind}-{stage.key.replace('_', '-')}"
+        pictures.append(render(figure, name, alt))
+    return pictures
+
+
+def _samples(run: LoadedRun) -> dict[str, Samples]:
+    """Return the durations of all stages [µs], without those of aborted flights."""
+    tests = tests_of(run)
+    return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
+
+
+def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the steps of a distribution of durations (n,) [µs]: at how many ms what share [%]."""
+    values = np.sort(samples) / US_PER_MS
+    count = min(len(values), CDF_POINTS)
+    rank = np.unique(np.linspace(0, len(values) - 1, count).astype(int))
+    at = values[rank]
+    share = 100.0 * (rank + 1) / len(values)
+    return np.concatenate([at[:1], at]), np.concatenate([[0.0], share])
+
+
+# --- energy
+
+
+def energy_picture(comparison: Comparison) -> Picture:
+    """Draw the mean energy of a successful flight, split into airframe and computer."""
+    runs = [run for run in comparison.runs if run.quality.energy_j.value is not None]
+    figure = new_figure(6.4, 1.3 + 0.55 * len(runs))
+    ax: Axes = figure.subplots()
+    airframe, computer = (
+        [measure.scale * (measure.of(run.quality).value or 0.0) for run in runs]
+        for measure in (ENERGY, COMPUTER_ENERGY)
+    )
+    rows = np.arange(len(runs))
+    ax.barh(rows, airframe, height=0.55, color=SERIES, label="airframe")
+    ax.barh(rows, computer, left=airframe, height=0.55, color=SERIES_SOFT, label="computer")
+    for row, (a, c) in enumerate(zip(airframe, computer, strict=True)):
+        share = 100.0 * c / (a + c) if a + c else 0.0
+        ax.annotate(
+            f"{a:.2f} + {c:.2f} kJ, computer {share:.1f} %",
+            (a + c, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+            color=INK,
+        )
+    names = ["\n".join(textwrap.wrap(run.heading, NAME_COLUMNS)) for run in runs]
+    ax.set_yticks(rows, names)
+    ax.set_ylim(len(runs) - 0.5, -0.5)
+    widest = max((a + c for a, c in zip(airframe, computer, strict=True)), default=1.0)
+    ax.set_xlim(0.0, 1.55 * widest)
+    label_axes(ax, "mean energy of a flight that reached the goal [kJ]")
+    plain_axes(ax)
+    ax.grid(False, axis="y")
+    ax.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
+    ax.spines["bottom"].set_color(RULE)
+    legend_below(figure, 2)
+    told = ", ".join(run.heading for run in runs)
+    return render(figure, f"{comparison.kind}-energy", f"Energy of airframe and computer: {told}")
+
+
+# --- flights
+
+
+def flight_panels(
+    compared: Sequence[ComparedRun], runs: Runs, most: int | None = None
+) -> list[Panel]:
+    """Return the flights of each run, or the first of them, for a picture from above."""
+    panels = []
+    for figures in compared:
+        run = runs[figures.name]
+        tests = tests_of(run)[:most]
+        if not tests:
+            continue
+        rate, path = figures.quality.success_rate, figures.quality.distance_m
+        if len(tests) < rate.n:
+            reached = sum(episode.outcome is Outcome.SUCCESS for episode in tests)
+            detail = f"{len(tests)} flights, {reached} reached the goal"
+        else:
+            success = NONE if rate.value is None else f"{100 * rate.value:.{rate_digits(rate)}f} %"
+            told = f"{path.value:.1f} m" if path.value is not None else NONE
+            detail = f"{success} of {rate.n:,} reached the goal, mean {DISTANCE.title} {told}"
+        arena = arena_of(run, tests[0])
+        panels.append(Panel(figures.heading, detail, tests, run.trajectories, arena))
+    return panels
+
+
+def seed_pictures(
+    prefix: str, compared: Sequence[ComparedRun], runs: Runs, seeds: Sequence[int]
+) -> list[Picture]:
+    """Draw the flights of several runs from above, one picture a seed."""
+    return [_seed_picture(f"{prefix}-{seed}", compared, runs, seed) for seed in seeds]
+
+
+def _seed_picture(name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int) -> Picture:
+    """Draw the flights of one seed over their arena, as it was when they began."""
+    figure = new_figure(4.2, 4.6)
+    ax: Axes = figure.subplots()
+    flights = [
+        (number, figures, flight)
+        for number, figures in enumerate(compared)
+        for flight in tests_of(runs[figures.name])
+        if flight.seed == seed
+    ]
+    handles: list[Line2D] = []
+    for number, figures, flight in flights:
+        run = runs[figures.name]
+        if not handles and (arena := arena_of(run, flight)) is not None:
+            draw_arena(arena, ax, goal_radius_m=flight.goal_radius_m)
+        style, path = line_style(number), run.trajectories.get(flight.index)
+        told = OUTCOME_LABELS[flight.outcome]
+        if flight.outcome is Outcome.SUCCESS and flight.quality is not None:
+            told = f"{flight.quality.flight_time_s:.1f} s"
+        points = np.zeros((0, 2)) if path is None else path_points(path, flight.ended_us)
+        (line,) = ax.plot(
+            *points.T,
+            color=style.colour,
+            ls=style.dashes,
+            lw=1.8,
+            zorder=4,
+            label=f"{figures.mark}: {told}",
+        )
+        handles.append(line)
+        if len(points):
+            marker = OUTCOME_MARKERS[flight.outcome]
+            ax.plot(*points[-1], marker, ms=7, color=style.colour, mec=PAPER, mew=0.8, zorder=5)
+    plain_axes(ax, grid=False)
+    label_axes(ax, "east of the start [m]", "north of the start [m]", f"seed {seed}")
+    legend_below(figure, 3, handles=handles, columnspacing=1.0)
+    told = ", ".join(figures.label for _, figures, _ in flights)
+    return render(figure, name, f"The flights of seed {seed} from above: {told}")

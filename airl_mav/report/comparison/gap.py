@@ -1,0 +1,465 @@
+"""The hardware gap: what a policy loses on a computer, with and without mitigation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import pair_by_seed
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import Estimate
+from airl_mav.profiles.published import PublishedRun, load_published, published_gap
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import compare
+from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.figures import (
+    contrast_pictures,
+    flight_panels,
+    seed_pictures,
+)
+from airl_mav.report.comparison.model import (
+    ComparedRun,
+    Comparison,
+    ComparisonRecipe,
+    Contrast,
+    ContrastEntry,
+    RunEntry,
+)
+from airl_mav.report.comparison.tables import (
+    THE_PAPER,
+    common_rules,
+    contrast_headlines,
+    contrast_table,
+    contrasts_table,
+    plain_facts,
+    published_value,
+)
+from airl_mav.report.document import Document, Section
+from airl_mav.report.flights_above import flight_pictures
+from airl_mav.report.measures import ALL_MEASURES, FLIGHT_TIME, interval_of
+from airl_mav.report.table import NONE, Column, TableView, ms
+
+Role = Literal["reference", "target", "mitigated", "training", "mitigated-reference"]
+"""Of `training` there may be several runs: one for each source of latency."""
+
+OVERLAID = 100
+"""Flights of a run that are drawn over each other: the first seeds."""
+
+WORST = 6
+"""Seeds that are looked at one by one."""
+
+WORST_ROLES: tuple[Role, ...] = ("reference", "target", "mitigated")
+"""What is drawn of the worst seeds."""
+
+WITHOUT, WITH = "without-mitigation", "with-mitigation"
+WITH_TRAINED, WITHOUT_TRAINED = "with-mitigation-trained", "without-mitigation-trained"
+COST, HELP = "cost-on-reference", "mitigation-on-target"
+
+HEADLINED = (WITHOUT, WITH, WITH_TRAINED)
+"""Gaps whose figures head an arena."""
+
+
+@dataclass(frozen=True)
+class _GapKind:
+    """Which two roles make a gap."""
+
+    key: str
+    target: Role
+    reference: Role
+    title: str
+    short: str
+
+
+GAP_KINDS = (
+    _GapKind(
+        WITHOUT, "target", "reference", "without mitigation, reference undelayed", "no mitigation"
+    ),
+    _GapKind(WITH, "mitigated", "reference", "with mitigation, reference undelayed", "mitigated"),
+    _GapKind(
+        WITHOUT_TRAINED,
+        "target",
+        "training",
+        "without mitigation, reference delay-trained (the paper's way)",
+        "no mitigation",
+    ),
+    _GapKind(
+        WITH_TRAINED,
+        "mitigated",
+        "training",
+        "with mitigation, reference delay-trained (the paper's way)",
+        "mitigated",
+    ),
+    _GapKind(
+        HELP, "mitigated", "target", "mitigation against none, both on the target", "mitigation"
+    ),
+    _GapKind(
+        COST,
+        "mitigated-reference",
+        "reference",
+        "mitigated policy where nothing is late, reference undelayed",
+        "mitigated, undelayed",
+    ),
+)
+
+
+def gap_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+    """Return what the hardware gap of runs is worked out from.
+
+    Args:
+        facts: What was asked for: `policy`, `computer`, `reference`, `latency`, ...
+        entries: The runs, each with its `role`; their group is the arena.
+    """
+    where = facts.get("latency") or facts.get("computer")
+    contrasts = [
+        ContrastEntry(target.name, reference.name, kind.key, kind.title, kind.short)
+        for group in dict.fromkeys(entry.group for entry in entries)
+        for kind in GAP_KINDS
+        for target in entries
+        for reference in entries
+        if target.group == reference.group == group
+        and (target.role, reference.role) == (kind.target, kind.reference)
+    ]
+    title = f"{facts.get('policy')} on {Path(str(where)).name}"
+    return ComparisonRecipe(title, dict(facts), tuple(entries), tuple(contrasts))
+
+
+def build_gap(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
+    """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
+
+    Raises:
+        UsageError: There is no run, or a run holds no flight.
+    """
+    comparison = compare(
+        runs,
+        recipe.contrasts,
+        kind="gap",
+        title=recipe.title,
+        facts=recipe.facts,
+        entries=recipe.entries,
+    )
+    tables: dict[str, str] = {}
+    published: dict[str, PublishedRun] = {}
+    worst: dict[str, list[int]] = {}
+    for arena in comparison.groups:
+        table, columns = _published_columns(comparison, arena)
+        if table:
+            tables[arena] = table
+        published |= columns
+        flown = {run.entry.role: runs[run.name] for run in reversed(comparison.group(arena))}
+        if "reference" in flown and "target" in flown:
+            worst[arena] = worst_seeds(flown["reference"].episodes, flown["target"].episodes)
+    comparison = replace(
+        comparison,
+        runs=tuple(replace(r, published=published.get(r.name)) for r in comparison.runs),
+        contrasts=tuple(
+            replace(
+                contrast,
+                published=published_gap(
+                    published[contrast.entry.reference], published[contrast.entry.target]
+                ),
+            )
+            if {contrast.entry.reference, contrast.entry.target} <= set(published)
+            else contrast
+            for contrast in comparison.contrasts
+        ),
+        extra={"worst_seeds": worst, "published_tables": tables},
+    )
+    told = [_verdict(comparison, arena) for arena in comparison.groups]
+    return replace(comparison, answers=tuple(sentence for sentence in told if sentence))
+
+
+def _published_columns(comparison: Comparison, arena: str) -> tuple[str, dict[str, PublishedRun]]:
+    """Return the published columns that are the same as ours: its computers, as late as there.
+
+    Returns:
+        Title of the table, and its columns by the names of our runs; empty where none fits.
+    """
+    facts = comparison.facts
+    asked = facts.get("computer"), facts.get("reference"), facts.get("latency")
+    if asked == ("ras-pi-4", "workstation", None):
+        for table in load_published().tables:
+            if table.arena != Path(arena).stem:
+                continue
+            found = {
+                run.name: column
+                for run in comparison.group(arena)
+                if (column := table.columns.get(run.entry.role)) is not None
+                and _as_late(run.stages["t2"].mean, column.latency_ms)
+            }
+            if any(comparison.run(name).entry.role == "target" for name in found):
+                return table.title, found
+    return "", {}
+
+
+def _as_late(t2_us: float | None, published_ms: float) -> bool:
+    """Return whether decisions come as late as published, for the purpose of a comparison."""
+    if t2_us is None:
+        return False
+    return abs(t2_us / US_PER_MS - published_ms) <= max(0.2 * published_ms, 20.0)
+
+
+def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
+    """Return seeds that lost most: half of them failed, half took longest against the reference.
+
+    The reference reached the goal with all of them. Of those that failed the first seeds are taken.
+    """
+    failed: list[int] = []
+    slower: dict[int, float] = {}
+    for first, second in pair_by_seed(reference, target):
+        if first.outcome is not Outcome.SUCCESS or first.quality is None:
+            continue
+        if second.outcome is not Outcome.SUCCESS:
+            failed.append(first.seed)
+        elif second.quality is not None:
+            slower[first.seed] = second.quality.flight_time_s / first.quality.flight_time_s
+    longest = sorted(slower, key=lambda seed: (-slower[seed], seed))
+    chosen = sorted(failed)[: max(WORST // 2, WORST - len(longest))]
+    return [*chosen, *longest[: WORST - len(chosen)]]
+
+
+# --- the verdict
+
+
+def _verdict(comparison: Comparison, arena: str) -> str:
+    """Return what the gap of an arena is; empty without its reference or its target."""
+    gaps = {c.entry.key: c for c in reversed(comparison.contrasts_of(arena))}
+    if (gap := gaps.get(WITHOUT)) is None:
+        return ""
+    target, reference = comparison.run(gap.entry.target), comparison.run(gap.entry.reference)
+    place = "" if len(comparison.groups) == 1 else f" in {Path(arena).stem}"
+    sentence = (
+        f"On {_computer(target)}{place} {target.setup.policy.name} flies {_longer(gap)} than on "
+        f"{_computer(reference)} and reaches {_rate(target)} of its goals, not {_rate(reference)}."
+    )
+    if (mitigated := gaps.get(WITH)) is None:
+        return sentence
+    other = comparison.run(mitigated.entry.target)
+    sentence += (
+        f" {other.setup.policy.name} there flies {_longer(mitigated)} than that and reaches "
+        f"{_rate(other)}"
+    )
+    if (trained := gaps.get(WITH_TRAINED)) is not None:
+        difference = trained.paired.flight_time_s.difference
+        told = "with no common success"
+        if difference.value is not None:
+            told = f"{difference.value:+.1f} %{_interval(difference)}"
+        sentence += f"; against the conditions of its own training that is {told} of flight time"
+    return f"{sentence}."
+
+
+def _computer(run: ComparedRun) -> str:
+    """Return a run's computer with its latency."""
+    name, mean = Path(run.setup.computer.name).stem, run.stages["t2"].mean
+    if mean is None:
+        return name
+    return f"{name} (t2 {mean / US_PER_MS:,.{0 if mean >= 10.0 * US_PER_MS else 1}f} ms)"
+
+
+def _longer(contrast: Contrast) -> str:
+    """Return a gap of the flight time as a comparative, without its `than`."""
+    difference = FLIGHT_TIME.change(contrast.paired).difference
+    if difference.value is None:
+        return "(no goal that both reached) longer"
+    comparative = "shorter" if difference.value < 0.0 else "longer"
+    return f"{abs(difference.value):.1f} % {comparative}{_interval(difference)}"
+
+
+def _interval(difference: Estimate) -> str:
+    text = interval_of(difference, 1, "+")
+    return f" ({text})" if text else ""
+
+
+def _rate(run: ComparedRun) -> str:
+    rate = run.quality.success_rate
+    return "none" if rate.value is None else f"{100.0 * rate.value:.1f} %"
+
+
+# --- tables
+
+
+def columns_table(comparison: Comparison, arena: str) -> TableView:
+    """Return all runs of an arena by themselves, one a column, published ones beside them."""
+    runs = comparison.group(arena)
+    having = [run for run in runs if run.published is not None]
+    columns = (
+        Column("", number=False),
+        *(Column(run.mark) for run in runs),
+        *(Column(f"paper\n{run.mark}") for run in having),
+    )
+    nothing = (NONE,) * len(having)
+    t2 = [run.stages["t2"] for run in runs]
+    rows = [
+        (
+            "t2, mean [ms]",
+            *(ms(each.mean, 1) for each in t2),
+            *(f"{run.published.latency_ms:g}" for run in having if run.published),
+        ),
+        ("t2, median [ms]", *(ms(each.p50, 1) for each in t2), *nothing),
+        ("flights", *(f"{run.quality.success_rate.n:,}" for run in runs), *nothing),
+    ]
+    for measure in ALL_MEASURES:
+        told = [published_value(run, measure) for run in having]
+        rows.append(
+            (
+                f"{measure.title} [{measure.unit}]",
+                *(measure.with_interval(measure.of(run.quality)) for run in runs),
+                *(NONE if figure is None else f"{figure:.4g}" for figure in told),
+            )
+        )
+    notes = (
+        "Each by itself; time, distance and energy: means over its own flights that reached the "
+        "goal, not the same ones in every column: compare by the gaps. t2: of every decision. In "
+        "brackets: 95 % intervals, Wilson for the success rate, bootstrap (BCa).",
+    )
+    return TableView(
+        f"flown-{Path(arena).stem}",
+        "Each run by itself",
+        columns,
+        tuple(rows),
+        notes,
+        stacked=True,
+        in_terminal="without intervals",
+    )
+
+
+def gaps_table(comparison: Comparison, arena: str) -> TableView:
+    """Return all gaps of an arena with their intervals, published ones below each."""
+    notes = []
+    runs = comparison.group(arena)
+    by_rules: dict[str, list[str]] = {}
+    for run in runs:
+        by_rules.setdefault(run.entry.rules, []).append(run.mark)
+    if len(by_rules) > 1:
+        told = "; ".join(f"{', '.join(marks)}: {rules}" for rules, marks in by_rules.items())
+        notes.append(f"Not all fly by the same rules, which makes differences too. {told}.")
+    roles = {run.entry.role for run in runs}
+    if "training" in roles:
+        notes.append(
+            "As trained: the sources of latency of the policy's own training. Its latencies are "
+            "other draws than the target's: with the same ones the comparison would be of a policy "
+            "with itself."
+        )
+    if table := comparison.extra["published_tables"].get(arena):
+        notes.append(
+            f"{THE_PAPER}: Air Learning, {table}, its gaps worked out here from its columns by the "
+            "definition above. Its own arena, vehicle, network and latencies."
+        )
+        published = next(each for each in load_published().tables if each.title == table)
+        if published.note and "mitigated" in roles:
+            notes.append(published.note)
+    return contrasts_table(comparison, comparison.contrasts_of(arena), "Hardware gap", notes)
+
+
+def gap_tables(comparison: Comparison, arena: str) -> list[TableView]:
+    """Return all tables of an arena."""
+    contrasts = comparison.contrasts_of(arena)
+    tables = [columns_table(comparison, arena)]
+    if contrasts:
+        tables.append(gaps_table(comparison, arena))
+    return [*tables, *(contrast_table(comparison, c, ALL_MEASURES) for c in contrasts)]
+
+
+def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+    """Return everything that a hardware gap says."""
+    sections = [
+        section
+        for arena in comparison.groups
+        for section in _arena_sections(comparison, runs, arena)
+    ]
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker="Hardware gap",
+        sections=sections,
+        facts=(*plain_facts(comparison), *common_rules(comparison)),
+    )
+
+
+def _arena_sections(
+    comparison: Comparison, runs: Mapping[str, LoadedRun], arena: str
+) -> list[Section]:
+    """Return what is said of one arena."""
+    name = Path(arena).stem
+    flown, contrasts = comparison.group(arena), comparison.contrasts_of(arena)
+    legend = tuple(
+        (
+            run.mark,
+            f"{run.label}; t2 {run.setup.injection.label}"
+            + ("" if run.published is None else f"; {THE_PAPER}: {run.published.label}"),
+        )
+        for run in flown
+    )
+    watts = {Path(r.setup.computer.name).stem: r.setup.computer_watts for r in flown}
+    told = ", ".join(f"{computer} {value:g} W" for computer, value in watts.items())
+    by_itself = columns_table(comparison, arena)
+    by_key = {contrast.entry.key: contrast for contrast in reversed(contrasts)}
+    sections = [
+        Section(name),
+        *(
+            Section(
+                by_key[key].entry.title,
+                3,
+                headlines=contrast_headlines(by_key[key], digits=1),
+                in_terminal=False,
+            )
+            for key in HEADLINED
+            if key in by_key
+        ),
+        Section(
+            by_itself.title,
+            3,
+            facts=legend,
+            tables=(by_itself,),
+            note=f"Energy: of the vehicle; that of the computer apart ({told}, times the flight "
+            "time), then both. A computer that could not fly along makes a gap of both that nobody "
+            "saves.",
+        ),
+    ]
+    if contrasts:
+        crosses = f" Crosses: {THE_PAPER}." if any(c.published for c in contrasts) else ""
+        sections.append(
+            Section(
+                "Hardware gap",
+                3,
+                tables=(gaps_table(comparison, arena),),
+                draw=lambda: contrast_pictures(f"gap-{name}", comparison, contrasts, medians=True),
+                sheet=f"gap-{name}.png",
+                note="Dots: gaps of the means on the same seeds, bars: their 95 % intervals. "
+                f"Diamonds: medians of the pairs.{crosses} The line of zero: no gap.",
+            )
+        )
+    sections.append(
+        Section(
+            "The flights from above",
+            3,
+            draw=lambda: flight_pictures(f"flights-{name}", flight_panels(flown, runs, OVERLAID)),
+            sheet=f"flights-{name}.png",
+            note="The same seeds in every picture, each with obstacles of its own.",
+            in_terminal=False,
+        )
+    )
+    if worst := comparison.extra["worst_seeds"].get(arena):
+        drawn = [run for role in WORST_ROLES for run in flown if run.entry.role == role]
+        key = "; ".join(run.heading for run in drawn)
+        sections.append(
+            Section(
+                "Seeds that lost most",
+                3,
+                draw=lambda: seed_pictures(f"worst-{name}", drawn, runs, worst),
+                sheet=f"worst-{name}.png",
+                note=f"{key}. Of the seeds with which the reference reached the goal: first ones "
+                "that failed on the target, then those that took longest against the reference. "
+                "Obstacles as they stood at the start.",
+                in_terminal=False,
+            )
+        )
+    sections += [
+        Section(view.title, 3, tables=(view,), in_terminal=False)
+        for view in (contrast_table(comparison, each, ALL_MEASURES) for each in contrasts)
+    ]
+    return sections

@@ -1,0 +1,293 @@
+"""The fidelity ladder: the same policy and seeds at several levels, the first as the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import pair_by_seed
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import compare, tests_of
+from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.figures import contrast_pictures
+from airl_mav.report.comparison.model import (
+    ComparedRun,
+    Comparison,
+    ComparisonRecipe,
+    Contrast,
+    ContrastEntry,
+    RunEntry,
+)
+from airl_mav.report.comparison.tables import (
+    contrast_headlines,
+    contrast_table,
+    flights_fact,
+    plain_facts,
+    runs_table,
+    stages_table,
+)
+from airl_mav.report.document import Document, Section
+from airl_mav.report.measures import MEASURES, count_successes
+from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, ms
+
+MAX_SPLIT = 50
+"""Seeds in the table of flights that did not end alike."""
+
+WIDEST = 3
+"""Pairs that are named for differing most."""
+
+
+def ladder_recipe(facts: Mapping[str, Any], levels: Sequence[RunEntry]) -> ComparisonRecipe:
+    """Return what a ladder is worked out from.
+
+    Args:
+        facts: What all levels share: `policy`, `arena`, ...
+        levels: The levels, two or more, the reference first.
+    """
+    first = levels[0].name
+    contrasts = tuple(
+        ContrastEntry(level.name, first, title=f"{level.name} against {first}")
+        for level in levels[1:]
+    )
+    title = f"{facts.get('policy')} in {facts.get('arena')}"
+    return ComparisonRecipe(title, dict(facts), tuple(levels), contrasts)
+
+
+def build_ladder(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
+    """Work out a ladder. Raises UsageError: there is no run, or a run holds no flight."""
+    comparison = compare(
+        runs,
+        recipe.contrasts,
+        kind="ladder",
+        title=recipe.title,
+        facts=recipe.facts,
+        entries=recipe.entries,
+    )
+    widest = {
+        contrast.entry.target: _widest(runs[contrast.entry.reference], runs[contrast.entry.target])
+        for contrast in comparison.contrasts
+    }
+    return replace(comparison, extra={"split": split_seeds(runs), "widest_percent": widest})
+
+
+def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
+    """Return the seeds of which not all flights reached the goal, but one did.
+
+    Returns:
+        For each its `seed`, and its `outcomes` by run; aborted flights are left out.
+    """
+    flights: dict[int, dict[str, EpisodeRecord]] = {}
+    for name, run in runs.items():
+        for episode in tests_of(run):
+            flights.setdefault(episode.seed, {})[name] = episode
+    return [
+        {"seed": seed, "outcomes": {name: f.outcome.value for name, f in flights[seed].items()}}
+        for seed in sorted(flights)
+        if len({f.outcome is Outcome.SUCCESS for f in flights[seed].values()}) > 1
+    ]
+
+
+def _widest(reference: LoadedRun, level: LoadedRun) -> dict[str, Any] | None:
+    """Return the median difference in flight time and the seeds of the widest [%].
+
+    None with fewer than three common successes.
+    """
+    percent = {
+        first.seed: 100.0 * (second.quality.flight_time_s / first.quality.flight_time_s - 1.0)
+        for first, second in pair_by_seed(reference.episodes, level.episodes)
+        if first.outcome is second.outcome is Outcome.SUCCESS and first.quality and second.quality
+    }
+    if len(percent) < WIDEST:
+        return None
+    widest = sorted(percent, key=lambda seed: -abs(percent[seed]))[:WIDEST]
+    return {
+        "median": median(percent.values()),
+        "seeds": [{"seed": seed, "percent": percent[seed]} for seed in widest],
+    }
+
+
+def start_table(comparison: Comparison) -> TableView:
+    """Return where navigation begins at each level, and how well the place is known."""
+    columns = (
+        Column("level", number=False),
+        Column("flights"),
+        Column("take-off", "s"),
+        Column("its energy", "kJ"),
+        Column("aside", "m"),
+        Column("height", "m"),
+        Column("speed", "m/s"),
+        Column("position error", "m"),
+    )
+    notes = (
+        "Means. Take-off: before navigation, in none of the figures above. Aside, height, speed: "
+        "of the vehicle as navigation begins. Position error: of the estimate that the companion "
+        "is told, during navigation, seen from above.",
+    )
+    rows = tuple(_start_row(run) for run in comparison.runs)
+    return TableView("start", "Where navigation begins", columns, rows, notes)
+
+
+def _start_row(run: ComparedRun) -> tuple[str, ...]:
+    start, error = run.start, run.position_error_m
+    told = NONE if error is None else f"{error:.2f}"
+    if start is None:
+        return (run.mark, "0", *(NONE,) * 5, told)
+    takeoff = (f"{start.takeoff_s:.2f}", f"{start.takeoff_energy_j / 1e3:.2f}")
+    if not start.takeoff_s:
+        takeoff = ("none", NONE)
+    place = (f"{start.aside_m:.2f}", f"{start.height_m:.2f}", f"{start.speed_m_s:.2f}")
+    return (run.mark, f"{start.n:,}", *takeoff, *place, told)
+
+
+def split_table(comparison: Comparison) -> TableView:
+    """Return the flights that did not end alike, seed by seed."""
+    columns = (
+        Column("seed"),
+        *(Column(run.mark, number=False) for run in comparison.runs),
+    )
+    split = comparison.extra["split"]
+    rows = tuple(
+        (
+            f"{each['seed']}",
+            *(
+                OUTCOME_LABELS[Outcome(each["outcomes"][run.name])]
+                if run.name in each["outcomes"]
+                else NONE
+                for run in comparison.runs
+            ),
+        )
+        for each in split[:MAX_SPLIT]
+    )
+    notes = ["Seeds of which one flight reached the goal and another did not."]
+    if len(rows) < len(split):
+        notes.append(f"{len(rows)} of {len(split):,}; all: ladder.json.")
+    title = "Flights that did not end alike"
+    return TableView("split", title, columns, rows, tuple(notes), in_terminal="not")
+
+
+def other_differences(comparison: Comparison) -> tuple[str, ...]:
+    """Return what else differs between the levels, in sentences: from stamps and paths."""
+
+    def across(what: str, text: Callable[[ComparedRun], str | None]) -> str:
+        told = [(run.mark, text(run)) for run in comparison.runs]
+        parts = [f"{text} at {mark}" for mark, text in told if text is not None]
+        return f"{what}: {'; '.join(parts)}." if parts else ""
+
+    def mean_of(stage: str) -> Callable[[ComparedRun], str | None]:
+        def text(run: ComparedRun) -> str | None:
+            mean = run.stages[stage].mean
+            return None if mean is None else f"{ms(mean, 1)} ms"
+
+        return text
+
+    lines = [
+        across("Decision period", mean_of("period")),
+        across("Frame to motors", mean_of("end_to_end")),
+        across("Start of navigation", _start_sentence),
+        across(
+            "Error of the estimated position",
+            lambda run: None if run.position_error_m is None else f"{run.position_error_m:.2f} m",
+        ),
+    ]
+    for contrast in comparison.contrasts:
+        lines += [_pace_sentence(comparison, contrast), _widest_sentence(comparison, contrast)]
+    lines += [
+        f"The host could not keep pace at {run.mark}: {ms(run.slipped_us, 0)} ms of simulated "
+        f"time given up over {run.flown:,} flights."
+        for run in comparison.runs
+        if run.slipped_us
+    ]
+    return tuple(line for line in lines if line)
+
+
+def _start_sentence(run: ComparedRun) -> str | None:
+    start = run.start
+    if start is None:
+        return None
+    after = f"after {start.takeoff_s:.1f} s of take-off" if start.takeoff_s else "without take-off"
+    return (
+        f"{after}, {start.aside_m:.2f} m aside, {start.height_m:.2f} m high, "
+        f"{start.speed_m_s:.2f} m/s"
+    )
+
+
+def _pace_sentence(comparison: Comparison, contrast: Contrast) -> str:
+    """Return mean speed and mean power of both on the common successes; empty without any."""
+    p = contrast.paired
+    time, distance, energy = p.flight_time_s, p.distance_m, p.energy_j
+    parts = [
+        f"{metres / seconds:.2f} m/s and {joules / seconds:.0f} W at {comparison.run(name).mark}"
+        for name, seconds, metres, joules in (
+            (contrast.entry.reference, time.reference, distance.reference, energy.reference),
+            (contrast.entry.target, time.other, distance.other, energy.other),
+        )
+        if seconds and metres is not None and joules is not None
+    ]
+    if not parts:
+        return ""
+    return f"Speed and power on {count_successes(contrast.successes)}: {'; '.join(parts)}."
+
+
+def _widest_sentence(comparison: Comparison, contrast: Contrast) -> str:
+    """Return whether a few seeds make a difference, or all of them."""
+    widest = comparison.extra["widest_percent"][contrast.entry.target]
+    if widest is None:
+        return ""
+    told = ", ".join(f"{e['percent']:+.1f} % with seed {e['seed']}" for e in widest["seeds"])
+    return (
+        f"Flight time at {comparison.run(contrast.entry.target).mark} by pairs: median "
+        f"{widest['median']:+.1f} %; widest {told}."
+    )
+
+
+def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+    """Return everything that a ladder says."""
+    reference = comparison.runs[0].mark
+    contrasts = comparison.contrasts
+    levels = runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)
+    latency, start, split = (
+        stages_table(comparison.runs),
+        start_table(comparison),
+        split_table(comparison),
+    )
+    sections = [
+        Section(levels.title, tables=(levels,)),
+        *(
+            Section(
+                view.title,
+                headlines=contrast_headlines(contrast),
+                tables=(view,),
+            )
+            for contrast in contrasts
+            for view in (contrast_table(comparison, contrast),)
+        ),
+        Section(
+            "Paired differences",
+            draw=lambda: contrast_pictures("ladder", comparison, contrasts),
+            sheet="ladder.png",
+            note="Dots: differences on the same seeds. Bars: 95 % intervals. The line of zero: "
+            f"{reference}.",
+            in_terminal=False,
+        ),
+        Section(latency.title, tables=(latency,)),
+        Section(start.title, tables=(start,)),
+        Section("What else differs", sentences=other_differences(comparison)),
+    ]
+    if split.rows:
+        sections.append(Section(split.title, tables=(split,)))
+    hashes = [(f"sha256 at {run.mark}", run.sha256) for run in comparison.runs if run.sha256]
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker="Fidelity ladder",
+        lead=f"The same policy and seeds at {', '.join(run.mark for run in comparison.runs)}; "
+        f"differences are from {reference}.",
+        sections=sections,
+        facts=(*plain_facts(comparison), *flights_fact(comparison), *hashes),
+    )

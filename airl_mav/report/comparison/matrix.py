@@ -1,0 +1,130 @@
+"""Several policies in several arenas: who flies well where it was not trained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import compare
+from airl_mav.report.comparison.documents import comparison_document
+from airl_mav.report.comparison.model import (
+    ComparedRun,
+    Comparison,
+    ComparisonRecipe,
+    RunEntry,
+)
+from airl_mav.report.comparison.tables import plain_facts
+from airl_mav.report.document import Document, Section
+from airl_mav.report.heatmap import Field, HeatMap, heat_picture
+from airl_mav.report.measures import MEASURES, SUCCESS_RATE, Measure
+from airl_mav.report.table import NONE, Column, TableView
+
+
+def matrix_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+    """Return what a table of policies x arenas is worked out from.
+
+    Args:
+        facts: What all cells share: level, seed, episodes, vehicle, computer.
+        entries: One for each cell: its `label` is the policy, its `group` the arena.
+    """
+    return ComparisonRecipe("Policies by arenas", dict(facts), tuple(entries))
+
+
+def build_matrix(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
+    """Work out a table. Raises UsageError: there is no run, or a run holds no flight."""
+    return compare(
+        runs,
+        (),
+        kind="matrix",
+        title=recipe.title,
+        facts=recipe.facts,
+        entries=recipe.entries,
+    )
+
+
+def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
+    """Return one table a measure: policies down, arenas across."""
+    policies = list(dict.fromkeys(run.label for run in runs))
+    arenas = list(dict.fromkeys(run.entry.group for run in runs))
+    at = {(run.label, run.entry.group): run for run in runs}
+    views = []
+    for measure in MEASURES:
+        columns = (
+            Column("policy", number=False),
+            *(Column(arena, measure.unit) for arena in arenas),
+        )
+        rows = tuple(
+            (policy, *(_cell(at.get((policy, arena)), measure) for arena in arenas))
+            for policy in policies
+        )
+        title = measure.title.capitalize()
+        views.append(TableView(measure.key, title, columns, rows, _notes(runs, measure)))
+    return views
+
+
+def _cell(run: ComparedRun | None, measure: Measure) -> str:
+    """Return a figure with its interval; a star where the policy was trained."""
+    if run is None:
+        return NONE
+    text = measure.with_interval(measure.of(run.quality))
+    return f"{text} *" if text != NONE and trained_here(run) else text
+
+
+def trained_here(run: ComparedRun) -> bool:
+    """Return whether a policy was trained in the arena that it flew in."""
+    return run.entry.group == run.entry.trained_in
+
+
+def _notes(runs: Sequence[ComparedRun], measure: Measure) -> tuple[str, ...]:
+    """Return what the figures mean."""
+    if measure is not SUCCESS_RATE:
+        return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
+    notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]
+    if any(trained_here(run) for run in runs):
+        notes.append("* the arena that the policy was trained in")
+    rules = list(dict.fromkeys(run.entry.rules for run in runs))
+    start = "Rules" if len(rules) == 1 else "Not all by the same rules"
+    return (*notes, f"{start}: {'; '.join(rules)}.")
+
+
+def success_map(runs: Sequence[ComparedRun]) -> HeatMap:
+    """Return the success rates as a heat map, the first policy on top."""
+    policies = list(dict.fromkeys(run.label for run in runs))[::-1]
+    return HeatMap(
+        title="success; a star: trained there",
+        rows=policies,
+        row_title="",
+        columns=list(dict.fromkeys(run.entry.group for run in runs)),
+        column_title="",
+        fields={
+            (run.label, run.entry.group): Field(
+                100.0 * rate, f"{100.0 * rate:.1f}{'*' if trained_here(run) else ''}"
+            )
+            for run in runs
+            if (rate := run.quality.success_rate.value) is not None
+        },
+        unit="success [%]",
+        limits=(0.0, 100.0),
+    )
+
+
+def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
+    """Return everything that a table of policies x arenas says."""
+    alt = "Success rate of every policy in every arena"
+    return comparison_document(
+        comparison,
+        runs,
+        folder,
+        kicker="Evaluation",
+        sections=[
+            *(Section(view.title, tables=(view,)) for view in matrix_tables(comparison.runs)),
+            Section(
+                "Success at a glance",
+                draw=lambda: [heat_picture("matrix", alt, success_map(comparison.runs))],
+                in_terminal=False,
+            ),
+        ],
+        facts=plain_facts(comparison),
+    )

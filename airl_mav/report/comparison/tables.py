@@ -1,0 +1,341 @@
+"""The tables of a comparison as text cells: terminal, page and Markdown show the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
+from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
+from airl_mav.report.document import Facts, Headline, estimate_headline
+from airl_mav.report.measures import (
+    COMPUTER_ENERGY,
+    FEW_FLIGHTS,
+    MEASURES,
+    Measure,
+    count_successes,
+    interval_of,
+    with_interval,
+)
+from airl_mav.report.table import (
+    NONE,
+    TOO_FEW_CELL,
+    TOO_FEW_NOTE,
+    Column,
+    TableView,
+    ms,
+    percentile_cell,
+)
+
+SIDE_BY_SIDE = 4
+"""Up to so many runs stand beside each other, more of them below each other."""
+
+STAGES = (*SHOWN_STAGES[:-1], SETPOINT_TO_MOTOR, SHOWN_STAGES[-1])
+"""Stages of a decision, in the order of the table."""
+
+THE_PAPER = "the paper"
+
+_PUBLISHED = {
+    "success_rate": ("success_percent", "success"),
+    "flight_time_s": ("flight_time_s", "flight_time_percent"),
+    "distance_m": ("distance_m", "distance_percent"),
+    "energy_j": ("energy_kj", "energy_percent"),
+}
+"""Fields of a published run (in the unit that is shown) and of a published gap, by our measure."""
+
+_NARROW = "Bootstrap intervals of fewer than {} {} are too narrow."
+
+
+def published_value(run: ComparedRun, measure: Measure) -> float | None:
+    """Return the published figure of a measure, in the unit that is shown."""
+    if run.published is None or measure.key not in _PUBLISHED:
+        return None
+    value: float | None = getattr(run.published, _PUBLISHED[measure.key][0])
+    return value
+
+
+def published_change(contrast: Contrast, measure: Measure) -> float | None:
+    """Return the published difference of a measure."""
+    if contrast.published is None or measure.key not in _PUBLISHED:
+        return None
+    value: float = getattr(contrast.published, _PUBLISHED[measure.key][1])
+    return value
+
+
+def signed(value: float | None, digits: int = 1) -> str:
+    """Return a difference with its sign; there is no -0."""
+    return NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
+
+
+def letters_of(comparison: Comparison, contrast: Contrast) -> str:
+    """Return the runs of a contrast as `B against A`."""
+    entry = contrast.entry
+    return f"{comparison.run(entry.target).mark} against {comparison.run(entry.reference).mark}"
+
+
+# --- runs by themselves
+
+
+def runs_table(
+    runs: Sequence[ComparedRun],
+    *,
+    title: str = "Quality of flight",
+    head: str = "run",
+    measures: Sequence[Measure] = (*MEASURES, COMPUTER_ENERGY),
+) -> TableView:
+    """Return every run by itself, one a row."""
+    columns = (
+        Column(head, number=False),
+        Column("flights"),
+        *(Column(measure.title, measure.unit) for measure in measures),
+    )
+    rows = tuple(
+        (
+            run.mark,
+            f"{run.quality.success_rate.n:,}",
+            *(measure.with_interval(measure.of(run.quality)) for measure in measures),
+        )
+        for run in runs
+    )
+    notes = [
+        "Each run by itself, 95 % intervals in brackets (Wilson, bootstrap); time, distance and "
+        "energy: means over the flights that reached the goal."
+    ]
+    if min(run.quality.flight_time_s.n for run in runs) < FEW_FLIGHTS:
+        notes.append(_NARROW.format(FEW_FLIGHTS, "flights"))
+    if len({run.quality.success_rate.n for run in runs}) > 1:
+        notes.append("Not the same number of flights in all runs: compare on the same seeds.")
+    return TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
+
+
+def facts_table(comparison: Comparison) -> TableView:
+    """Return what differs in what was flown, and nothing else; many runs in rows."""
+    terms, runs = comparison.different, comparison.runs
+    note = f"Only what differs. The reference: {runs[0].heading}."
+    if len(runs) > SIDE_BY_SIDE:
+        columns: tuple[Column, ...] = tuple(
+            Column(title, number=False) for title in ("run", "what", "")
+        )
+        rows: tuple[tuple[str, ...], ...] = tuple(
+            (run.heading if number == 0 else "", term, run.facts.get(term, NONE))
+            for run in runs
+            for number, term in enumerate(terms)
+        )
+    else:
+        columns = (Column("", number=False), *(Column(r.heading, number=False) for r in runs))
+        rows = tuple((term, *(r.facts.get(term, NONE) for r in runs)) for term in terms)
+    return TableView("facts", "What differs", columns, rows, (note,))
+
+
+def stages_table(runs: Sequence[ComparedRun]) -> TableView:
+    """Return the latencies of all runs, stage by stage."""
+    columns = (
+        Column("stage", number=False),
+        Column("run", number=False),
+        Column("n"),
+        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+    )
+    rows: list[tuple[str, ...]] = []
+    mixed = any(run.modelled for run in runs)
+    for stage in STAGES:
+        # Where one run has link and control in one, that sum is shown of all.
+        joint = mixed and stage == SETPOINT_TO_MOTOR
+        having = [r for r in runs if r.has_stage(stage) or (joint and r.stages[stage.key].n)]
+        for number, run in enumerate(having):
+            s = run.stages[stage.key]
+            tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
+            cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
+            rows.append((stage.title if number == 0 else "", run.mark, *cells))
+    notes = ["Milliseconds of simulated time."]
+    labels = {run.mark: run.setup.injection.label for run in runs}
+    if len(set(labels.values())) == 1:
+        notes.append(f"t2: {next(iter(labels.values()))}.")
+    else:
+        notes += [f"t2 of {mark}: {label}." for mark, label in labels.items()]
+    if modelled := [run.mark for run in runs if run.modelled]:
+        listed = "all runs" if len(modelled) > SIDE_BY_SIDE else "; ".join(modelled)
+        notes.append(
+            f"Level gym measures no time: transport and link are constants of its model, t2 is "
+            f"drawn ({listed})."
+        )
+    if any(TOO_FEW_CELL in row for row in rows):
+        notes.append(TOO_FEW_NOTE)
+    return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+
+
+# --- contrasts
+
+
+def contrast_table(
+    comparison: Comparison, contrast: Contrast, measures: Sequence[Measure] = MEASURES
+) -> TableView:
+    """Return one contrast, measure by measure."""
+    target, reference = (
+        comparison.run(name) for name in (contrast.entry.target, contrast.entry.reference)
+    )
+    columns = [
+        Column("same seeds", number=False),
+        Column(reference.mark),
+        Column(target.mark),
+        Column("difference"),
+        Column("95 % interval"),
+        Column("median of pairs", page_only=True),
+        Column("pairs"),
+    ]
+    if contrast.published is not None:
+        marks = (reference.mark, target.mark)
+        columns += [Column(f"paper {mark}", page_only=True) for mark in marks]
+        columns.append(Column("paper difference", page_only=True))
+    rows = tuple(_contrast_row(contrast, m, reference, target) for m in measures)
+    a = contrast.paired.agreement
+    n = contrast.successes
+    notes = [
+        f"Of {a.n:,} seeds both reached the goal in {a.both:,}, only {reference.mark} in "
+        f"{a.only_reference:,}, only {target.mark} in {a.only_other:,}, neither in {a.neither:,}.",
+        f"Time, distance and energy: means over {count_successes(n)}; the median over the pairs "
+        "is of the difference of each seed. Intervals: Tango's score interval for the success "
+        "rate, bootstrap over pairs (BCa) for the means, binomial for the medians.",
+    ]
+    if 1 < n < FEW_FLIGHTS:
+        notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
+    title = f"{target.mark} against {reference.mark}"
+    if contrast.entry.short:
+        title += f": {contrast.entry.title}"
+    key = f"{contrast.entry.target}-against-{contrast.entry.reference}"
+    return TableView(key, title, tuple(columns), rows, tuple(notes))
+
+
+def _contrast_row(
+    contrast: Contrast, measure: Measure, reference: ComparedRun, target: ComparedRun
+) -> tuple[str, ...]:
+    """Return the cells of one measure."""
+    change = measure.change(contrast.paired)
+    d = change.difference
+    unit = measure.difference_unit
+    row = (
+        measure.title,
+        measure.plain(change.reference, unit=True),
+        measure.plain(change.other, unit=True),
+        NONE if d.value is None else f"{d.value:+.2f} {unit}",
+        interval_of(d, 2, "+") or NONE,
+        NONE if change.median is None else with_interval(change.median, 1, "+"),
+        f"{d.n:,}",
+    )
+    if contrast.published is None:
+        return row
+    figures = (published_value(run, measure) for run in (reference, target))
+    told = published_change(contrast, measure)
+    return (
+        *row,
+        *(NONE if value is None else f"{value:.4g} {measure.unit}" for value in figures),
+        NONE if told is None else f"{told:+.2f} {unit}",
+    )
+
+
+def contrasts_table(
+    comparison: Comparison, contrasts: Sequence[Contrast], title: str, notes: Sequence[str] = ()
+) -> TableView:
+    """Return contrasts with their intervals, one a row; published ones below each."""
+    columns = (
+        Column("", number=False),
+        *(Column(measure.title, measure.difference_unit) for measure in MEASURES),
+        Column("t2", "%", page_only=True),
+        Column("pairs", page_only=True),
+    )
+    rows: list[tuple[str, ...]] = []
+    for contrast in contrasts:
+        changes = [measure.change(contrast.paired).difference for measure in MEASURES]
+        head = f"{letters_of(comparison, contrast)}\n{contrast.entry.short}".rstrip()
+        told = [with_interval(d, 1, "+") for d in changes]
+        rows.append((head, *told, signed(contrast.t2_percent, 0), f"{contrast.successes:,}"))
+        if contrast.published is not None:
+            figures = (signed(published_change(contrast, measure)) for measure in MEASURES)
+            t2 = signed(contrast.published.latency_percent, 0)
+            rows.append((f"  {THE_PAPER}", *figures, t2, NONE))
+    notes = [
+        *(
+            f"{letters_of(comparison, c)}: {c.entry.title}, {c.successes:,} pairs."
+            for c in contrasts
+            if c.entry.title
+        ),
+        "Difference: 100 (target - reference) / reference, in percent; success: percentage "
+        "points. The same seeds; time, distance and energy over the pairs of which both reached "
+        "the goal. In brackets: 95 % intervals, Tango's for the success, bootstrap over pairs "
+        "(BCa) for the means.",
+        *notes,
+    ]
+    if min((c.successes for c in contrasts), default=FEW_FLIGHTS) < FEW_FLIGHTS:
+        notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
+    return TableView(
+        "contrasts",
+        title,
+        columns,
+        tuple(rows),
+        tuple(notes),
+        in_terminal="stacked",
+    )
+
+
+def contrast_headlines(
+    contrast: Contrast, measures: Sequence[Measure] = MEASURES, digits: int = 2
+) -> tuple[Headline, ...]:
+    """Return the differences of a contrast as headlines."""
+    headlines = []
+    for measure in measures:
+        d = measure.change(contrast.paired).difference
+        told = published_change(contrast, measure)
+        more = [] if told is None else [f"{THE_PAPER} {told:+.1f}"]
+        headlines.append(
+            estimate_headline(
+                measure.title, d, measure.difference_unit, digits=digits, sign="+", more=more
+            )
+        )
+    return tuple(headlines)
+
+
+def pair_sentences(comparison: Comparison) -> tuple[str, ...]:
+    """Return how many pairs there are of every contrast, and why no more."""
+    sentences = []
+    for contrast in comparison.contrasts:
+        target, reference = (
+            comparison.run(name).mark for name in (contrast.entry.target, contrast.entry.reference)
+        )
+        unmatched = ""
+        if contrast.unmatched:
+            unmatched = (
+                f" {contrast.unmatched:,} flights have a seed of {reference}, but another arena "
+                "or goal: no pairs."
+            )
+        if contrast.pairs:
+            sentences.append(f"{target} and {reference}: {contrast.pairs:,} pairs.{unmatched}")
+        else:
+            sentences.append(
+                f"{target} and {reference} share no episode: their differences are those of the "
+                f"runs by themselves, unpaired.{unmatched}"
+            )
+    return tuple(sentences)
+
+
+def flights_fact(comparison: Comparison) -> Facts:
+    """Return how many flights each run has, of how many planned."""
+    counts = ", ".join(
+        f"{run.flown:,} at {run.mark}"
+        if run.flown == run.planned
+        else f"{run.flown:,} of {run.planned:,} at {run.mark}"
+        for run in comparison.runs
+    )
+    return (("flights", counts),)
+
+
+def common_rules(comparison: Comparison) -> Facts:
+    """Return the rules that the flights were judged by."""
+    rules = dict.fromkeys(run.entry.rules for run in comparison.runs if run.entry.rules)
+    return (("rules", "; ".join(rules)),) if rules else ()
+
+
+def plain_facts(comparison: Comparison) -> Facts:
+    """Return what was asked for, without what has a place of its own."""
+    return tuple(
+        (key.replace("_", " "), f"{value}")
+        for key, value in comparison.facts.items()
+        if value is not None and key != "remarks"
+    )

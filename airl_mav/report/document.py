@@ -1,0 +1,247 @@
+"""A report as headings, tables and pictures: one HTML page that opens offline, Markdown, terminal.
+
+Comparisons, sweeps and studies are documents; the page of a single run has a template of its own.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from rich.console import Console
+from rich.text import Text
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.flight.statistics import Estimate
+from airl_mav.report.measures import interval_of
+from airl_mav.report.table import (
+    NONE,
+    OUTCOME_LABELS,
+    TableView,
+    escape_markdown,
+    markdown_table,
+    print_facts,
+    print_table,
+    stacked,
+)
+from airl_mav.report.theme import Picture, montage
+
+REPORT_FILE = "report.html"
+"""The page of a single run, in its folder."""
+
+SHEET_COLUMNS = 3
+
+Facts = tuple[tuple[str, str], ...]
+"""Terms with their texts."""
+
+
+@dataclass(frozen=True)
+class Headline:
+    """One figure at the top of a page or a section."""
+
+    title: str
+    value: str
+    unit: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """What stands under one heading."""
+
+    title: str
+    level: int = 2
+    """Of the heading: 3 belongs to the 2 before it."""
+    headlines: tuple[Headline, ...] = ()
+    """On the page alone."""
+    sentences: tuple[str, ...] = ()
+    facts: Facts = ()
+    tables: tuple[TableView, ...] = ()
+    draw: Callable[[], Sequence[Picture]] | None = None
+    """Draws the pictures; called only where they are shown."""
+    sheet: str = ""
+    """File name of one PNG with all pictures; empty: each has one of its own."""
+    note: str = ""
+    """Explains the pictures, or the tables where there are no pictures."""
+    in_terminal: bool = True
+
+
+@dataclass(frozen=True)
+class RunLink:
+    """Where a run lies."""
+
+    name: str
+    folder: str
+    """From the document's folder."""
+    report: str | None
+    """Address of its own report, if it has one."""
+
+
+@dataclass(frozen=True)
+class Document:
+    """Everything that a page says."""
+
+    name: str
+    """File name of the page and of its Markdown, without suffix."""
+    title: str
+    kicker: str
+    sections: tuple[Section, ...]
+    lead: str = ""
+    answers: tuple[str, ...] = ()
+    """What came out, in whole sentences."""
+    headlines: tuple[Headline, ...] = ()
+    facts: Facts = ()
+    """What was flown."""
+    facts_title: str = "What flew"
+    remarks: tuple[str, ...] = ()
+    runs: tuple[RunLink, ...] = ()
+    provenance: Facts = ()
+    configurations: tuple[tuple[str, str], ...] = ()
+    """Full configuration by the name of a run."""
+    footer: str = ""
+
+
+def estimate_headline(
+    title: str,
+    estimate: Estimate,
+    unit: str,
+    *,
+    digits: int,
+    sign: str = "",
+    more: Sequence[str] = (),
+) -> Headline:
+    """Return an estimate as a headline with its interval and n."""
+    if estimate.value is None:
+        return Headline(title, NONE, "", f"n = {estimate.n:,}")
+    details = [interval_of(estimate, digits, sign), f"n = {estimate.n:,}", *more]
+    value = f"{estimate.value:{sign}.{digits}f}"
+    return Headline(title, value, unit, ", ".join(text for text in details if text))
+
+
+def run_link(name: str, run: Path, folder: Path) -> RunLink:
+    """Return where a run lies, seen from the folder of a document."""
+    there = Path(os.path.relpath(run, folder)).as_posix()
+    report = f"{there}/{REPORT_FILE}" if (run / REPORT_FILE).exists() else None
+    return RunLink(name, there, report)
+
+
+@cache
+def environment() -> Environment:
+    """Return the template engine: everything escaped, nothing undefined passed over."""
+    made = Environment(
+        loader=PackageLoader("airl_mav.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters["stacked"] = stacked
+    made.globals["outcome_labels"] = OUTCOME_LABELS
+    made.globals["outcome_keys"] = {
+        label: outcome.value for outcome, label in OUTCOME_LABELS.items()
+    }
+    return made
+
+
+def provenance_facts(
+    machine: Mapping[str, Any], git: Mapping[str, Any] | None, versions: Mapping[str, str]
+) -> Facts:
+    """Return machine, commit and versions as facts."""
+    facts = dict(machine)
+    if memory := facts.pop("memory_bytes", None):
+        facts["memory"] = f"{memory / 1e9:.1f} GB"
+    rows = [(name.replace("_", " "), f"{value}") for name, value in facts.items()]
+    if git is not None:
+        changed = " (with changes)" if git.get("changed") else ""
+        rows.append(("commit", f"{git.get('commit')}{changed}"))
+    return (*rows, *sorted(versions.items()))
+
+
+def write_document(document: Document, folder: Path) -> Path:
+    """Write the page, the Markdown and the PNG files, each whole or not at all.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        UsageError: The folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn = []
+        for section in document.sections:
+            pictures = () if section.draw is None else tuple(section.draw())
+            drawn.append((section, pictures))
+            if section.sheet and pictures:
+                columns = 2 if len(pictures) == 4 else SHEET_COLUMNS
+                replace_file(folder / section.sheet, montage(pictures, columns))
+            else:
+                for picture in pictures:
+                    replace_file(folder / f"{picture.name}.png", picture.png)
+        replace_file(folder / f"{document.name}.md", markdown(document).encode())
+        template = environment().get_template("document.html.j2")
+        path = folder / f"{document.name}.html"
+        replace_file(path, template.render(document=document, sections=drawn).encode())
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}") from None
+    return path
+
+
+def markdown(document: Document) -> str:
+    """Return a document without its pictures as Markdown."""
+
+    def listed(facts: Facts) -> str:
+        return "\n".join(f"- {escape_markdown(k)}: {escape_markdown(v)}" for k, v in facts)
+
+    parts = [f"# {escape_markdown(document.title)}", escape_markdown(document.lead)]
+    parts += [escape_markdown(answer) for answer in document.answers]
+    parts.append(listed(document.facts))
+    for section in document.sections:
+        said = (section.sentences, section.facts, section.tables)
+        if not any(said) and section.level > 2:
+            continue
+        if section.title not in [view.title for view in section.tables]:
+            parts.append(f"{'#' * (section.level - 1)} {escape_markdown(section.title)}")
+        parts.append("\n".join(f"- {escape_markdown(line)}" for line in section.sentences))
+        parts.append(listed(section.facts))
+        parts += [markdown_table(view) for view in section.tables]
+        if section.draw is None:
+            parts.append(escape_markdown(section.note))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def print_document(document: Document, console: Console, page: Path) -> None:
+    """Print facts, tables and answers, and where the page lies."""
+    print_facts(document.facts, console)
+    shown = [section for section in document.sections if section.in_terminal]
+    several = sum(section.level == 2 for section in shown) > 1
+    for section in shown:
+        if section.level == 2 and several and not section.tables and not section.sentences:
+            console.print()
+            console.rule(Text(section.title, style="bold"), align="left", style="dim")
+        if section.facts:
+            print_facts(section.facts, console, style="bold")
+        for view in section.tables:
+            if view.in_terminal != "not":
+                console.print()
+                print_table(view, console, wrap=True)
+        if section.note and section.draw is None:
+            console.print(Text(section.note, style="dim"))
+        if section.sentences:
+            console.print()
+            for sentence in section.sentences:
+                console.print(Text(sentence))
+    if document.answers:
+        console.print()
+        if document.lead:
+            console.print(Text(document.lead, style="bold"))
+        for answer in document.answers:
+            console.print(Text(answer, style="" if document.lead else "bold"))
+    console.print()
+    console.print(Text.assemble((f"{document.name}  ", "dim"), str(page)), soft_wrap=True)

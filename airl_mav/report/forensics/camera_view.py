@@ -1,0 +1,173 @@
+"""What the camera had of an obstacle when a frame was taken, and where the obstacle lay."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import Mount, camera_pose, render
+from airl_mav.control.attitude import heading_of
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.vehicle import Camera
+
+Floats = NDArray[np.float64]
+
+SAME_DEPTH_M = 1e-3
+"""Two depths closer than this show the same thing."""
+
+
+@dataclass(frozen=True)
+class PolicyCamera:
+    """The camera that the policy looked through."""
+
+    intrinsics: Intrinsics
+    range_m: float
+    mount: Mount
+
+    @classmethod
+    def of(cls, camera: Camera) -> PolicyCamera:
+        """Return the camera of a vehicle."""
+        mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
+        return cls(Intrinsics.of(camera), camera.range_m, mount)
+
+    @property
+    def half_angle_rad(self) -> float:
+        """Return how far to either side it sees [rad]."""
+        return math.atan(0.5 * self.intrinsics.width / self.intrinsics.focal)
+
+
+@dataclass(frozen=True)
+class ObstacleView:
+    """Where the spot that was hit lay, seen from the vehicle when a frame was taken."""
+
+    distance_m: float
+    """From the vehicle's centre, seen from above [m]."""
+    bearing_rad: float
+    """From the vehicle's heading, positive to the right [rad]."""
+    share: float | None
+    """Part of the picture that showed the obstacle, 0 to 1; None for a wall or the floor."""
+    hidden: bool
+    """The obstacle would have been in the picture, but something nearer covered all of it."""
+
+
+def pose_at(path: Trajectory, time_us: int) -> tuple[Floats, Floats, Floats]:
+    """Return position (3,), velocity (3,) and quaternion (4,), the nearest there is to a time."""
+    time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
+    at = path.between(time, time)
+    return at.position[0], at.velocity[0], at.quaternion[0]
+
+
+def heading_rad(quaternion: Floats) -> float:
+    """Return the heading [rad] of an attitude, 0 north, positive to the east."""
+    w, x, y, z = (float(part) for part in quaternion)
+    cos, sin = heading_of((w, x, y, z))
+    return math.atan2(sin, cos)
+
+
+def bearing(quaternion: Floats, offset: Floats) -> float:
+    """Return where a thing lies [rad]: from the heading, positive to the right, -pi to pi.
+
+    Args:
+        quaternion: (4,) body to NED.
+        offset: (2,) or more, from the vehicle to the thing, north and east first [m].
+    """
+    angle = math.atan2(offset[1], offset[0]) - heading_rad(quaternion)
+    return math.remainder(angle, 2.0 * math.pi)
+
+
+def nearest_spot(obstacles: Obstacles, i: int, center: Floats, position: Floats) -> Floats:
+    """Return the point (2,) of an obstacle's outline from above that is nearest to a position.
+
+    Args:
+        obstacles: All of them.
+        i: Which one.
+        center: (3,) where it is [m].
+        position: (3,) NED [m].
+    """
+    offset = position[:2] - center[:2]
+    if obstacles.shape[i] == Shape.BOX:
+        cos, sin = math.cos(float(obstacles.yaw[i])), math.sin(float(obstacles.yaw[i]))
+        axes = np.array([[cos, sin], [-sin, cos]])
+        half = obstacles.half_size[i, :2]
+        spot: Floats = center[:2] + np.clip(axes @ offset, -half, half) @ axes
+        return spot
+    reach = float(np.linalg.norm(offset))
+    radius = float(obstacles.half_size[i, 0])
+    return center[:2] + offset * min(1.0, radius / reach if reach else 0.0)
+
+
+def view_obstacle(
+    path: Trajectory,
+    frame_us: int,
+    hit_us: int,
+    arena: Arena,
+    began_us: int,
+    i: int,
+    camera: PolicyCamera,
+) -> ObstacleView:
+    """Return where obstacle i was on the frame of `frame_us`, and how much of it was to be seen.
+
+    Args:
+        path: The flight.
+        frame_us: Exposure of the frame [µs].
+        hit_us: When the obstacle was hit [µs].
+        arena: Where it flew.
+        began_us: Start of the episode, from which moving obstacles count [µs].
+        i: Number of the obstacle.
+        camera: The camera.
+    """
+    position, _, quaternion = pose_at(path, frame_us)
+    centers, centers_then = (
+        arena.centers_at(frame_us - began_us),
+        arena.centers_at(hit_us - began_us),
+    )
+    spot = nearest_spot(arena.obstacles, i, centers_then[i], pose_at(path, hit_us)[0])
+    offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
+    whole, alone, empty = (
+        _depth(arena, keep, centers, camera, position, quaternion)
+        for keep in (slice(None), slice(i, i + 1), slice(0, 0))
+    )
+    outline = np.abs(alone - empty) > SAME_DEPTH_M
+    shown = outline & (np.abs(whole - alone) <= SAME_DEPTH_M)
+    return ObstacleView(
+        distance_m=float(np.linalg.norm(offset)),
+        bearing_rad=bearing(quaternion, offset),
+        share=float(shown.mean()),
+        hidden=bool(outline.any() and not shown.any()),
+    )
+
+
+def view_wall(path: Trajectory, frame_us: int, hit_us: int, arena: Arena) -> ObstacleView:
+    """Return where the spot of a wall that was hit lay when a frame was taken."""
+    b = arena.bounds
+    north, east = pose_at(path, hit_us)[0][:2]
+    spots = np.array(
+        [[b.north_max, east], [b.north_min, east], [north, b.east_max], [north, b.east_min]]
+    )
+    spot = spots[np.argmin(np.linalg.norm(spots - [north, east], axis=1))]
+    position, _, quaternion = pose_at(path, frame_us)
+    offset = spot - position[:2]
+    return ObstacleView(
+        float(np.linalg.norm(offset)), bearing(quaternion, offset), None, hidden=False
+    )
+
+
+def _depth(
+    arena: Arena,
+    keep: slice,
+    centers: Floats,
+    camera: PolicyCamera,
+    position: Floats,
+    quaternion: Floats,
+) -> NDArray[np.float32]:
+    """Return the depth image (h, w) of the arena with some of its obstacles only."""
+    o = arena.obstacles
+    some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
+    bare = replace(arena, obstacles=some, tours=())
+    eye, attitude = camera_pose(position, quaternion, camera.mount)
+    return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)

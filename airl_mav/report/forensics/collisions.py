@@ -1,0 +1,145 @@
+"""What led to a collision: the last frame that still moved the motors, and what lay ahead in it."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.forensics.camera_view import (
+    ObstacleView,
+    PolicyCamera,
+    bearing,
+    pose_at,
+    view_obstacle,
+    view_wall,
+)
+
+LOOK_BACK = 5
+"""Decisions before the collision whose frames are looked at."""
+
+SEEN_SHARE = 0.002
+"""An obstacle on a smaller part of the picture counts as not seen: 6 pixels of 64 x 48."""
+
+_THING = re.compile(r"hit (?:[a-z]+-)*([a-z]+(?:[- ](\d+))?)")
+
+
+@dataclass(frozen=True)
+class Collision:
+    """A collision, taken apart."""
+
+    what: str
+    """As the plant calls it: `static-box-3`, `wall`, `floor`."""
+    obstacle: int | None
+    """Number of the obstacle; None for a wall or the floor, or where the arena is not known."""
+    speed_m_s: float
+    """At the collision."""
+    off_heading_rad: float
+    """Direction of flight at the collision, from the heading, positive to the right."""
+    before_s: float | None
+    """Exposure of the last frame that still moved the motors, before the collision [s]; None when
+    no decision ever did."""
+    blind_m: float | None
+    """Way flown since then."""
+    lag_s: float | None
+    """Of it: until the motors answered to that frame."""
+    lag_m: float | None
+    """Way flown meanwhile."""
+    answer_m_s: float | None
+    """Speed at which the motors answered."""
+    view: ObstacleView | None
+    """Where the spot that was hit lay on that frame; None where arena or camera is not known."""
+    seen: tuple[bool, ...]
+    """Whether the obstacle was in the picture in each of the last frames decided on, old to new."""
+
+
+def acting(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
+    """Return the numbers of the decisions that moved the motors before a time [µs].
+
+    Where nothing says when the motors answered, a decision acts when it is sent.
+    """
+    if "sent_us" not in stamps or "capture_us" not in stamps:
+        return np.zeros(0, np.int64)
+    acts = stamps["sent_us"]
+    motor = stamps.get("motor_us")
+    if motor is not None and np.any(motor != NO_STAMP):
+        acts = motor
+    flown = (acts != NO_STAMP) & (acts <= ended_us) & (stamps["capture_us"] != NO_STAMP)
+    return np.flatnonzero(flown).astype(np.int64)
+
+
+def hit_number(reason: str, arena: Arena | None) -> int | None:
+    """Return the number of the obstacle that a verdict names; None for walls, floor, unknown."""
+    found = _THING.match(reason)
+    if found is None or found[2] is None or arena is None:
+        return None
+    number = int(found[2])
+    return number if number < len(arena.obstacles) else None
+
+
+def examine(
+    record: EpisodeRecord,
+    path: Trajectory,
+    stamps: Mapping[str, NDArray[Any]],
+    arena: Arena | None,
+    camera: PolicyCamera | None,
+) -> Collision | None:
+    """Take a collision apart; None for a flight that hit nothing, or that has no recording."""
+    if record.outcome is not Outcome.COLLISION or not len(path):
+        return None
+    hit_us = record.ended_us
+    _, velocity, quaternion = pose_at(path, hit_us)
+    number = hit_number(record.reason, arena)
+    before_s = blind_m = lag_s = lag_m = answer_m_s = view = None
+    seen: tuple[bool, ...] = ()
+    decisions = acting(stamps, hit_us)
+    if decisions.size:
+        frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
+        frame_us = int(frames[-1])
+        before_s, blind_m = (hit_us - frame_us) / US_PER_S, _way(path, frame_us, hit_us)
+        motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
+        if motor_us != NO_STAMP:
+            lag_s, lag_m = (motor_us - frame_us) / US_PER_S, _way(path, frame_us, motor_us)
+            answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
+        if arena is not None and camera is not None:
+            if number is not None:
+                views = [
+                    view_obstacle(
+                        path, int(frame), hit_us, arena, record.started_us, number, camera
+                    )
+                    for frame in frames
+                ]
+                view = views[-1]
+                seen = tuple((v.share or 0.0) >= SEEN_SHARE for v in views)
+            elif "wall" in record.reason:
+                view = view_wall(path, frame_us, hit_us, arena)
+    return Collision(
+        what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
+        obstacle=number,
+        speed_m_s=float(np.linalg.norm(velocity)),
+        off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
+        before_s=before_s,
+        blind_m=blind_m,
+        lag_s=lag_s,
+        lag_m=lag_m,
+        answer_m_s=answer_m_s,
+        view=view,
+        seen=seen,
+    )
+
+
+def _way(path: Trajectory, start_us: int, end_us: int) -> float:
+    """Return the length [m] of a part of the path."""
+    part = path.between(start_us, end_us)
+    return float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum())

@@ -1,0 +1,208 @@
+"""Why a flight never arrived, or took long on its way: swings, stops, circles, passes, detours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.footprints import bounding_boxes, segments_clear
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.forensics.evidence import (
+    HALF_WIDTH_M,
+    NO_CAUSE,
+    Cause,
+    Evidence,
+    Standard,
+    path_excess,
+    straight_m,
+)
+from airl_mav.report.forensics.swings import SPOT_M, Swing, longest_swing
+
+STILL_M_S = 0.2
+"""Slower than this the vehicle stands."""
+
+STOOD_SHARE = 0.25
+"""A flight that stood for more of its time than this has that for a cause."""
+
+CIRCLES = 3.0
+"""As many whole turns in one direction make a flight that circled."""
+
+NEAR_MISS = 2.0
+"""Passing the goal within so many of its radii, and leaving again, is a miss."""
+
+MISS_M = 1.0
+"""How far it must have left again."""
+
+PAUSE_PERIODS = 3.0
+"""A gap between two commands that is so many times the usual one is a pause."""
+
+SLOW_SHARE = 0.15
+"""A mean speed lower than usual by this much of it is slow."""
+
+DETOUR_EXCESS = 0.25
+"""A way that is longer than the straight one by this much of it is a detour."""
+
+
+def of_wandering(flight: Evidence, standard: Standard) -> Cause:
+    """Return why a flight took long, or never arrived."""
+    record, path = flight.record, flight.path
+    start_us = record.started_us if record.navigation_us is None else record.navigation_us
+    part = path.between(start_us, record.ended_us)
+    if len(part) < 2:
+        return Cause(NO_CAUSE, ())
+    swing = longest_swing(flight.stamps, part, record.ended_us)
+    failed = record.outcome is not Outcome.SUCCESS
+    findings = [
+        _swinging(swing, start_us),
+        _circling(part),
+        _standing(part),
+        _pausing(flight.stamps, start_us, record.ended_us),
+        _missing(record, part, start_us),
+        None if failed else _detour(flight),
+        None if failed else _dawdling(record, standard),
+        _hurried(record, standard),
+    ]
+    found = [finding for finding in findings if finding is not None]
+    sentences = [sentence for cause in found for sentence in cause.sentences]
+    if failed:
+        sentences.insert(0, _approach(record, part, start_us))
+        if record.outcome is Outcome.BATTERY:
+            sentences.append(_power(part))
+    return Cause(found[0].kind if found else NO_CAUSE, tuple(sentences))
+
+
+def _goal_distance(record: EpisodeRecord, part: Trajectory) -> NDArray[np.float64]:
+    """Return the distance from the goal (n,) [m], seen from above."""
+    away: NDArray[np.float64] = np.hypot(
+        part.position[:, 0] - record.goal[0], part.position[:, 1] - record.goal[1]
+    )
+    return away
+
+
+def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
+    """Say how close to the goal a flight came."""
+    away = _goal_distance(record, part)
+    best = int(away.argmin())
+    after = (part.time_us[best] - start_us) / US_PER_S
+    return (
+        f"Closest to the goal after {after:.1f} s: {away[best]:.1f} m (radius "
+        f"{record.goal_radius_m:g} m, {away[0]:.1f} m at the start); {away[-1]:.1f} m at the end."
+    )
+
+
+def _swinging(swing: Swing | None, start_us: int) -> Cause | None:
+    """Say that the commands swung left and right on the spot."""
+    if swing is None or not swing.on_the_spot:
+        return None
+    side = "turned left and right" if swing.kind == "yaw" else "moved left and right"
+    begin = (swing.start_us - start_us) / US_PER_S
+    sentence = (
+        f"From {begin:.1f} s on the commands {side} {swing.turns} times in {swing.time_s:.1f} s "
+        f"({swing.time_s / swing.turns:.1f} s to a side), and the vehicle stayed within "
+        f"{SPOT_M:g} m."
+    )
+    return Cause("swung left and right on the spot", (sentence,))
+
+
+def _circling(part: Trajectory) -> Cause | None:
+    """Say that the vehicle turned round and round."""
+    w, x, y, z = part.quaternion.T
+    heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    turns = float(heading[-1] - heading[0]) / (2.0 * math.pi)
+    if abs(turns) < CIRCLES:
+        return None
+    way = "right" if turns > 0.0 else "left"
+    return Cause("circled", (f"It turned {abs(turns):.1f} times round to the {way}.",))
+
+
+def _standing(part: Trajectory) -> Cause | None:
+    """Say that the vehicle stood still."""
+    steps_s = np.diff(part.time_us) / US_PER_S
+    stood_s = float(steps_s[part.speed()[1:] < STILL_M_S].sum())
+    share = stood_s / float(steps_s.sum())
+    if share < STOOD_SHARE:
+        return None
+    return Cause("stood still", (f"It stood still for {stood_s:.1f} s, {share:.0%} of the time.",))
+
+
+def _pausing(stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int) -> Cause | None:
+    """Say that a command was long in coming."""
+    sent = stamps.get("sent_us", np.zeros(0, np.int64))
+    times = sent[(sent != NO_STAMP) & (sent <= ended_us)]
+    gaps = np.diff(times)
+    if len(gaps) < 3 or gaps.max() < PAUSE_PERIODS * np.median(gaps):
+        return None
+    at = (times[int(gaps.argmax())] - start_us) / US_PER_S
+    usual = np.median(gaps) / US_PER_S
+    longest = gaps.max() / US_PER_S
+    sentences = f"At {at:.1f} s no command came for {longest:.1f} s; usual: {usual:.2f} s."
+    return Cause("a decision was late", (sentences,))
+
+
+def _missing(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
+    """Say that the vehicle passed the goal closely and left again."""
+    away = _goal_distance(record, part)
+    # What is still to come of the greatest distance: a pass is a dip before it.
+    later = np.maximum.accumulate(away[::-1])[::-1]
+    near = (away < NEAR_MISS * record.goal_radius_m) & (later > away + MISS_M)
+    if not near.any():
+        return None
+    first = int(np.flatnonzero(near)[0])
+    nearest = np.minimum.accumulate(away[first:])
+    left = int(np.argmax(away[first:] > nearest + MISS_M))
+    best = first + int(away[first : first + left].argmin())
+    after = (part.time_us[best] - start_us) / US_PER_S
+    return Cause(
+        "passed the goal",
+        (f"After {after:.1f} s it passed the goal at {away[best]:.1f} m and left again.",),
+    )
+
+
+def _detour(flight: Evidence) -> Cause | None:
+    """Say whether something stood on the straight way to the goal."""
+    excess = path_excess(flight.record)
+    if flight.arena is None or excess is None or excess < DETOUR_EXCESS:
+        return None
+    boxes = bounding_boxes(flight.arena.obstacles).grown(HALF_WIDTH_M)
+    free = bool(segments_clear(np.zeros(2), np.array([flight.record.goal]), boxes)[0])
+    way = f"{1.0 + excess:.2f} times the straight way"
+    if free:
+        return Cause("a detour without need", (f"{way}, on which nothing stood at the start.",))
+    return Cause("a detour round obstacles", (f"{way}, which obstacles barred.",))
+
+
+def _dawdling(record: EpisodeRecord, standard: Standard) -> Cause | None:
+    """Say that the vehicle flew slowly."""
+    if record.quality is None or standard.speed_m_s is None:
+        return None
+    speed = record.quality.mean_speed_m_s
+    if speed > (1.0 - SLOW_SHARE) * standard.speed_m_s:
+        return None
+    sentences = f"Mean speed {speed:.1f} m/s; usual in this run: {standard.speed_m_s:.1f} m/s."
+    return Cause("flew slowly", (sentences,))
+
+
+def _hurried(record: EpisodeRecord, standard: Standard) -> Cause | None:
+    """Say that no usual flight would have arrived within the time limit."""
+    if record.outcome is not Outcome.TIMEOUT or standard.pace_s_m is None:
+        return None
+    needs_s = standard.pace_s_m * straight_m(record)
+    if needs_s <= record.time_limit_s:
+        return None
+    limit = f"the limit is {record.time_limit_s:g} s"
+    sentences = f"At the usual pace the way takes {needs_s:.1f} s; {limit}."
+    return Cause("a time limit too short for the way", (sentences,))
+
+
+def _power(part: Trajectory) -> str:
+    """Say what emptied the battery."""
+    time_s = (part.time_us[-1] - part.time_us[0]) / US_PER_S
+    return f"{time_s:.0f} s at {part.power_w[1:].mean():.0f} W on average emptied the battery."

@@ -1,0 +1,189 @@
+"""The flights that went worst, and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.safe_velocity import max_acceleration
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.forensics.camera_view import PolicyCamera
+from airl_mav.report.forensics.causes import cause_of
+from airl_mav.report.forensics.evidence import (
+    Cause,
+    Evidence,
+    path_excess,
+    standard_of,
+    time_lost_s,
+)
+from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
+
+EXAMINED = 100
+"""Flights whose cause is looked for: the worst."""
+
+LISTED = 12
+"""Rows of the table of worst flights."""
+
+NAMED = 6
+"""Flights named beside each cause."""
+
+NOT_RECORDED = Trajectory(
+    np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0)
+)
+
+
+@dataclass(frozen=True)
+class ExaminedFlight:
+    """A flight and its cause."""
+
+    record: EpisodeRecord
+    cause: Cause
+    lost_s: float | None
+    """Against the run's median pace over the same straight way [s]."""
+    excess: float | None
+    """Of the way flown over the straight one, as a fraction."""
+
+
+def ranked(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return all flights, the worst first.
+
+    Those that failed come first, then aborted ones, then those that reached the goal; each by the
+    time they lost, or took where no flight reached the goal.
+    """
+    standard = standard_of(run.episodes)
+    order = {Outcome.SUCCESS: 2, Outcome.ABORTED: 1}
+
+    def key(e: EpisodeRecord) -> tuple[int, float, int]:
+        lost_s = time_lost_s(e, standard)
+        if lost_s is None:
+            lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
+        return (order.get(e.outcome, 0), -lost_s, e.index)
+
+    return sorted(run.episodes, key=key)
+
+
+def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
+    """Return a flight's path up to the verdict; what is recorded after it is the landing."""
+    path = run.trajectories.get(record.index)
+    if path is None or not len(path):
+        return None
+    return path.between(int(path.time_us[0]), record.ended_us)
+
+
+def examine_worst(
+    run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
+) -> list[ExaminedFlight]:
+    """Return the worst flights of a run, `EXAMINED` at most, each with its cause.
+
+    Args:
+        run: The run.
+        arenas: Arenas by episode index; where one is missing the cause says less.
+        vehicle: What flew; None says less too.
+    """
+    standard = standard_of(run.episodes)
+    camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
+    brake = None if vehicle is None else max_acceleration(vehicle)
+    return [
+        ExaminedFlight(
+            record,
+            cause_of(_evidence(run, record, arenas, camera, brake), standard),
+            time_lost_s(record, standard),
+            path_excess(record),
+        )
+        for record in ranked(run)[:EXAMINED]
+    ]
+
+
+def _evidence(
+    run: LoadedRun,
+    record: EpisodeRecord,
+    arenas: Mapping[int, Arena],
+    camera: PolicyCamera | None,
+    brake_m_s2: float | None,
+) -> Evidence:
+    """Gather what is known of a flight."""
+    path = flown_path(run, record)
+    stamps = run.latency.get(record.index, {})
+    arena = arenas.get(record.index)
+    return Evidence(
+        record, NOT_RECORDED if path is None else path, stamps, arena, camera, brake_m_s2
+    )
+
+
+def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
+    """Return the worst flights with their causes."""
+    columns = (
+        Column("#"),
+        Column("seed"),
+        Column("outcome", number=False),
+        Column("after", "s"),
+        Column("time lost", "s"),
+        Column("way", "x straight"),
+        Column("cause", number=False),
+    )
+    shown = judged[:LISTED]
+    notes = [
+        "Failed flights first, each by time lost: its time less that of the run's median pace over "
+        "the same straight way. Causes are worked out from what was recorded.",
+    ]
+    if len(shown) < total:
+        notes.append(f"The {len(shown)} worst of {total:,} flights.")
+    return TableView("worst", "Worst flights", columns, tuple(map(_row, shown)), tuple(notes))
+
+
+def _row(judged: ExaminedFlight) -> tuple[str, ...]:
+    """Return one flight's cells."""
+    record = judged.record
+    began_us = record.started_us if record.navigation_us is None else record.navigation_us
+    arrived = record.outcome is Outcome.SUCCESS
+    # What ended early has not saved time.
+    whole = arrived or record.outcome is Outcome.TIMEOUT
+    return (
+        f"{record.index}",
+        f"{record.seed}",
+        OUTCOME_LABELS[record.outcome],
+        f"{(record.ended_us - began_us) / US_PER_S:.1f}",
+        NONE if judged.lost_s is None or not whole else f"{judged.lost_s:+.1f}",
+        NONE if judged.excess is None or not arrived else f"{1.0 + judged.excess:.2f}",
+        judged.cause.kind,
+    )
+
+
+def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView | None:
+    """Return how often each cause made a flight fail; None where fewer than two failed."""
+    failed = [j for j in judged if j.record.outcome not in (Outcome.SUCCESS, Outcome.ABORTED)]
+    if len(failed) < 2:
+        return None
+    counts = Counter(j.cause.kind for j in failed)
+    rows = []
+    for kind, count in counts.most_common():
+        which = [f"{j.record.index}" for j in failed if j.cause.kind == kind]
+        more = ", …" if len(which) > NAMED else ""
+        rows.append(
+            (
+                kind,
+                f"{count}",
+                f"{100.0 * count / len(failed):.0f}",
+                ", ".join(which[:NAMED]) + more,
+            )
+        )
+    columns = (
+        Column("cause", number=False),
+        Column("flights"),
+        Column("of those that failed", "%"),
+        Column("which", number=False),
+    )
+    all_failed = sum(e.outcome not in (Outcome.SUCCESS, Outcome.ABORTED) for e in run.episodes)
+    notes: tuple[str, ...] = ()
+    if all_failed > len(failed):
+        notes = (f"The first {len(failed)} of {all_failed:,} flights that failed.",)
+    return TableView("causes", "Why flights failed", columns, tuple(rows), notes)

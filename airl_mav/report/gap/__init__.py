@@ -1,1 +1,0 @@
-"""The hardware gap: worked out, tabled, drawn."""

@@ -1,1 +1,0 @@
-"""The fidelity ladder: worked out, tabled, drawn."""

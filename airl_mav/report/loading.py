@@ -1,0 +1,65 @@
+"""A run read back, and its vehicle and arenas made again from their profiles and seeds."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+from zipfile import BadZipFile
+
+from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
+
+
+def load_run(path: Path) -> LoadedRun:
+    """Read a run folder. Raises UsageError with one line, whatever is wrong with its files."""
+    try:
+        return load(path)
+    except RecursionError:
+        raise UsageError(f"{path}: a file is nested too deeply: damaged") from None
+    except (EOFError, KeyError, NotImplementedError, zlib.error, BadZipFile, OSError) as error:
+        raise UsageError(f"{path}: a file is damaged: {error}") from None
+
+
+def vehicle_of(info: RunInfo) -> VehicleProfile:
+    """Return the vehicle of a run, with the camera that its environment gave it.
+
+    Raises:
+        UsageError: Its profile cannot be found any more.
+    """
+    vehicle = load_profile("vehicles", info.setup.vehicle.name, VehicleProfile)
+    change = info.config.get("environment", {}).get("camera", {})
+    given = {name: value for name, value in change.items() if value is not None}
+    camera = vehicle.camera.model_copy(update=given)
+    return vehicle.model_copy(update={"camera": camera})
+
+
+def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:
+    """Make the arenas of some flights, by episode index. Raises UsageError."""
+    specs: dict[str, ArenaSpec] = {}
+    arenas: dict[int, Arena] = {}
+    for record in records:
+        if record.arena not in specs:
+            specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
+        if record.index not in arenas:
+            arenas[record.index] = generate(
+                specs[record.arena],
+                record.arena_seed,
+                name=record.arena,
+                vehicle_width_m=vehicle.body.width_m,
+            )
+    return arenas
+
+
+def arena_of(run: LoadedRun, episode: EpisodeRecord) -> Arena | None:
+    """Make the arena of one flight; None where a profile cannot be found any more."""
+    try:
+        return arenas_of([episode], vehicle_of(run.info))[episode.index]
+    except UsageError:
+        return None

@@ -1,0 +1,102 @@
+"""The measures that runs are compared in, and estimates of them as text."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from airl_mav.flight.paired import Change, PairedComparison
+from airl_mav.flight.statistics import Aggregate, Estimate
+from airl_mav.report.table import NONE
+
+FEW_FLIGHTS = 10
+"""Below this a bootstrap interval covers clearly less than its 95 %."""
+
+MANY_FLIGHTS = 100
+"""From here on rates have a decimal."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A measure of the quality of flight."""
+
+    key: Literal[
+        "success_rate",
+        "flight_time_s",
+        "distance_m",
+        "energy_j",
+        "computer_energy_j",
+        "total_energy_j",
+    ]
+    """Its field in a `PairedComparison`, and in an `Aggregate`."""
+    title: str
+    unit: str
+    scale: float
+    """From the unit of the field to the shown one."""
+    digits: int
+    difference_unit: str = "%"
+
+    def of(self, quality: Aggregate) -> Estimate:
+        """Return the measure of a run."""
+        estimate: Estimate = getattr(quality, self.key)
+        return estimate
+
+    def change(self, paired: PairedComparison) -> Change:
+        """Return the measure of a paired comparison."""
+        change: Change = getattr(paired, self.key)
+        return change
+
+    def plain(self, value: float | None, *, unit: bool = False) -> str:
+        """Return a value in the shown unit."""
+        if value is None:
+            return NONE
+        return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}"
+
+    def with_interval(self, estimate: Estimate) -> str:
+        """Return an estimate in the shown unit with its 95 % interval in brackets."""
+        return with_interval(estimate.scaled(self.scale), self.digits)
+
+
+SUCCESS_RATE = Measure("success_rate", "success rate", "%", 100.0, 1, "points")
+FLIGHT_TIME = Measure("flight_time_s", "flight time", "s", 1.0, 2)
+DISTANCE = Measure("distance_m", "distance", "m", 1.0, 2)
+ENERGY = Measure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
+COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
+TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
+
+MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)
+ALL_MEASURES = (*MEASURES, COMPUTER_ENERGY, TOTAL_ENERGY)
+
+
+def with_interval(estimate: Estimate, digits: int = 1, sign: str = "") -> str:
+    """Return an estimate with its 95 % interval in brackets; `sign` is "+" for differences."""
+    if estimate.value is None:
+        return NONE
+    form = f"{sign}.{digits}f"
+    text = f"{estimate.value:{form}}"
+    if estimate.low is not None and estimate.high is not None:
+        text += f" [{estimate.low:{form}}, {estimate.high:{form}}]"
+    return text
+
+
+def interval_of(estimate: Estimate, digits: int, sign: str = "") -> str:
+    """Return the 95 % interval alone; empty where there is none."""
+    if estimate.low is None or estimate.high is None:
+        return ""
+    form = f"{sign}.{digits}f"
+    return f"{estimate.low:{form}} … {estimate.high:{form}}"
+
+
+def rate_digits(rate: Estimate) -> int:
+    """Return the decimals of a rate in percent: one flight more or less shows."""
+    return 1 if rate.n >= MANY_FLIGHTS else 0
+
+
+def rate_with_interval(rate: Estimate) -> str:
+    """Return a rate in percent with its interval in brackets."""
+    return with_interval(rate.scaled(100.0), rate_digits(rate))
+
+
+def count_successes(n: int) -> str:
+    """Return "3 common successes"."""
+    return f"{n:,} common success" if n == 1 else f"{n:,} common successes"

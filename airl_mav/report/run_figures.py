@@ -1,0 +1,308 @@
+"""The figures of a run's report: latency by stage, the flight from above, the flight over time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Colormap, ListedColormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
+
+from airl_mav.arena.draw import draw_arena
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.percentiles import Summary
+from airl_mav.latency.stages import Samples, Stage
+from airl_mav.report.table import OUTCOME_LABELS, US_PER_MS, ms
+from airl_mav.report.theme import (
+    HALO,
+    INK,
+    MARK,
+    MUTED,
+    RULE,
+    SERIES,
+    SERIES_SOFT,
+    Picture,
+    new_figure,
+    plain_axes,
+    render,
+)
+
+LONG_TAIL = 30.0
+"""A maximum this many times the median: the axis becomes logarithmic."""
+PATH_SEGMENTS = 500
+"""A drawn path has at most this many corners: more are not seen, and weigh."""
+TIME_POINTS = 500
+"""A line over time has at most this many corners."""
+PATH_COLOURS = 24
+"""Steps of a path's colour: neighbours of one step are one line."""
+
+OUTCOME_COLOURS = {
+    Outcome.SUCCESS: "#1b8a3f",
+    Outcome.COLLISION: "#c0261c",
+    Outcome.TIMEOUT: "#a86400",
+    Outcome.BATTERY: "#7b3fa0",
+    Outcome.ABORTED: "#68707a",
+}
+OUTCOME_MARKERS = {
+    Outcome.SUCCESS: "o",
+    Outcome.COLLISION: "X",
+    Outcome.TIMEOUT: "s",
+    Outcome.BATTERY: "D",
+    Outcome.ABORTED: "P",
+}
+
+
+def speed_colours() -> Colormap:
+    """Return viridis without its pale end, which would vanish on the floor's colour."""
+    return ListedColormap(colormaps["viridis"](np.linspace(0.05, 0.9, 256)), name="speed")
+
+
+def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> Picture:
+    """Draw how one stage's durations (n,) [µs] spread: histogram above, cumulated share below.
+
+    Its percentiles are marked on the lower axes.
+    """
+    figure = new_figure(4.2, 2.6)
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.1, 1.0))
+    values = np.sort(samples) / US_PER_MS
+    edges = _bin_edges(values)
+    top.hist(values, edges, color=SERIES_SOFT, edgecolor=SERIES, linewidth=0.4)
+    share = 100.0 * np.arange(1, len(values) + 1) / len(values)
+    bottom.step(
+        [edges[0], *values, edges[-1]],
+        [0.0, *share, 100.0],
+        where="post",
+        color=SERIES,
+        linewidth=1.4,
+    )
+    marks = []
+    for name, level, at_us in (
+        ("p50", 50.0, summary.p50),
+        ("p90", 90.0, summary.p90),
+        ("p99", 99.0, summary.p99),
+    ):
+        if at_us is not None:
+            marks.append(f"{name} {ms(at_us)}")
+            bottom.plot(at_us / US_PER_MS, level, "o", ms=4, color=MARK, clip_on=False, zorder=3)
+    top.set_title(stage.title, loc="left", fontsize=10.5, color=INK, pad=6)
+    top.set_title("   ".join(marks), loc="right", fontsize=8.5, color=MARK, pad=6)
+    top.set_ylabel("decisions", fontsize=8.5, color=MUTED)
+    top.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+    bottom.set_ylabel("share [%]", fontsize=8.5, color=MUTED)
+    bottom.set_yticks([0, 50, 100])
+    bottom.set_ylim(0, 104)
+    bottom.set_xlabel(f"ms, n = {summary.n:,}", fontsize=8.5, color=MUTED)
+    if long_tail(values):
+        bottom.set_xscale("log")
+        bottom.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        bottom.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        bottom.xaxis.set_major_locator(MaxNLocator(5))
+    for ax in (top, bottom):
+        plain_axes(ax)
+    alt = f"Histogram and cumulated distribution of {stage.title}: {stage.meaning}"
+    return render(figure, f"latency-{stage.key.replace('_', '-')}", alt)
+
+
+def long_tail(values: NDArray[np.float64]) -> bool:
+    """Return whether sorted values call for a logarithmic axis."""
+    return bool(values[0] > 0.0 and values[-1] > LONG_TAIL * np.median(values))
+
+
+def _bin_edges(values: NDArray[np.float64]) -> list[float]:
+    """Return the histogram's edges for sorted values (n,): about two times the root of n bins.
+
+    Their number is odd, so that a single duration lies in the middle of its bar.
+    """
+    bins = int(np.clip(2.0 * math.sqrt(len(values)), 12, 40)) | 1
+    low, high = float(values[0]), float(values[-1])
+    if long_tail(values):
+        return [float(edge) for edge in np.geomspace(low, high, bins + 1)]
+    # One duration only, as in lockstep, still needs a width.
+    pad = 0.03 * (high - low) if high > low else max(0.1 * abs(high), 0.001)
+    return [float(edge) for edge in np.linspace(low - pad, high + pad, bins + 1)]
+
+
+def map_figure(
+    episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
+) -> Picture:
+    """Draw a flight from above over its arena, as the arena was when the flight ended.
+
+    Args:
+        episode: The flight.
+        trajectory: Its path; None draws the arena alone.
+        arena: Where it flew; None draws path and goal alone.
+        top_speed: Upper end of the colour scale [m/s], the same for all flights of a run.
+    """
+    tall = 1.0
+    if arena is not None:
+        b = arena.bounds
+        tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
+    # The map takes 4.15 inches across; axis labels and legend about one inch of the height.
+    figure = new_figure(5.2, 1.0 + 4.15 * min(max(tall, 0.5), 1.6))
+    ax = figure.add_subplot()
+    if arena is not None:
+        ended_us = episode.ended_us - episode.started_us
+        draw_arena(arena, ax, ended_us, goal_radius_m=episode.goal_radius_m)
+    else:
+        _draw_goal(ax, episode)
+    if trajectory is not None and len(trajectory) > 1:
+        _draw_path(figure, ax, episode, trajectory, top_speed)
+    plain_axes(ax, grid=False)
+    ax.xaxis.label.set(color=MUTED, fontsize=8.5)
+    ax.yaxis.label.set(color=MUTED, fontsize=8.5)
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower left",
+        ncols=3,
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+        handletextpad=0.4,
+        columnspacing=1.2,
+    )
+    words = OUTCOME_LABELS[episode.outcome]
+    alt = f"Flight {episode.index} from above, coloured by speed: {words}, {episode.reason}"
+    return render(figure, f"flight-{episode.index:03d}-map", alt)
+
+
+def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
+    """Draw start and goal where no arena does."""
+    north, east = episode.goal
+    colour = OUTCOME_COLOURS[Outcome.SUCCESS]
+    ax.add_patch(
+        Circle((east, north), episode.goal_radius_m, facecolor="none", edgecolor=colour, lw=1.0)
+    )
+    ax.plot(east, north, marker="*", ms=15, color=colour, ls="none", label="goal")
+    ax.plot(0.0, 0.0, marker="^", ms=11, color=SERIES, ls="none", label="start, heading north")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel("east [m]")
+    ax.set_ylabel("north [m]")
+
+
+def _draw_path(
+    figure: Figure, ax: Axes, episode: EpisodeRecord, trajectory: Trajectory, top_speed: float
+) -> None:
+    """Draw the path coloured by speed, its end marked by the outcome."""
+    keep = np.unique(
+        np.linspace(0, len(trajectory) - 1, min(len(trajectory), PATH_SEGMENTS)).astype(int)
+    )
+    points = trajectory.position[keep][:, [1, 0]]
+    speed = trajectory.speed()[keep]
+    colours = speed_colours()
+    scale = Normalize(0.0, top_speed)
+    ax.plot(*points.T, color=HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
+    pieces, levels = coloured_pieces(points, 0.5 * (speed[1:] + speed[:-1]), top_speed)
+    path = LineCollection(
+        pieces,
+        cmap=colours,
+        norm=scale,
+        linewidths=2.2,
+        capstyle="round",
+        zorder=2.6,
+    )
+    path.set_array(levels)
+    ax.add_collection(path)
+    outcome = episode.outcome
+    ax.plot(
+        *points[-1],
+        marker=OUTCOME_MARKERS[outcome],
+        ms=9 if outcome is not Outcome.SUCCESS else 7,
+        color=OUTCOME_COLOURS[outcome],
+        mec="white",
+        mew=1.0,
+        ls="none",
+        zorder=4,
+        label=f"end: {OUTCOME_LABELS[outcome]}",
+    )
+    bar = figure.colorbar(ScalarMappable(scale, colours), ax=ax, shrink=0.45, aspect=26, pad=0.015)
+    speed_bar(bar)
+
+
+def speed_bar(bar: Colorbar) -> None:
+    """Style the colour scale of a path."""
+    if bar.solids is not None:
+        # 256 colour steps weigh less as pixels than as shapes.
+        bar.solids.set_rasterized(True)
+    bar.outline.set_visible(False)
+    bar.set_label("speed [m/s]", fontsize=8.5, color=MUTED)
+    bar.ax.tick_params(colors=MUTED, labelsize=8, length=0)
+
+
+def coloured_pieces(
+    points: NDArray[np.float64], values: NDArray[np.float64], top: float
+) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
+    """Cut a line where its colour changes.
+
+    Args:
+        points: (n, 2) its corners, n >= 2.
+        values: (n - 1,) value of each segment.
+        top: Value at the upper end of the colour scale, which begins at 0.
+
+    Returns:
+        The pieces, each (k, 2), which share their ends; and the value of each.
+    """
+    step = top / PATH_COLOURS
+    levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)
+    cuts = np.flatnonzero(np.diff(levels)) + 1
+    starts, ends = [0, *cuts], [*cuts, len(values)]
+    pieces = [points[start : end + 1] for start, end in zip(starts, ends, strict=True)]
+    return pieces, (levels[np.array(starts)] + 0.5) * step
+
+
+def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
+    """Draw speed, altitude and power over time, zero where navigation begins."""
+    figure = new_figure(5.2, 4.9)
+    zero_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
+    keep = np.unique(np.linspace(0, len(trajectory) - 1, TIME_POINTS).astype(int))
+    # Power is a mean since the sample before: so it stays when samples are left out.
+    steps_us = np.diff(trajectory.time_us, prepend=trajectory.time_us[0] - 1)
+    energy = np.cumsum(trajectory.power_w * steps_us)
+    passed_us = trajectory.time_us[keep] - trajectory.time_us[0] + 1
+    power = np.diff(energy[keep], prepend=0.0) / np.diff(passed_us, prepend=0)
+    t = (trajectory.time_us[keep] - zero_us) / US_PER_S
+    rows: tuple[tuple[Any, str, NDArray[np.float64]], ...] = tuple(
+        zip(
+            figure.subplots(3, 1, sharex=True),
+            ("speed [m/s]", "altitude [m]", "power [W]"),
+            (trajectory.speed()[keep], -trajectory.position[keep, 2], power),
+            strict=True,
+        )
+    )
+    for ax, label, values in rows:
+        ax.plot(t, values, color=SERIES, lw=1.2)
+        ax.set_ylabel(label, fontsize=8.5, color=MUTED)
+        ax.set_ylim(bottom=min(0.0, float(values.min())))
+        if t[0] < 0.0:
+            ax.axvspan(t[0], 0.0, color=RULE, alpha=0.45, lw=0)
+        plain_axes(ax)
+        ax.set_xlim(t[0], t[-1])
+    if t[0] < 0.0:
+        rows[0][0].annotate(
+            "take-off",
+            (t[0], 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, -3),
+            textcoords="offset points",
+            va="top",
+            fontsize=8,
+            color=MUTED,
+        )
+    rows[-1][0].set_xlabel("time since the start of navigation [s]", fontsize=8.5, color=MUTED)
+    alt = f"Speed, altitude and power over time, flight {episode.index}"
+    return render(figure, f"flight-{episode.index:03d}-time", alt)

@@ -1,0 +1,217 @@
+"""The tables of a run's report: the terminal and the page show the same ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord, run_sha256
+from airl_mav.flight.setup import Part
+from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
+from airl_mav.latency.percentiles import Summary
+from airl_mav.rehearsal.run_folder import EPISODES_FILE, LoadedRun
+from airl_mav.report.measures import FEW_FLIGHTS, rate_digits
+from airl_mav.report.run_summary import RealTime, RunSummary
+from airl_mav.report.table import (
+    NONE,
+    OUTCOME_LABELS,
+    TOO_FEW_CELL,
+    TOO_FEW_NOTE,
+    Column,
+    TableView,
+    ms,
+    percentile_cell,
+)
+
+
+def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
+    """Return what was flown on what, as (term, text)."""
+    setup = run.info.setup
+    injection = setup.injection
+    latency = f"{injection.origin}: {injection.label}"
+    pace = "not paced: as fast as it goes" if setup.speed is None else f"{setup.speed:g} x"
+    rows = [
+        ("vehicle", _part(setup.vehicle)),
+        ("arena", _part(setup.arena)),
+        ("policy", _part(setup.policy)),
+        ("computer", f"{_part(setup.computer)}, {setup.computer_watts:g} W"),
+        ("decision latency t2", latency),
+        ("source of t2", injection.source),
+        ("assumed of t2", injection.assumed),
+        ("level", setup.level),
+        ("firmware", setup.firmware),
+        ("speed", pace),
+        ("between commands", setup.between_commands),
+        ("sha256 of the flights", run_sha256(run.episodes) or ""),
+    ]
+    return tuple((term, text) for term, text in rows if text)
+
+
+def _part(part: Part) -> str:
+    """Return a part's name and description."""
+    return f"{part.name} – {part.description}" if part.description else part.name
+
+
+def latency_table(summary: RunSummary) -> TableView:
+    """Return the latencies by stage."""
+    columns = (
+        Column("stage", number=False),
+        Column("n"),
+        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+        Column("from → to", number=False, page_only=True),
+    )
+    rows, short = [], False
+    for stage in summary.shown_stages:
+        s = summary.stages[stage.key]
+        tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
+        short = short or TOO_FEW_CELL in tail
+        cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
+        rows.append((stage.title, *cells, stage.meaning))
+    notes = ["Milliseconds of simulated time."]
+    if summary.modelled:
+        notes.append(
+            "Level gym measures no time: transport and link are constants of its model, t2 is "
+            "drawn from the distribution named above."
+        )
+    if short:
+        notes.append(TOO_FEW_NOTE)
+    return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+
+
+def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[EpisodeRecord]:
+    """Return at most so many episodes, those that failed before all others, in flown order."""
+    ranked = sorted(episodes, key=lambda e: (e.outcome is Outcome.SUCCESS, e.index))
+    return sorted(ranked[:most], key=lambda e: e.index)
+
+
+def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
+    """Return the quality of each flight, or of at most so many, those that failed first."""
+    columns = (
+        Column("#"),
+        Column("seed"),
+        Column("outcome", number=False),
+        Column("time", "s"),
+        Column("distance", "m"),
+        Column("energy", "kJ"),
+        Column("speed", "m/s"),
+        Column("top speed", "m/s", page_only=True),
+        Column("computer", "J", page_only=True),
+        Column("take-off", "s, kJ", page_only=True),
+        Column("battery", "%", page_only=True),
+        Column("why", number=False, page_only=True),
+    )
+    total = len(run.episodes)
+    shown = run.episodes if most is None else failures_first(run.episodes, most)
+    rows = tuple(_episode_row(episode) for episode in shown)
+    notes = ["From the start of navigation; the take-off apart. Energy without the computer's."]
+    if len(shown) < total:
+        notes.append(
+            f"{len(shown)} of {total:,} flights, those that failed first; all: {EPISODES_FILE}."
+        )
+    return TableView("episodes", "Flights", columns, rows, tuple(notes))
+
+
+def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
+    """Return an episode's cells."""
+    q = episode.quality
+    figures = (
+        (NONE,) * 7
+        if q is None
+        else (
+            f"{q.flight_time_s:.2f}",
+            f"{q.distance_m:.2f}",
+            f"{q.energy_j / 1e3:.2f}",
+            f"{q.mean_speed_m_s:.2f}",
+            f"{q.max_speed_m_s:.2f}",
+            f"{q.computer_energy_j:,.0f}",
+            f"{q.takeoff.time_s:.2f}, {q.takeoff.energy_j / 1e3:.2f}",
+        )
+    )
+    battery = episode.battery_remaining
+    left = NONE if battery is None else f"{100.0 * battery:.1f}"
+    why = "; ".join([episode.reason, *episode.notes])
+    words = OUTCOME_LABELS[episode.outcome]
+    return (f"{episode.index}", f"{episode.seed}", words, *figures, left, why)
+
+
+def quality_table(summary: RunSummary) -> TableView:
+    """Return the quality of flight over all episodes, with intervals."""
+    columns = (
+        Column("measure", number=False),
+        Column("value"),
+        Column("95 % interval"),
+        Column("median"),
+        Column("95 % interval", page_only=True),
+        Column("n"),
+    )
+    q = summary.quality
+    measures = (
+        ("flight time", "s", "flight_time_s", 1.0, 2),
+        ("distance", "m", "distance_m", 1.0, 2),
+        ("energy, vehicle", "kJ", "energy_j", 1e-3, 2),
+        ("energy, computer", "J", "computer_energy_j", 1.0, 0),
+        ("mean speed", "m/s", "mean_speed_m_s", 1.0, 2),
+    )
+    digits = rate_digits(q.success_rate)
+    rows = [_estimate_row("success rate", "%", q.success_rate, NO_ESTIMATE, 100.0, digits)]
+    for title, unit, name, scale, places in measures:
+        mean = getattr(q, name)
+        rows.append(_estimate_row(title, unit, mean, summary.medians[name], scale, places))
+    notes = [
+        "Means and medians over the flights that reached the goal; n is their number (for the "
+        "success rate: all flights but aborted ones). Intervals: Wilson for the rate, bootstrap "
+        "for the means, binomial for the medians."
+    ]
+    if 1 < q.flight_time_s.n < FEW_FLIGHTS:
+        notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
+    return TableView("quality", "Quality of flight", columns, tuple(rows), tuple(notes))
+
+
+def _estimate_row(
+    title: str, unit: str, estimate: Estimate, median: Estimate, scale: float, digits: int
+) -> tuple[str, ...]:
+    """Return an estimate's cells."""
+
+    def show(value: float | None) -> str:
+        return NONE if value is None else f"{scale * value:,.{digits}f}"
+
+    def interval(of: Estimate) -> str:
+        return NONE if of.low is None else f"{show(of.low)} … {show(of.high)}"
+
+    value = NONE if estimate.value is None else f"{show(estimate.value)} {unit}"
+    middle = show(median.value), interval(median)
+    return title, value, interval(estimate), *middle, f"{estimate.n}"
+
+
+def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
+    """Return how the run kept pace with the wall clock."""
+    columns = (Column("measure", number=False), Column("value"), Column("n"))
+    rt = summary.real_time
+    rows = [
+        *_tail_rows("tick lateness", rt.tick_lateness),
+        ("real-time factor", _factor(run, rt), f"{len(run.episodes)}"),
+        ("simulated time given up", f"{ms(rt.slipped_us)} ms", f"{len(run.episodes)}"),
+        *_tail_rows("setpoint → motor", rt.setpoint_to_motor),
+        ("setpoints never accepted", f"{rt.unmatched:,}", f"{rt.setpoints:,}"),
+    ]
+    return TableView("real-time", "Real time", columns, tuple(rows))
+
+
+def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
+    """Return median, p99 and maximum of a set of durations as rows; one row when there is none."""
+    n = summary.n
+    if not n:
+        return [(title, NONE, "0")]
+    p99 = percentile_cell(summary.p99, n)
+    return [
+        (f"{title}, p50", f"{ms(summary.p50)} ms", f"{n:,}"),
+        (f"{title}, p99", p99 if p99 == TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
+        (f"{title}, max", f"{ms(summary.max)} ms", f"{n:,}"),
+    ]
+
+
+def _factor(run: LoadedRun, real_time: RealTime) -> str:
+    """Return the real-time factor beside the one asked for."""
+    if real_time.factor is None or run.info.setup.speed is None:
+        return "not paced"
+    return f"{real_time.factor:.3f} (asked {run.info.setup.speed:g})"

@@ -1,1 +1,0 @@
-"""The architecture search: tabled, drawn."""

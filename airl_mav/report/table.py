@@ -1,0 +1,157 @@
+"""A table of text cells, and how the terminal and Markdown show it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from airl_mav.flight.judge import Outcome
+from airl_mav.latency.percentiles import MIN_SAMPLES
+
+US_PER_MS = 1_000.0
+NONE = "–"
+"""Shown where there is no value."""
+TOO_FEW_CELL = "too few"
+TOO_FEW_NOTE = (
+    f"{TOO_FEW_CELL}: a p90 needs {MIN_SAMPLES[90.0]} samples, a p99 {MIN_SAMPLES[99.0]}."
+)
+
+OUTCOME_LABELS = {
+    Outcome.SUCCESS: "goal reached",
+    Outcome.COLLISION: "collision",
+    Outcome.TIMEOUT: "time limit",
+    Outcome.BATTERY: "battery empty",
+    Outcome.ABORTED: "aborted",
+}
+
+STYLES = {
+    OUTCOME_LABELS[Outcome.SUCCESS]: "green",
+    OUTCOME_LABELS[Outcome.COLLISION]: "red",
+    OUTCOME_LABELS[Outcome.TIMEOUT]: "yellow",
+    OUTCOME_LABELS[Outcome.BATTERY]: "magenta",
+    OUTCOME_LABELS[Outcome.ABORTED]: "dim",
+    TOO_FEW_CELL: "dim",
+    NONE: "dim",
+}
+"""Style of a cell in the terminal by its text."""
+
+_INTERVAL = re.compile(r" (\[[^\[\]]*\])")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table."""
+
+    title: str
+    unit: str = ""
+    number: bool = True
+    """Set right, in figures of equal width."""
+    page_only: bool = False
+    """Left out where there is little room: in the terminal."""
+
+
+@dataclass(frozen=True)
+class TableView:
+    """A table of text cells."""
+
+    key: str
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...] = ()
+    stacked: bool = False
+    """Intervals in brackets stand below their values on a page, which saves width."""
+    in_terminal: Literal["whole", "stacked", "without intervals", "not"] = "whole"
+
+
+def ms(value_us: float | None, digits: int = 2) -> str:
+    """Return a duration [µs] as milliseconds."""
+    return NONE if value_us is None else f"{value_us / US_PER_MS:,.{digits}f}"
+
+
+def percentile_cell(value_us: float | None, n: int) -> str:
+    """Return a percentile [µs] as milliseconds, or that its samples are too few."""
+    return TOO_FEW_CELL if value_us is None and n else ms(value_us)
+
+
+def stacked(cell: str) -> str:
+    """Return a cell with its interval in a line of its own."""
+    return _INTERVAL.sub(r"\n\1", cell)
+
+
+def escape_markdown(text: str) -> str:
+    """Return text in which nothing is taken for Markdown."""
+    return "".join(f"\\{c}" if c in "\\|*_`[]<>" else c for c in text)
+
+
+def markdown_table(view: TableView) -> str:
+    """Return a table with its title and notes as Markdown."""
+    titles = [f"{c.title} [{c.unit}]" if c.unit else c.title for c in view.columns]
+    rule = ["---:" if column.number else "---" for column in view.columns]
+    cells = [[escape_markdown(cell.replace("\n", ", ")) for cell in row] for row in view.rows]
+    lines = [f"| {' | '.join(row)} |" for row in (titles, rule, *cells)]
+    return "\n\n".join([f"## {view.title}", "\n".join(lines), *map(escape_markdown, view.notes)])
+
+
+def print_table(view: TableView, console: Console, *, wrap: bool = False) -> None:
+    """Print a table and its notes; its cells are broken into lines or kept whole."""
+    if view.in_terminal == "not":
+        return
+    console.print(rich_table(view, wrap=wrap))
+    for note in view.notes:
+        console.print(Text(note, style="dim"))
+
+
+def rich_table(view: TableView, *, wrap: bool = False) -> Table:
+    """Return a table for the terminal, without the columns meant for a page."""
+    table = Table(
+        title=view.title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    shown = [i for i, column in enumerate(view.columns) if not column.page_only]
+    for i in shown:
+        column = view.columns[i]
+        title = f"{column.title} [{column.unit}]" if column.unit else column.title
+        side: Literal["left", "right"] = "right" if column.number else "left"
+        table.add_column(Text(title), justify=side, no_wrap=not wrap)
+    for row in view.rows:
+        cells = [row[i] for i in shown]
+        if view.in_terminal == "stacked":
+            cells = [stacked(cell) for cell in cells]
+        elif view.in_terminal == "without intervals":
+            cells = [_INTERVAL.sub("", cell) for cell in cells]
+        table.add_row(*(Text(cell, style=STYLES.get(cell, "")) for cell in cells))
+    return table
+
+
+def print_facts(
+    rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim", indent: str = ""
+) -> None:
+    """Print terms with their texts."""
+    facts = Table.grid(padding=(0, 2))
+    facts.add_column(style=style, no_wrap=True)
+    facts.add_column(overflow="fold")
+    for term, text in rows:
+        facts.add_row(f"{indent}{term}", Text(text))
+    console.print()
+    console.print(facts)
+
+
+def count_outcomes(outcomes: Sequence[Outcome]) -> str:
+    """Return how many flights ended how, in one line."""
+    return ", ".join(
+        f"{outcomes.count(outcome):,} {label}"
+        for outcome, label in OUTCOME_LABELS.items()
+        if outcome in outcomes
+    )
