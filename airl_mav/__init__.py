@@ -15,19 +15,39 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 _EXPORTS = {
-    "Scenario": "airl_mav.scenario.model",
+    "ExperimentResult": "airl_mav.experiments.experiment",
     "Run": "airl_mav.experiments.run",
+    "Scenario": "airl_mav.scenario.model",
+    "degrade": "airl_mav.experiments.degrade",
+    "evaluate": "airl_mav.experiments.evaluate",
+    "gap": "airl_mav.experiments.gap",
+    "ladder": "airl_mav.experiments.ladder",
     "load_run": "airl_mav.experiments.run",
     "rehearse": "airl_mav.experiments.fly",
 }
 """Public names, and the modules that define them."""
 
 if TYPE_CHECKING:
+    from airl_mav.experiments.degrade import degrade
+    from airl_mav.experiments.evaluate import evaluate
+    from airl_mav.experiments.experiment import ExperimentResult
     from airl_mav.experiments.fly import rehearse
+    from airl_mav.experiments.gap import gap
+    from airl_mav.experiments.ladder import ladder
     from airl_mav.experiments.run import Run, load_run
     from airl_mav.scenario.model import Scenario
 
-__all__ = ["Run", "Scenario", "load_run", "rehearse"]
+__all__ = [
+    "ExperimentResult",
+    "Run",
+    "Scenario",
+    "degrade",
+    "evaluate",
+    "gap",
+    "ladder",
+    "load_run",
+    "rehearse",
+]
 
 
 def __getattr__(name: str) -> Any:

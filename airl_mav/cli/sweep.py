@@ -20,7 +20,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, write_document
-from airl_mav.report.sweep import document_of, print_plan
+from airl_mav.sweep.document import document_of, print_plan
 from airl_mav.scenario.model import Workers
 from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.run import run_sweep
