@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -79,7 +80,9 @@ def read_options(
         file, words = Path(words[0]), words[1:]
         held = read_scenario_file(file)
         validated(model, held, file)
-    parsed = tyro.cli(_arguments(model, held), prog=prog, description=model.__doc__, args=words)
+    parsed = tyro.cli(
+        _arguments(model, held), prog=prog, description=inspect.getdoc(model), args=words
+    )
     try:
         return validated(model, dataclasses.asdict(parsed))
     except FieldError as error:
@@ -107,9 +110,7 @@ def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> s
 
 
 def option_of(field: str) -> str:
-    """Return the option of a field: hold_s -> --hold-s, watchdog.leave_after_s ->
-    --leave-after-s.
-    """
+    """Return the option of a field: --hold-s of hold_s, --leave-after-s of watchdog's."""
     table, _, name = field.rpartition(".")
     full = f"{table}.{name}" if table in PREFIXED else name
     return "--" + full.replace("_", "-")
@@ -136,9 +137,7 @@ def _positionals(model: type[BaseModel]) -> list[str]:
 
 
 def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
-    """Return the dataclass that tyro reads into: the model's types and defaults without its
-    ranges.
-    """
+    """Return the dataclass that tyro reads into: types and defaults of the model, no ranges."""
     fields: list[tuple[str, Any, Any]] = []
     # Positional words first: what has no default must come before what has one.
     names = sorted(
@@ -159,15 +158,10 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
                 tyro.conf.Positional,
                 tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
             ]
-        fields.append(
-            (
-                name,
-                Annotated[(kind, *marks)],
-                dataclasses.field(default=_default(field, held.get(name))),
-            )
-        )
+        default = dataclasses.field(default=_default(field, held.get(name)))
+        fields.append((name, Annotated[(kind, *marks)], default))
     made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)
-    made.__doc__ = model.__doc__
+    made.__doc__ = inspect.getdoc(model)
     return made
 
 

@@ -20,9 +20,9 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, write_document
-from airl_mav.sweep.document import document_of, print_plan
 from airl_mav.scenario.model import Workers
 from airl_mav.sweep.config import SweepConfig, load_sweep
+from airl_mav.sweep.document import document_of, print_plan
 from airl_mav.sweep.run import run_sweep
 from airl_mav.sweep.summary import Computer, estimated_ms
 
@@ -68,8 +68,8 @@ class SweepOptions(Workers):
     )
     computer: str | None = Field(
         default=None,
-        description="computer profile: each cell then shows its decision latency t2 there, estimated"
-        " from multiply-accumulates; may change when a sweep goes on",
+        description="computer profile: each cell then shows its decision latency t2 there,"
+        " estimated from multiply-accumulates; may change when a sweep goes on",
     )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu", description="what trains: cpu, one core a trial, or cuda"

@@ -1,6 +1,4 @@
-"""A scenario, flown into its run folder at whatever level; what was flown before is gone on
-with.
-"""
+"""A scenario, flown into its run folder at any level; a run that was interrupted goes on."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""The hardware gap: a policy on a workstation and on an onboard computer, with and without
-mitigation.
-"""
+"""The hardware gap: a policy on a workstation and on an onboard computer, also mitigated."""
 
 from __future__ import annotations
 

@@ -66,8 +66,7 @@ def declare_ladder(
         raise FieldError("sitl_episodes", sitl_episodes, f"1 <= value <= {scenario.episodes}")
     fewer = min(sitl_episodes or SITL_EPISODES, scenario.episodes)
     cells = tuple(
-        make_cell(level, level, scenario.model_copy(update=_at(level, scenario, fewer)))
-        for level in levels
+        make_cell(level, level, scenario.model_copy(update=_at(level, fewer))) for level in levels
     )
     policy, arena = cells[0].scenario.policy, cells[0].scenario.arena_name
     facts = {"policy": policy.name, **{field: getattr(scenario, field) for field in FACTS}}
@@ -82,7 +81,7 @@ def declare_ladder(
     )
 
 
-def _at(level: LevelName, scenario: Scenario, sitl_episodes: int) -> dict[str, object]:
+def _at(level: LevelName, sitl_episodes: int) -> dict[str, object]:
     """Return what differs at a level: fields that only others have are left at their default."""
     if level == "sitl":
         return {"level": level, "episodes": sitl_episodes, "workers": None, "tlogs": False}

@@ -43,9 +43,10 @@ class Run:
 
     @cached_property
     def latency(self) -> dict[str, Samples]:
-        """Durations (n,) [µs] of each stage over all decisions: `t1`, `t2`, `t3`, `link`,
-        `control`,
-        `end_to_end`, `period`, ...; see `latency.stages.STAGES`.
+        """Durations (n,) [µs] of each stage over all decisions, by its key.
+
+        `t1`, `t2`, `t3`, `link`, `control`, `end_to_end`, `period` and more; see
+        `latency.stages.STAGES`.
         """
         return pool(stage_samples(stamps) for stamps in self.stamps.values())
 
@@ -61,8 +62,9 @@ class Run:
 
     @property
     def sha256(self) -> str | None:
-        """Fingerprint of all flights: equal when they are equal bit by bit; None where flights are
-        never the same (level sitl).
+        """Fingerprint of all flights: the same when they are the same, bit by bit.
+
+        None where flights are never the same: level sitl.
         """
         return run_sha256(self.episodes)
 
