@@ -11,7 +11,7 @@ import importlib
 import inspect
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -195,11 +195,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
     try:
-        command = importlib.import_module(module)
-        check_installed(*getattr(command, "EXTRAS", ("sim",)))
-        renamed = getattr(command, "RENAMED_OPTIONS", RENAMED)
-        options = read_options(command.OPTIONS, prog, words, renamed=renamed)
-        code = _run(command.run, options, words)
+        code = carry_out(prog, module, words)
     except UsageError as error:
         _fail(str(error))
         code = EXIT_USAGE
@@ -213,9 +209,25 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     sys.exit(code)
 
 
-def _run(run: Callable[[Any], int], options: BaseModel, words: Sequence[str]) -> int:
+def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
+    """Read a command line and run its command; return the exit status.
+
+    Args:
+        prog: Name of the command.
+        module: See `run_command`.
+        words: The command line without the command's name.
+        more: Given to the module's `run`, as `console`.
+
+    Raises:
+        UsageError: The input cannot be used; a message about a field names its option.
+        SystemExit: tyro has printed the help, or what is wrong with the words.
+    """
+    command = importlib.import_module(module)
+    check_installed(*getattr(command, "EXTRAS", ("sim",)))
+    renamed = getattr(command, "RENAMED_OPTIONS", RENAMED)
+    options = read_options(command.OPTIONS, prog, words, renamed=renamed)
     try:
-        return run(options)
+        return int(command.run(options, **more))
     except FieldError as error:
         raise UsageError(told(error, words)) from None
 

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments.campaign import FlyEpisodes
 from airl_mav.experiments.executors import Stop
+from airl_mav.experiments.fliers import FlyEpisodes
 from airl_mav.experiments.process_executor import ProcessExecutor
-from airl_mav.rehearsal.evaluation import PlannedEpisode
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.scenario.resolved import PlannedEpisode
 
 PATIENCE_S = 60.0
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import math
 import os
 import subprocess
@@ -12,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tyro
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from rich.console import Console
 from scipy import ndimage, stats
 
 from airl_mav.arena import generate as generate_module
@@ -27,7 +24,6 @@ from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
 from airl_mav.arena.zones import zone_of, zone_radius_m
-from airl_mav.cli.arena import ArenaCommand, run
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -40,6 +36,7 @@ seeds = st.integers(0, 2**32 - 1)
 relaxed = settings(
     deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
+from tests.support.command_line import airl
 
 
 def shipped(name: str) -> ArenaSpec:
@@ -554,10 +551,9 @@ def test_picture_shows_what_is_there() -> None:
 
 
 def run_cli(*args: str) -> str:
-    out = io.StringIO()
-    command = tyro.cli(ArenaCommand, args=args)
-    assert run(command, Console(file=out, width=120)) == 0
-    return out.getvalue()
+    code, text = airl("arena", *args, width=120)
+    assert code == 0
+    return text
 
 
 def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
@@ -586,8 +582,11 @@ def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
             "--png a.jpg: accepted: a file name that ends in .png",
         ),
         (["no-obstacles", "--png", "/nowhere/a.png"], "--png /nowhere/a.png: cannot write"),
-        (["no-obstacles", "--vehicle-width", "0"], "--vehicle-width 0: accepted: value > 0 m"),
-        (["no-obstacles", "--time=-1"], "--time -1: accepted: value >= 0 s"),
+        (
+            ["no-obstacles", "--vehicle-width", "0"],
+            "--vehicle-width-m 0: accepted: 0 < value <= 100 m",
+        ),
+        (["no-obstacles", "--time=-1"], "--time-s -1: accepted: 0 <= value <= 1e+06 s"),
     ],
 )
 def test_cli_refuses_in_one_line(args: list[str], message: str) -> None:
