@@ -16,7 +16,7 @@ from airl_mav.core.files import save_arrays
 from airl_mav.latency.samplers import latency_generator
 from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.scenario.model import DEFAULT_POLICY, GREATEST_SEED, Decisions, Lateness
-from airl_mav.scenario.piloting import check_quota, decide_piloting, select_latency
+from airl_mav.scenario.piloting import check_quota, check_trust, decide_piloting, select_latency
 from airl_mav.scenario.resolved import action_generator
 from companion.conducted import Abandoned
 from companion.interfaces import LinkError
@@ -128,6 +128,7 @@ def _mission(options: CompanionOptions) -> Mission:
     if options.log is not None and not options.log.parent.is_dir():
         raise FieldError("log", options.log, problem=f"no folder {options.log.parent}")
     policy = find_policy(options.policy)
+    check_trust(options, policy)
     pilot, watchdog = decide_piloting(options, policy, goal_radius_m=2.0)
     # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
     injection = select_latency(options, policy, on_this_computer=not options.lockstep)

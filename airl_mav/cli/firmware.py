@@ -28,7 +28,7 @@ from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED, Aircraft, Scen
 from airl_mav.scenario.resolve import check_firmware, check_ports
 from airl_mav.scenario.resolved import FIRMWARE_TITLES, TRANSPORT_US
 from firmware_sim.autopilot.state import Message
-from firmware_sim.external.compose import how_to_start
+from firmware_sim.external.programs import how_to_start
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.pacing import Unpaced, WallPacing
 from firmware_sim.simulation import EpisodeSetup

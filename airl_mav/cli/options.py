@@ -90,8 +90,7 @@ def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> s
 
 
 def option_of(field: str) -> str:
-    """Return the option of a field: hold_s -> --hold-s, watchdog.leave_after_s ->
-    --leave-after-s."""
+    """Return the option of a field: watchdog.leave_after_s -> --leave-after-s."""
     table, _, name = field.rpartition(".")
     full = f"{table}.{name}" if table in PREFIXED else name
     return "--" + full.replace("_", "-")
@@ -118,8 +117,7 @@ def _positionals(model: type[BaseModel]) -> list[str]:
 
 
 def _arguments(model: type[BaseModel], defaults: BaseModel) -> type[Any]:
-    """Return the dataclass that tyro reads into: the model's types and defaults without its
-    ranges."""
+    """Return the dataclass that tyro reads: the model's types and defaults, not its ranges."""
     fields: list[tuple[str, Any, Any]] = []
     # Positional words first: what has no default must come before what has one.
     names = sorted(

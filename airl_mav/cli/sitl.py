@@ -11,13 +11,11 @@ from rich.console import Console
 from airl_mav.cli.options import RENAMED, run_command
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.fly import EXIT_CODES, fly_live
-from airl_mav.report.rebuild import rebuild
-from airl_mav.report.terminal import print_report
+from airl_mav.experiments.fly import EXIT_CODES, FlownRun, fly_live
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.external.compose import how_to_start
+from firmware_sim.external.programs import how_to_start
 
 
 class SitlOptions(Scenario):
@@ -59,12 +57,21 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         flown = fly_live(
             scenario, options.out, progress, announce=partial(_announce, scenario, console)
         )
-    if flown.episodes:
-        loaded, page = rebuild(flown.path)
-        print_report(loaded, console, page)
-    else:
-        _say(console, f"no episode was finished; logs in {flown.path}")
+    conclude(flown, console)
     return EXIT_CODES[flown.ended]
+
+
+def conclude(flown: FlownRun, console: Console) -> None:
+    """Print the tables and write the report of what was flown."""
+    if not flown.episodes:
+        _say(console, f"no episode was finished; logs in {flown.path}")
+        return
+    # Imported here: the figures take seconds to load, which no flight has to wait for.
+    from airl_mav.report.rebuild import rebuild
+    from airl_mav.report.terminal import print_report
+
+    loaded, page = rebuild(flown.path)
+    print_report(loaded, console, page)
 
 
 def _announce(scenario: ResolvedScenario, console: Console) -> None:

@@ -1,5 +1,4 @@
-"""A scenario, flown into its run folder at whatever level; what was flown before is gone on
-with."""
+"""A scenario, flown into its run folder one flight after the other; earlier flights are kept."""
 
 from __future__ import annotations
 
@@ -15,7 +14,6 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, UsageError
 from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.errors import LockstepError
-from airl_mav.lockstep.rehearsal import rehearse as rehearse_in_lockstep
 from airl_mav.rehearsal.evaluation import open_run
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import LiveObserver
@@ -23,7 +21,7 @@ from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, RunFolder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.external.compose import check_program
+from firmware_sim.external.programs import check_program
 
 Ended = Literal["complete", "interrupted", "broken off"]
 
@@ -94,7 +92,10 @@ def fly_live(
         problem = ""
         try:
             if asked.level == "lockstep":
-                rehearse_in_lockstep(scenario, folder, observer, indices)
+                # Imported here: level sitl starts its processes sooner without the simulator.
+                from airl_mav.lockstep.rehearsal import rehearse
+
+                rehearse(scenario, folder, observer, indices)
             else:
                 with Rehearsal(scenario, folder, observer, keeps=(keeps,)) as rehearsal:
                     rehearsal.run(done=indices)

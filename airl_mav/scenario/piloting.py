@@ -13,8 +13,10 @@ from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.source import select_injection
+from airl_mav.policy.card import TORCH_FILE
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.model import (
     Decisions,
     Lateness,
@@ -73,6 +75,18 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
             f"without {why}: only where the companion's own time counts",
         )
     check_permitted(asked.cpu_quota)
+
+
+def check_trust(asked: Decisions, policy: PolicyInfo) -> None:
+    """Raise FieldError for a torch program of unknown origin that nobody said to trust."""
+    if asked.runtime != "torch" or asked.trust or policy.folder is None:
+        return
+    if not policy.folder.resolve().is_relative_to((profiles_dir() / "policies").resolve()):
+        raise FieldError(
+            "runtime",
+            asked.runtime,
+            f"with trust; loading {policy.folder / TORCH_FILE} can execute code of its author",
+        )
 
 
 def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:

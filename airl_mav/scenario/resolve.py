@@ -15,7 +15,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Ports, Scenario
-from airl_mav.scenario.piloting import check_quota, decide_piloting
+from airl_mav.scenario.piloting import check_quota, check_trust, decide_piloting
 from airl_mav.scenario.resolved import NATIVE_T2_US, ResolvedScenario
 
 SITL_SPEEDS = 0.5, 10.0
@@ -43,6 +43,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.ports, any_camera=False)
     policy = find_policy(scenario.policy)
+    check_trust(scenario, policy)
     pilot, watchdog = decide_piloting(scenario, policy)
     vehicle = load_vehicle(scenario.vehicle)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):

@@ -149,7 +149,7 @@ class ResolvedScenario:
     def _load_policy(self) -> Policy:
         scenario = self.scenario
         return load_policy(
-            scenario.policy,
+            self.policy,
             self.pilot.hold_s,
             runtime=scenario.runtime,
             threads=scenario.threads,
