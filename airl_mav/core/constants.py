@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Literal
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard gravity [m/s²] (CGPM 1901; PX4's CONSTANTS_ONE_G)."""
@@ -45,3 +45,6 @@ TICK_HZ: Final = US_PER_S // TICK_US
 
 DEG: Final = math.pi / 180.0
 """One degree [rad]."""
+
+Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
+"""What flew, as a report calls it: a rung of the fidelity ladder."""

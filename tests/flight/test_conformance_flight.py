@@ -116,7 +116,7 @@ def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
     out = tmp_path / "result.json"
-    options = ["--steps-only", "--steps", "north-2", "--altitude", "3", "--out", str(out)]
+    options = ["--steps-only", "--steps", "north-2", "--altitude-m", "3", "--out", str(out)]
     with (
         firmware(tmp_path, QUIET + "MPC_XY_VEL_P_ACC = 1.2\n") as ports,
         conformance(tmp_path, *connect(ports), *options) as command,
@@ -136,7 +136,7 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_ctrl_c_lands(tmp_path: Path) -> None:
     out = tmp_path / "result.json"
-    options = ["--steps-only", "--altitude", "3", "--out", str(out)]
+    options = ["--steps-only", "--altitude-m", "3", "--out", str(out)]
     with (
         firmware(tmp_path, QUIET) as ports,
         conformance(tmp_path, *connect(ports), *options) as command,
