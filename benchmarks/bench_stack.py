@@ -21,17 +21,17 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from airl_mav.cli.lockstep import lockstep_plan, policies
-from airl_mav.cli.sitl_command import SitlCommand, check
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.flight import LockstepPlan, fly
+from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.link import lockstep_link
 from airl_mav.lockstep.threaded import ThreadPartner
-from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from firmware_sim.autopilot.estimator import Estimator
@@ -112,12 +112,12 @@ def main() -> None:
     console = Console()
     console.print(f"core {pinned()}", highlight=False)
     vehicle = load_vehicle("quad")
-    plan, policy = lockstep("static-obstacles")
+    resolved = lockstep("static-obstacles")
     flights: dict[str, Callable[[], Timed]] = {
         "(a) plant + flight controller": lambda: hover(vehicle, ()),
         "(b) + MAVLink, onboard link": lambda: hover(vehicle, (lockstep_link,)),
         "(b') + MAVLink, both links": lambda: hover(vehicle, (lockstep_link, gcs_link)),
-        "(c) + MAVSDK, camera, policy": lambda: whole(plan, policy),
+        "(c) + MAVSDK, camera, policy": lambda: whole(resolved),
     }
     table = Table("stack", "x real time (best of 3)", "tick [µs]", "simulated s per CPU second")
     for name, flight in flights.items():
@@ -129,7 +129,7 @@ def main() -> None:
         table.add_row(name, f"{best:.1f}", tick_us, f"{per_cpu_s:.1f}")
     console.print(table)
     shares("(b)", lambda begins: hover(vehicle, (lockstep_link,), begins), console)
-    shares("(c)", lambda _: whole(plan, policy), console)
+    shares("(c)", lambda _: whole(resolved), console)
 
 
 def pinned() -> int:
@@ -181,18 +181,16 @@ def hover(
     return timed
 
 
-def lockstep(policy: str) -> tuple[LockstepPlan, Callable[[int], Policy]]:
-    command = SitlCommand(policy=policy, lockstep=True)
-    setup, pilot = check(command)
-    return lockstep_plan(command, setup, pilot), policies(command, pilot.hold_s)
+def lockstep(policy: str) -> ResolvedScenario:
+    return resolve(Scenario(policy=policy, level="lockstep"))
 
 
-def whole(plan: LockstepPlan, policy: Callable[[int], Policy]) -> Timed:
+def whole(resolved: ResolvedScenario) -> Timed:
     """Fly some episodes from boot to disarming, all that belongs to them included."""
     simulated_us = 0
     timer = Timer()
     for seed in SEEDS:
-        flown = fly(plan, policy(seed), 0, seed)
+        flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
         path = flown.trajectory.time_us
         simulated_us += int(path[-1] - path[0]) + TICK_US
     return timer.timed(simulated_us / US_PER_S)

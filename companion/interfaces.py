@@ -7,6 +7,12 @@ from typing import Protocol
 
 from airl_mav.policy.observation import Kinematics
 
+LINK_LOST = "link lost"
+"""Why a mission ended: the flight controller was no longer heard."""
+
+CAMERA_SILENT = "camera silent"
+"""Why a mission ended: the watchdog saw that no frame came."""
+
 
 class LinkError(Exception):
     """The flight controller refused, or is gone."""

@@ -18,7 +18,7 @@ from airl_mav.policy.actions import CameraBound, Policy
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
-from companion.interfaces import STOP, LinkError
+from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
 from companion.watchdog import Watchdog
@@ -28,11 +28,6 @@ PREPARE_TIMEOUT_S = 10.0
 
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
-LINK_LOST = "link lost"
-"""Why a mission ended: the flight controller was no longer heard."""
-
-CAMERA_SILENT = "camera silent"
-"""Why a mission ended: the watchdog saw that no frame came."""
 
 FRAME_TIMEOUT_S = 5.0
 """How long a camera may take to show a first frame [wall s]."""

@@ -9,9 +9,18 @@ from dataclasses import dataclass
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
-from airl_mav.latency.samplers import LatencySampler
+from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
+from airl_mav.policy.registry import find_policy, load_policy
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
+from airl_mav.scenario.piloting import (
+    action_generator,
+    check_quota,
+    check_trust,
+    decide_piloting,
+    select_latency,
+)
+from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.camera import open_camera
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
@@ -31,14 +40,34 @@ class Mission:
     """Where t2 is drawn from; None injects nothing."""
 
 
+def prepare(asked: StandAloneCompanion) -> Mission:
+    """Check all that can be wrong before a connection is opened, and load the policy.
+
+    Raises:
+        UsageError: The input cannot be used.
+    """
+    check_companion(asked)
+    policy = find_policy(asked.policy)
+    check_trust(asked, policy)
+    pilot, watchdog = decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
+    injection = select_latency(asked, policy, on_this_computer=not asked.lockstep)
+    check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
+    loaded = load_policy(
+        policy,
+        pilot.hold_s,
+        runtime=asked.runtime,
+        threads=asked.threads,
+        rng=action_generator(asked.seed),
+        ablate=asked.ablate,
+    )
+    sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
+    return Mission(asked.goal, loaded, pilot, watchdog, sampler)
+
+
 def fly_alone(
+    asked: StandAloneCompanion,
     mission: Mission,
-    *,
-    connect: str,
-    camera: str,
-    connect_timeout_s: float,
-    speed: float,
-    cpu_quota: float | None,
     stop: threading.Event,
     abandon: threading.Event,
     progress: Callable[[str, int], None],
@@ -46,12 +75,8 @@ def fly_alone(
     """Fly one mission against whatever answers.
 
     Args:
+        asked: How the flight controller and the camera are reached.
         mission: What is flown.
-        connect: MAVSDK connection to the flight controller.
-        camera: ZeroMQ address of the depth camera.
-        connect_timeout_s: Longest wait for the flight controller [wall s].
-        speed: Simulated seconds per wall second; 1 on a real aircraft.
-        cpu_quota: Share of one core that this program is held to [%]; None: no limit.
         stop: Set to land and end.
         abandon: Set to end without landing.
         progress: Called with each phase as it begins, and its time [µs].
@@ -60,13 +85,13 @@ def fly_alone(
         UsageError: An address is unusable, or the policy cannot use the camera.
         LinkError: No flight controller is heard, or it was lost.
     """
-    clock = WallClock(speed)
+    clock = WallClock(asked.speed)
     with (
-        held_to(cpu_quota),
-        closing(open_camera(camera, clock)) as frames,
-        closing(MavsdkLink(connect, clock, abandon)) as link,
+        held_to(asked.cpu_quota),
+        closing(open_camera(asked.camera, clock)) as frames,
+        closing(MavsdkLink(asked.connect, clock, abandon)) as link,
     ):
-        link.connect(connect_timeout_s, stop)
+        link.connect(asked.connect_timeout, stop)
         check_camera(mission.policy, frames, stop)
         return fly_mission(
             link,

@@ -116,21 +116,21 @@ def busy(processes: int) -> Iterator[None]:
 
 def fly(command: Reruns, flights: int) -> None:
     """Fly, and print when each flight begins and what its fingerprint is."""
-    from airl_mav.cli.lockstep import lockstep_plan, policies
-    from airl_mav.cli.sitl_command import SitlCommand, check
     from airl_mav.lockstep.flight import Watching
     from airl_mav.lockstep.flight import fly as fly_episode
+    from airl_mav.scenario.model import Scenario
+    from airl_mav.scenario.resolve import resolve
 
-    flown = SitlCommand(
-        policy=command.policy, arena=command.arena, seed=command.seed, lockstep=True
+    scenario = Scenario(
+        level="lockstep", policy=command.policy, arena=command.arena, seed=command.seed
     )
-    setup, pilot = check(flown)
-    plan, fresh = lockstep_plan(flown, setup, pilot), policies(flown, pilot.hold_s)
+    resolved = resolve(scenario)
     watching = Watching(begin=lambda _: say(BEGINS))
     # What is compiled or loaded late is so before the first that counts.
-    fly_episode(plan, fresh(command.seed + 1), 0, command.seed + 1)
+    fly_episode(resolved, resolved.fresh_policy(command.seed + 1), 0, command.seed + 1)
     for _ in range(flights):
-        record = fly_episode(plan, fresh(command.seed), 0, command.seed, watching=watching).record
+        policy = resolved.fresh_policy(command.seed)
+        record = fly_episode(resolved, policy, 0, command.seed, watching=watching).record
         assert record.sha256 is not None
         say(record.sha256["flight"])
 

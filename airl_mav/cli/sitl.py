@@ -11,12 +11,11 @@ from rich.console import Console
 from airl_mav.cli.options import RENAMED, run_command, scenario_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.fly import EXIT_CODES, fly_live
-from airl_mav.report.run_report import show_report
+from airl_mav.experiments.fly import EXIT_CODES, FlownRun, fly_live
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.external.compose import how_to_start
+from firmware_sim.external.programs import how_to_start
 
 
 class SitlOptions(Scenario):
@@ -58,11 +57,19 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         flown = fly_live(
             scenario, options.out, progress, announce=partial(_announce, scenario, console)
         )
-    if flown.episodes:
-        show_report(flown.path, console)
-    else:
-        _say(console, f"no episode was finished; logs in {flown.path}")
+    conclude(flown, console)
     return EXIT_CODES[flown.ended]
+
+
+def conclude(flown: FlownRun, console: Console) -> None:
+    """Print the tables and write the report of what was flown."""
+    if not flown.episodes:
+        _say(console, f"no episode was finished; logs in {flown.path}")
+        return
+    # Imported here: the figures take seconds to load, which no flight has to wait for.
+    from airl_mav.report.run_report import show_report
+
+    show_report(flown.path, console)
 
 
 def _announce(scenario: ResolvedScenario, console: Console) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Literal
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard gravity [m/s²] (CGPM 1901; PX4's CONSTANTS_ONE_G)."""
@@ -48,3 +48,5 @@ DEG: Final = math.pi / 180.0
 
 MAX_ATTEMPTS: Final = 3
 """A job or a flight whose processes are lost is begun so many times, the first included."""
+Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
+"""What flew, as a report calls it: a rung of the fidelity ladder."""

@@ -19,7 +19,6 @@ from airl_mav.experiments.executors import Executor, ExecutorSettings, open_exec
 from airl_mav.experiments.run import Run
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.errors import LockstepError
-from airl_mav.lockstep.rehearsal import rehearse as rehearse_in_lockstep
 from airl_mav.rehearsal.evaluation import open_folder
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import LiveObserver
@@ -29,7 +28,7 @@ from airl_mav.rehearsal.signals import stop_on_signals, terminated_as_interrupte
 from airl_mav.scenario.model import Flights, Scenario, Workers
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.external.compose import check_program
+from firmware_sim.external.programs import check_program
 
 Ended = Literal["complete", "interrupted", "broken off"]
 
@@ -97,7 +96,10 @@ def fly_live(
         problem = ""
         try:
             if asked.level == "lockstep":
-                rehearse_in_lockstep(scenario, folder, observer, indices)
+                # Imported here: level sitl starts its processes sooner without the simulator.
+                from airl_mav.lockstep.rehearsal import rehearse
+
+                rehearse(scenario, folder, observer, indices)
             else:
                 with Rehearsal(scenario, folder, observer, keeps=(keeps,)) as rehearsal:
                     rehearsal.run(done=indices)

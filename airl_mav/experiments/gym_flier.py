@@ -28,7 +28,8 @@ from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario, action_generator
+from airl_mav.scenario.piloting import action_generator
+from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 BLOCK_SLOTS = 4
 """Episodes a job and slot: in a shorter job most slots would wait for the longest flights."""

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
+from airl_mav.core.constants import Level
 from airl_mav.latency.injection import Injection
-
-Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
-
 
 BUILT_IN = "built-in"
 """The firmware of all levels but one."""

@@ -19,7 +19,8 @@ from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.episode import join_stamps, judged_record
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.rehearsal.supervisor import Order, Supervisor
-from airl_mav.scenario.resolved import TRANSPORT_US, ResolvedScenario
+from airl_mav.scenario.piloting import TRANSPORT_US
+from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import MissionResult, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.simulation import EpisodeSetup, Simulation

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.conductor import Conductor
@@ -21,13 +22,17 @@ from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.stand_alone import Listener, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.model import Ports
+from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.warm_up import warm_up
 
 
 @dataclass(frozen=True)
@@ -187,6 +192,50 @@ class Sockets:
         """Release the ports."""
         self.endpoint.close()
         self.camera.close()
+
+
+def fly_vehicle_in_lockstep(
+    asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
+) -> None:
+    """Fly with one companion that passes turns, until it has ended.
+
+    Args:
+        asked: What flies, and where.
+        stop: Set from outside to end it.
+        listener: Who is told what happens.
+
+    Raises:
+        UsageError: The input cannot be used.
+        LockstepError: The companion is gone, or does not keep to the turns.
+    """
+    listener = listener or Listener()
+    check_vehicle(asked)
+    vehicle = load_vehicle(asked.vehicle)
+    plan = plan_of(asked)
+    with closing(
+        Sockets.open(asked.ports, asked.bind, asked.companion_host, insecure=asked.insecure)
+    ) as sockets:
+        episode, goal = episode_of(asked, vehicle)
+        warm_up(vehicle)
+        with closing(sockets.stage(plan, stop.is_set)) as stage:
+            stage.firmware.on_message = listener.text
+            started_us = stage.load(episode, asked.tlog).time_us
+            listener.ready(sockets.camera.endpoint, goal)
+            end_us = None
+            if asked.duration is not None:
+                end_us = started_us + int(asked.duration * US_PER_S)
+            fly_stage(stage, stop, end_us, listener.say)
+
+
+def plan_of(asked: StandAloneVehicle) -> RemotePlan:
+    """Return how a flight goes that was asked for."""
+    return RemotePlan(
+        transport_us=round(asked.transport_ms * US_PER_MS),
+        tokens=TokenSettings(asked.turn_us, asked.companion_timeout),
+        speed=asked.pace,
+        goal_radius_m=asked.goal_radius_m,
+        time_limit_s=asked.time_limit_s,
+    )
 
 
 def fly_stage(

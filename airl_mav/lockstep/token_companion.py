@@ -8,7 +8,7 @@ from contextlib import closing
 
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
-from airl_mav.scenario.resolved import NATIVE_T2_US
+from airl_mav.scenario.piloting import NATIVE_T2_US
 from companion.camera import open_camera
 from companion.conducted import ConductedClock
 from companion.mavsdk_link import MavsdkLink

@@ -20,6 +20,7 @@ from airl_mav.lockstep.frames import datagrams, newest_heartbeat
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.turns import Turn
 from airl_mav.rehearsal.supervisor import Order
+from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
 from companion.tokens import Phase, TurnBack, TurnGiven
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
@@ -27,10 +28,6 @@ from firmware_sim.mavlink.endpoint import UdpEndpoint
 
 LONGEST_DATAGRAM = 1400
 """Frames of telemetry share a datagram up to this size [bytes]; MAVSDK reads 2048 at a time."""
-
-LONGEST_REST_US = US_PER_S
-"""The companion has a turn at least this often, wanted or not, so that what is sent to it fits into
-its socket's buffer even when it does not read [µs]."""
 
 KNOCK_S = 0.1
 """Before the companion is there, a heartbeat goes out so often [wall s]."""
@@ -48,9 +45,9 @@ _TURN_BACK = re.compile(r"D\d+\b")
 class TokenSettings:
     """How patient the vehicle is with its companion."""
 
-    turn_us: int = 20_000
+    turn_us: int = TURN_US
     """A companion that does not say when it wants the next turn has it so long after [µs]."""
-    patience_s: float = 60.0
+    patience_s: float = COMPANION_TIMEOUT_S
     """Longest turn of the companion [s of wall time, while this process runs]."""
 
 

@@ -13,10 +13,10 @@ from typing import Annotated, Any
 from pydantic import Field, Strict, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, write_json
-from airl_mav.flight.setup import Level
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
 from airl_mav.policy.runtime import OnnxRuntime

@@ -21,7 +21,7 @@ from airl_mav.rehearsal.channel import Ended, Loaded, State
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, RunFolder
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
-from companion.mission import CAMERA_SILENT, LINK_LOST
+from companion.interfaces import CAMERA_SILENT, LINK_LOST
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT)
 """Why a mission ends when both processes live but no longer hear each other: one of them stood

@@ -32,7 +32,7 @@ from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, Proc
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
-from firmware_sim.external.compose import load_timeout_s
+from firmware_sim.external.programs import load_timeout_s
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""

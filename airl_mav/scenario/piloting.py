@@ -8,13 +8,17 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.cpu_quota import check_permitted
 from airl_mav.core.errors import FieldError
-from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.source import select_injection
+from airl_mav.policy.card import TORCH_FILE
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.model import (
     Decisions,
     Lateness,
@@ -23,9 +27,18 @@ from airl_mav.scenario.model import (
     WatchdogSettings,
 )
 
+ACTION_STREAM = 1
+"""Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
+
+NATIVE_T2_US = round(1.0 * US_PER_MS)
+"""t2 where nothing is injected and no machine's own time counts: as on a desktop computer [µs]."""
+
+TRANSPORT_US = round(5.0 * US_PER_MS)
+"""Exposure to decoding where no machine's own time counts: t1 without the wait for a frame [µs]."""
+
 
 def decide_piloting(
-    asked: Decisions, policy: PolicyInfo, goal_radius_m: float = GOAL_RADIUS_M
+    asked: Decisions, policy: PolicyInfo, goal_radius_m: float
 ) -> tuple[PilotSettings, WatchdogSettings]:
     """Return how a policy is flown: as asked, else as its card says, else by default.
 
@@ -75,6 +88,18 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
     check_permitted(asked.cpu_quota)
 
 
+def check_trust(asked: Decisions, policy: PolicyInfo) -> None:
+    """Raise FieldError for a torch program of unknown origin that nobody said to trust."""
+    if asked.runtime != "torch" or asked.trust or policy.folder is None:
+        return
+    if not policy.folder.resolve().is_relative_to((profiles_dir() / "policies").resolve()):
+        raise FieldError(
+            "runtime",
+            asked.runtime,
+            f"with trust; loading {policy.folder / TORCH_FILE} can execute code of its author",
+        )
+
+
 def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
     """Return the latency that a companion by itself flies with.
 
@@ -94,3 +119,8 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
         policy_sha256=None if on_this_computer else policy.sha256,
         macs=policy.macs,
     )
+
+
+def action_generator(seed: int) -> np.random.Generator:
+    """Return the source of a policy's random actions in the flight of a seed."""
+    return np.random.default_rng((seed, ACTION_STREAM))

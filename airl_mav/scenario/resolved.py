@@ -9,13 +9,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
-from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.constants import Level
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import BUILT_IN, Level, Part, Setup
+from airl_mav.flight.setup import BUILT_IN, Part, Setup
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
@@ -25,22 +24,11 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import FirmwareName, PilotSettings, Scenario, WatchdogSettings
-
-ACTION_STREAM = 1
-"""Second word of the seed of a policy's random actions: not the numbers that draw the latency."""
+from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator
 
 ARRIVAL_SHARE = 0.8
 """The companion flies to this share of the goal radius: it knows its position only by estimate,
-while
-the referee measures the true one."""
-
-NATIVE_T2_US = round(1.0 * US_PER_MS)
-"""t2 where nothing is injected and no machine's own time counts: inference on a desktop
-computer."""
-
-TRANSPORT_US = round(5.0 * US_PER_MS)
-"""t1 without the wait for the frame, where no machine's own time counts: exposure to decoded
-[µs]."""
+while the referee measures the true one."""
 
 FIRMWARE_TITLES: dict[FirmwareName, str] = {
     "builtin": BUILT_IN,
@@ -196,7 +184,7 @@ class ResolvedScenario:
     def _load_policy(self) -> Policy:
         scenario = self.scenario
         return load_policy(
-            scenario.policy,
+            self.policy,
             self.pilot.hold_s,
             runtime=scenario.runtime,
             threads=scenario.threads,
@@ -207,11 +195,6 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
-
-
-def action_generator(seed: int) -> np.random.Generator:
-    """Return the source of a policy's random actions in the flight of a seed."""
-    return np.random.default_rng((seed, ACTION_STREAM))
 
 
 RESOLVED: TypeAdapter[ResolvedScenario] = TypeAdapter(ResolvedScenario)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +11,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.model import Aircraft, FirmwareName, RealFirmware
+from airl_mav.scenario.model import Aircraft, FirmwareName
 from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,
@@ -57,38 +56,6 @@ def real_firmware(wanted: Wanted) -> ExternalFlightStack:
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer")
     return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)
-
-
-def check_program(real: RealFirmware) -> None:
-    """Look for the program that is to be started. Raises UsageError if it is not there."""
-    if real.px4_dir is not None:
-        find_px4(real.px4_dir)
-    if real.ardupilot_dir is not None:
-        find_arducopter(real.ardupilot_dir)
-
-
-def load_timeout_s(aircraft: Aircraft) -> float | None:
-    """Return the longest wait until the vehicle stands ready [wall s]; None: as for any answer.
-
-    To connect, a heartbeat, the parameters read and set, ready to arm: each within the time-out.
-    """
-    if aircraft.firmware == "builtin":
-        return None
-    return 30.0 + 5.0 * aircraft.real.firmware_timeout
-
-
-def how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
-    """Return the command with which the user starts what is waited for; None: nothing is."""
-    real, ports = aircraft.real, aircraft.ports
-    if real.px4_connect and vehicle.px4 is not None:
-        return px4_program.how_to_start(real.instance, vehicle.px4.airframe)
-    if real.ardupilot_connect:
-        observer = ardupilot_program.OBSERVER_PORT + real.instance
-        links = ardupilot_program.Links(ports.api_port, ports.gcs_port, observer)
-        start = ardupilot_program.how_to_start(real.instance, links)
-        file = shlex.join(["--vehicle", aircraft.vehicle, "--out", ardupilot_program.PARAMETERS])
-        return f"airl parameters ardupilot {file} && {start}"
-    return None
 
 
 def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:

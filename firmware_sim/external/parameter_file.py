@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
-from firmware_sim.external.parameter_client import Value
+if TYPE_CHECKING:
+    from firmware_sim.external.parameter_client import Value
 
 _INT32, _REAL32 = 6, 9
 """MAV_PARAM_TYPE, as QGroundControl writes it."""

@@ -22,6 +22,7 @@ from airl_mav.cli.firmware_options import (
     how_to_start,
     load_timeout_s,
 )
+from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.cli.sitl_command import SitlCommand
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
@@ -29,7 +30,6 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.cli.firmware import FirmwareCommand
 from airl_mav.cli.parameters import KINDS
 from airl_mav.cli.parameters import run as write_parameters
-from airl_mav.cli.parameters_command import ParametersCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.model import Ports

@@ -72,7 +72,7 @@ def sitl(
     words = [
         *(SITL if report else SITL_WITHOUT_REPORT),
         *("--arena", str(write_arena(folder, goal_m))),
-        *("--speed", str(speed), "--altitude", "1.5", "--out", str(folder / "run")),
+        *("--speed", str(speed), "--altitude-m", "1.5", "--out", str(folder / "run")),
         *ports.options(),
         *options,
     ]
@@ -383,8 +383,8 @@ class Hog:
         return Action(0.7, 0.0, 0.0)
 
 POLICIES["hog"] = ("holds the interpreter", Hog)
-from airl_mav.cli.companion import main
-main()
+from airl_mav.cli.entry import companion
+companion()
 """
 
 
@@ -419,8 +419,8 @@ class Raiser:
         return Action(0.7, 0.0, 0.0)
 
 POLICIES["raiser"] = ("raises", Raiser)
-from airl_mav.cli.companion import main
-main()
+from airl_mav.cli.entry import companion
+companion()
 """
 
 

@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,45 +19,43 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.errors import LockstepError
-from airl_mav.lockstep.flight import LockstepPlan, fly
+from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.lockstep.stage import Stage
 from airl_mav.lockstep.threaded import ThreadPartner
-from airl_mav.policy.actions import Action, Policy
+from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.registry import load_policy
-from airl_mav.profiles.computer import Latency
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings, WindSettings
+from airl_mav.scenario.piloting import TRANSPORT_US
+from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import BodyVelocity
 from companion.mission import fly_mission
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit
-from tests.support.lockstep_kit import BEGINS, POLICY, SEED, demo_plan
+from tests.support.lockstep_kit import BEGINS, SEED, demo_scenario
 
 LONG_MS = 200.0
 RERUNS, STOPPED = 6, 2
 
 
 @pytest.fixture(scope="module")
-def plan() -> LockstepPlan:
-    return demo_plan()
+def scenario() -> ResolvedScenario:
+    return demo_scenario()
+
+
+def flown(scenario: ResolvedScenario, seed: int = SEED) -> FlownEpisode:
+    return fly(scenario, scenario.fresh_policy(seed), 0, seed)
 
 
 @pytest.fixture(scope="module")
-def policy() -> Policy:
-    return load_policy(POLICY, 0.5)
-
-
-@pytest.fixture(scope="module")
-def reference(plan: LockstepPlan, policy: Policy) -> FlownEpisode:
-    return fly(plan, policy, 0, SEED)
+def reference(scenario: ResolvedScenario) -> FlownEpisode:
+    return flown(scenario)
 
 
 @contextmanager
@@ -87,11 +84,11 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
 
 
 def test_reruns_under_load_are_the_same(
-    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
+    scenario: ResolvedScenario, reference: FlownEpisode
 ) -> None:
     """Some of them; `scripts/lockstep_reruns.py` does a hundred."""
     with busy(3):
-        reruns = [fly(plan, policy, 0, SEED) for _ in range(RERUNS)]
+        reruns = [flown(scenario) for _ in range(RERUNS)]
     assert [rerun.record for rerun in reruns] == [reference.record] * RERUNS
     for rerun in reruns:
         for name, values in reference.trajectory.arrays().items():
@@ -102,7 +99,7 @@ def test_reruns_under_load_are_the_same(
 
 
 def test_without_the_barrier_reruns_differ(
-    plan: LockstepPlan, policy: Policy, monkeypatch: pytest.MonkeyPatch
+    scenario: ResolvedScenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The control: what the test above sees is the barrier's doing, not luck."""
 
@@ -114,7 +111,7 @@ def test_without_the_barrier_reruns_differ(
     flights: set[str] = set()
     with busy(2):
         for _ in range(10):
-            record = fly(plan, policy, 0, SEED).record
+            record = flown(scenario).record
             assert record.sha256 is not None
             flights.add(record.sha256["flight"])
             if len(flights) > 1:
@@ -122,24 +119,22 @@ def test_without_the_barrier_reruns_differ(
     assert len(flights) > 1
 
 
-def test_other_flights_are_others(
-    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
-) -> None:
+def test_other_flights_are_others(scenario: ResolvedScenario, reference: FlownEpisode) -> None:
     assert reference.record.sha256 is not None
     for other in (
-        fly(plan, policy, 0, SEED + 1),
-        fly(replace(plan, native_t2_us=1_001), policy, 0, SEED),
-        fly(replace(plan, wind=WindSettings(north_m_s=0.1)), policy, 0, SEED),
+        flown(scenario, SEED + 1),
+        flown(demo_scenario(latency="1.001ms")),
+        flown(demo_scenario(wind=WindSettings(north_m_s=0.1))),
     ):
         assert other.record.sha256 is not None
         assert other.record.sha256["trajectory"] != reference.record.sha256["trajectory"]
 
 
 def test_earlier_flights_leave_no_trace(
-    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
+    scenario: ResolvedScenario, reference: FlownEpisode
 ) -> None:
-    fly(plan, policy, 0, 3)
-    assert fly(plan, policy, 0, SEED).record == reference.record
+    flown(scenario, 3)
+    assert flown(scenario).record == reference.record
 
 
 def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> None:
@@ -166,31 +161,26 @@ def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> No
     assert fingerprints == [reference.record.sha256["flight"]] * STOPPED
 
 
-def test_pace_changes_nothing(plan: LockstepPlan, policy: Policy, reference: FlownEpisode) -> None:
-    assert fly(replace(plan, speed=25.0), policy, 0, SEED).record == reference.record
+def test_pace_changes_nothing(reference: FlownEpisode) -> None:
+    assert flown(demo_scenario(speed=25.0)).record == reference.record
 
 
-def test_filterpy_flies_the_same_to_rounding(
-    plan: LockstepPlan, policy: Policy, reference: FlownEpisode
-) -> None:
+def test_filterpy_flies_the_same_to_rounding(reference: FlownEpisode) -> None:
     """A whole flight on the estimator's reference: rounding stays rounding."""
-    flown = fly(replace(plan, estimator="filterpy"), policy, 0, SEED)
-    assert flown.record.outcome is Outcome.SUCCESS
-    ours, theirs = reference.trajectory, flown.trajectory
+    other = flown(demo_scenario(estimator="filterpy"))
+    assert other.record.outcome is Outcome.SUCCESS
+    ours, theirs = reference.trajectory, other.trajectory
     assert len(ours) == len(theirs)
     np.testing.assert_allclose(ours.position, theirs.position, atol=1e-6)
-    assert reference.record.sha256 != flown.record.sha256, "another filter did fly"
+    assert reference.record.sha256 != other.record.sha256, "another filter did fly"
 
 
 # --- latency
 
 
-def test_latency_acts_in_simulated_time(plan: LockstepPlan, policy: Policy) -> None:
+def test_latency_acts_in_simulated_time() -> None:
     """A decision at t takes effect at t + t2; the old setpoint flies on, repeated at 20 Hz."""
-    latency = Latency(distribution="fixed", mean_ms=LONG_MS)
-    slow = Injection("injected", "a slow computer", latency=latency)
-    flown = fly(replace(plan, injection=slow), policy, 0, SEED)
-    stamps = flown.latency
+    stamps = flown(demo_scenario(latency=f"{LONG_MS:g}ms")).latency
     assert len(stamps["sent_us"]) >= 3
     took = stamps["action_ready_us"] - stamps["infer_start_us"]
     assert np.all(took == LONG_MS * 1_000)
@@ -200,7 +190,7 @@ def test_latency_acts_in_simulated_time(plan: LockstepPlan, policy: Policy) -> N
     # The position loop runs at every second tick; attitude and rates hand over a tick each.
     assert np.all((wait >= 2 * TICK_US) & (wait < 4 * TICK_US))
     t1 = stamps["decoded_us"] - stamps["capture_us"]
-    assert np.all((t1 >= plan.transport_us) & (t1 <= plan.transport_us + 34_000 + TICK_US))
+    assert np.all((t1 >= TRANSPORT_US) & (t1 <= TRANSPORT_US + 34_000 + TICK_US))
 
 
 # --- failsafes: the same tick at every speed
@@ -264,12 +254,12 @@ FAILSAFES = [
     ("program", "word", "capacity_mah"), FAILSAFES, ids=lambda value: getattr(value, "__name__", "")
 )
 def test_failsafes_come_at_the_same_tick_at_every_speed(
-    plan: LockstepPlan,
+    scenario: ResolvedScenario,
     program: Callable[[Stage], None],
     word: str,
     capacity_mah: float | None,
 ) -> None:
-    vehicle = plan.vehicle
+    vehicle = scenario.vehicle
     if capacity_mah is not None:
         battery = vehicle.battery.model_copy(update={"capacity_mah": capacity_mah})
         vehicle = vehicle.model_copy(update={"battery": battery})

@@ -6,7 +6,6 @@ The reference is `flight.fly`, which flies MAVSDK on raw bytes in a thread: no s
 from __future__ import annotations
 
 import os
-import queue
 import random
 import re
 import select
@@ -19,35 +18,25 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from airl_mav.cli.lockstep import lockstep_plan, policies
-from airl_mav.cli.sitl_command import SitlCommand, check
 from pymavlink import mavutil
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import LockstepPlan, Watching, fly
+from airl_mav.lockstep.flight import Watching, fly
 from airl_mav.lockstep.remote import RemotePlan, RemoteStage
 from airl_mav.lockstep.tokens import TokenSettings
-from airl_mav.rehearsal.channel import (
-    Ended,
-    Failed,
-    FinishEpisode,
-    Fly,
-    Loaded,
-    LoadEpisode,
-    Ready,
-    Saved,
-)
-from airl_mav.rehearsal.process import Child
+from airl_mav.scenario.piloting import TRANSPORT_US
+from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
+from tests.support.lockstep_kit import demo_scenario
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports
 from tests.support.processes import ROOT, Running, running
 
@@ -69,27 +58,25 @@ class Reference:
     lanes: dict[str, str]
     goal: tuple[float, float]
     outcome: Outcome
-    command: SitlCommand
-    plan: LockstepPlan
+    scenario: ResolvedScenario
     setup: EpisodeSetup
 
 
-def fly_here(command: SitlCommand) -> Reference:
-    setup, pilot = check(command)
-    seed = command.seed
-    plan = lockstep_plan(command, setup, pilot)
+def fly_here(**changes: Any) -> Reference:
+    resolved = demo_scenario(**({"arena": ARENA, "seed": SEED, "time_limit_s": 120.0} | changes))
+    seed = resolved.scenario.seed
     goals: list[tuple[float, float]] = []
     seen: list[Any] = []
     watching = Watching(begin=goals.append, tick=lambda simulation, _: seen.append(simulation))
-    flown = fly(plan, policies(command, pilot.hold_s)(seed), 0, seed, watching=watching)
+    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed, watching=watching)
     lanes = {name: (flown.record.sha256 or {})[name] for name in LANES}
-    episode = EpisodeSetup(plan.vehicle, seen[-1]._arena, seed, plan.wind)
-    return Reference(lanes, goals[0], flown.record.outcome, command, plan, episode)
+    episode = EpisodeSetup(resolved.vehicle, seen[-1]._arena, seed, resolved.scenario)
+    return Reference(lanes, goals[0], flown.record.outcome, resolved, episode)
 
 
 @pytest.fixture(scope="module")
 def reference() -> Reference:
-    done = fly_here(SitlCommand(arena=ARENA, seed=SEED, lockstep=True))
+    done = fly_here()
     assert done.outcome is Outcome.SUCCESS
     return done
 
@@ -106,15 +93,20 @@ def companion_words(api: int, camera: int, reference: Reference, *options: str) 
     north, east = reference.goal
     return [
         *("-m", "airl_mav.cli.companion", "--lockstep"),
-        *("--policy", reference.command.policy, "--seed", str(reference.command.seed)),
+        *(
+            "--policy",
+            reference.scenario.scenario.policy,
+            "--seed",
+            str(reference.scenario.scenario.seed),
+        ),
         *("--connect", f"udpin://{LOOPBACK}:{api}", "--camera", f"tcp://{LOOPBACK}:{camera}"),
         *("--goal", repr(north), repr(east)),
-        *("--goal-radius-m", repr(reference.plan.pilot.goal_radius_m), *options),
+        *("--goal-radius-m", repr(reference.scenario.companion_pilot.goal_radius_m), *options),
     ]
 
 
 def radius(reference: Reference) -> tuple[str, str]:
-    return "--goal-radius", repr(reference.plan.goal_radius_m)
+    return "--goal-radius-m", repr(reference.scenario.pilot.goal_radius_m)
 
 
 def lanes_in(*texts: str) -> dict[str, str]:
@@ -196,19 +188,19 @@ def staged(reference: Reference, plan: RemotePlan) -> Iterator[tuple[RemoteStage
         closing(camera),
         closing(RemoteStage(endpoint, camera, plan, broken_off=lambda: False)) as stage,
     ):
-        warm_up(reference.plan.vehicle)
+        warm_up(reference.scenario.vehicle)
         stage.load(reference.setup, None)
         yield stage, ports
 
 
 def remote_plan(reference: Reference, patience_s: float = 60.0) -> RemotePlan:
-    flown = reference.plan
+    resolved = reference.scenario
     return RemotePlan(
-        flown.transport_us,
+        TRANSPORT_US,
         TokenSettings(patience_s=patience_s),
         None,
-        flown.goal_radius_m,
-        flown.time_limit_s,
+        resolved.pilot.goal_radius_m,
+        resolved.scenario.time_limit_s,
     )
 
 
@@ -219,18 +211,18 @@ def fly_staged(stage: RemoteStage) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("command", "outcome"),
+    ("changes", "outcome"),
     [
-        (SitlCommand(arena=ARENA, time_limit=TOO_SHORT_S, lockstep=True), Outcome.TIMEOUT),
-        (SitlCommand(arena="crowded", policy="greedy", seed=10, lockstep=True), Outcome.COLLISION),
+        ({"time_limit_s": TOO_SHORT_S}, Outcome.TIMEOUT),
+        ({"arena": "crowded", "policy": "greedy", "seed": 10}, Outcome.COLLISION),
     ],
     ids=["land", "abandon"],
 )
 def test_orders_of_the_referee_arrive_in_their_turn(
-    command: SitlCommand, outcome: Outcome, reference: Reference, tmp_path: Path
+    changes: dict[str, Any], outcome: Outcome, reference: Reference, tmp_path: Path
 ) -> None:
     """Flights that are called off, in the middle of an action."""
-    successful, reference = reference, fly_here(command)
+    successful, reference = reference, fly_here(**changes)
     assert reference.outcome is outcome
     with (
         staged(reference, remote_plan(reference)) as (stage, ports),
@@ -334,77 +326,6 @@ def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path:
             stage.close()
             assert companion.wait() == 1
     assert companion.text().splitlines()[-1] == "error: the flight controller has ended the flight"
-
-
-# --- under a harness
-
-
-@pytest.mark.slow
-def test_harness_flies_episodes_from_scratch(reference: Reference, tmp_path: Path) -> None:
-    """Two episodes by one pair of processes: each is the flight that its seed is alone."""
-    references = [reference, fly_here(replace(reference.command, seed=SEED + 1))]
-    ports = choose_ports()
-    events: queue.Queue[Any] = queue.Queue()
-    firmware_options = firmware_words(ports, "--control", "stdio", *radius(reference))[2:]
-    companion_options = companion_words(ports.api, ports.camera, reference)[2:]
-    children = {
-        "firmware": Child(
-            "firmware", "airl_mav.cli.firmware", firmware_options, tmp_path / "f.log", events
-        ),
-        "companion": Child(
-            "companion",
-            "airl_mav.cli.companion",
-            [*companion_options, "--control", "stdio"],
-            tmp_path / "c.log",
-            events,
-        ),
-    }
-
-    def wait_for(kind: type[Any]) -> Any:
-        while True:
-            _, event = events.get(timeout=120.0)
-            assert not isinstance(event, Failed), event
-            if isinstance(event, kind):
-                return event
-
-    try:
-        wait_for(Ready)
-        wait_for(Ready)
-        for index, expected in enumerate(references):
-            seed = SEED + index
-            record = tmp_path / f"{index}.npz"
-            children["firmware"].send(
-                LoadEpisode(
-                    episode=index,
-                    arena=ARENA,
-                    arena_seed=seed,
-                    seed=seed,
-                    tlog=None,
-                    record=str(record),
-                )
-            )
-            loaded = wait_for(Loaded)
-            assert loaded.goal == expected.goal
-            assert loaded.epoch_ns is None
-            children["companion"].send(
-                Fly(
-                    episode=index,
-                    goal=loaded.goal,
-                    epoch_ns=None,
-                    latency_seed=seed,
-                    record=str(tmp_path / f"d{index}.npz"),
-                )
-            )
-            ended = wait_for(Ended)
-            assert ended.reason == "goal reached"
-            children["firmware"].send(FinishEpisode())
-            saved = wait_for(Saved)
-            assert saved.sha256 | ended.sha256 == expected.lanes
-            with np.load(record) as arrays:
-                assert arrays["trajectory/time_us"][-1] > 15_000_000
-    finally:
-        for child in children.values():
-            child.stop()
 
 
 # --- another language

@@ -10,15 +10,17 @@ from contextlib import closing, contextmanager
 from typing import Any
 
 import pytest
-from airl_mav.cli.firmware_lockstep import LockstepOptions, remote_plan
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import validated
 from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.remote import plan_of
 from airl_mav.lockstep.token_camera import TokenCamera
 from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
 from airl_mav.lockstep.turns import Turn
 from airl_mav.rehearsal.supervisor import Order
+from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from companion.tokens import Phase, TurnBack, TurnGiven
 from firmware_sim.firmware import FrameServer
 from firmware_sim.mavlink.codec import Encoder
@@ -285,26 +287,26 @@ def test_phases_are_told_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "speed", "named"),
+    "options",
     [
-        (LockstepOptions(transport_ms=-1.0), None, "--transport-ms"),
-        (LockstepOptions(turn_us=0), None, "--turn-us"),
-        (LockstepOptions(turn_us=2_000_000), None, "--turn-us"),
-        (LockstepOptions(companion_timeout=0.0), None, "--companion-timeout"),
-        (LockstepOptions(goal_radius=0.0), None, "--goal-radius"),
-        (LockstepOptions(time_limit=0.0), None, "--time-limit"),
-        (LockstepOptions(), 0.01, "--speed"),
+        {"transport_ms": -1.0},
+        {"turn_us": 0},
+        {"turn_us": 2_000_000},
+        {"companion_timeout": 0.0},
+        {"goal_radius_m": 0.0},
+        {"time_limit_s": 0.0},
+        {"speed": 0.01},
     ],
+    ids=str,
 )
-def test_options_out_of_range_are_refused(
-    options: LockstepOptions, speed: float | None, named: str
-) -> None:
-    with pytest.raises(UsageError, match=named):
-        remote_plan(options, speed)
+def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(FieldError) as refused:
+        check_vehicle(validated(StandAloneVehicle, {"lockstep": True, **options}))
+    assert refused.value.field == next(iter(options))
 
 
 @pytest.mark.parametrize(("speed", "paced"), [(None, None), ("max", None), (2.0, 2.0)])
 def test_pace_is_as_fast_as_it_goes_unless_asked(speed: Any, paced: float | None) -> None:
-    plan = remote_plan(LockstepOptions(transport_ms=7.0), speed)
+    plan = plan_of(StandAloneVehicle(lockstep=True, transport_ms=7.0, speed=speed))
     assert plan.speed == paced
     assert plan.transport_us == 7_000

@@ -27,9 +27,9 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.report.document import write_document
 from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_map
-from airl_mav.sweep.document import document_of
 from airl_mav.report.theme import new_figure, render_png
 from airl_mav.sweep.config import SweepConfig, load_sweep
+from airl_mav.sweep.document import document_of
 from airl_mav.sweep.size_fit import fit_times, neighbours
 from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep

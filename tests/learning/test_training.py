@@ -25,8 +25,7 @@ from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import nominal
 from airl_mav.training.store import TrainingFolder
-from tests.support.ports import choose_ports
-from tests.support.processes import ROOT, allow_interrupt
+from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, allow_interrupt
 
 SHORT = """
 description = "a short one"
@@ -42,12 +41,6 @@ learning_starts = 300
 [selection]
 every = 1_000
 episodes = 10
-"""
-
-NO_REPORT = """
-from airl_mav.cli import sitl
-sitl.conclude = lambda *_: None  # figures take longer than flights
-sitl.main()
 """
 
 
@@ -236,7 +229,7 @@ def test_learns_exports_and_flies(tmp_path: Path) -> None:
     assert success_rate(flown) > success_rate(chance) + 0.4
     sitl = subprocess.run(
         [
-            *(sys.executable, "-c", NO_REPORT, *choose_ports().options(), "--lockstep"),
+            *(sys.executable, *SITL_WITHOUT_REPORT, "--level", "lockstep"),
             *("--policy", str(out / "policy"), "--arena", "no-obstacles", "--episodes", "2"),
             *("--out", str(tmp_path / "flight")),
         ],

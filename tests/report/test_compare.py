@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from airl_mav.cli.evaluate_command import EvaluateCommand
 from airl_mav.cli.evaluate_task import prepare
+from airl_mav.cli.report_command import ReportCommand
 from PIL import Image
 from rich.console import Console
 
 from airl_mav.cli.report import run
-from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder

@@ -21,12 +21,12 @@ import numpy as np
 import pytest
 from airl_mav.cli.gap_command import DEFAULT_MITIGATED, GapCommand
 from airl_mav.cli.gap_plan import TRAINING_LATENCY_SEED, plan_gap
+from airl_mav.cli.report_command import ReportCommand
 from PIL import Image
 from rich.console import Console
 
 from airl_mav.cli import gap_plan, report
 from airl_mav.cli.gap import run
-from airl_mav.cli.report_command import ReportCommand
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo

@@ -18,7 +18,8 @@ BEGINS = "begins"
 
 
 def demo_scenario(**changes: Any) -> ResolvedScenario:
-    return resolve(Scenario(level="lockstep", time_limit_s=60.0).model_copy(update=changes))
+    """Return a short flight in lockstep; `changes` are fields of the scenario."""
+    return resolve(Scenario(**({"level": "lockstep", "time_limit_s": 60.0} | changes)))
 
 
 def main(flights: int) -> None:

@@ -28,10 +28,10 @@ NO_REPORT = """
 from airl_mav.cli import sitl
 sitl.conclude = lambda *_: None
 """
-"""Before airl-sitl's main(): pictures take longer than flights."""
+"""Before airl-sitl: pictures take longer than flights."""
 
 SITL = ("-m", "airl_mav.cli.sitl")
-SITL_WITHOUT_REPORT = ("-c", f"{NO_REPORT}\nsitl.main()")
+SITL_WITHOUT_REPORT = ("-c", f"{NO_REPORT}\nfrom airl_mav.cli import entry\nentry.sitl()")
 
 PATIENCE_S = 150.0
 """Longest wait for anything [wall s]: after a change of the sources, a first start compiles."""
@@ -60,7 +60,7 @@ def is_running(pid: int) -> bool:
 
 
 def children_of(pid: int) -> dict[str, int]:
-    """Return the children of a process: last part of the module's name -> pid."""
+    """Return the children of a process: firmware, companion, or their module's name -> pid."""
     found = {}
     for entry in Path("/proc").iterdir():
         if not entry.name.isdecimal():
@@ -70,7 +70,8 @@ def children_of(pid: int) -> dict[str, int]:
             if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) != pid:
                 continue
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            found[words[words.index(b"-m") + 1].decode().rpartition(".")[2]] = int(entry.name)
+            module = words[words.index(b"-m") + 1].decode()
+            found[module.rpartition(".")[2].removesuffix("_process")] = int(entry.name)
     return found
 
 

@@ -27,6 +27,7 @@ from airl_mav.arena.zones import zone_of, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from tests.support.command_line import airl
 
 WIDTH_M = 0.55
 SHIPPED = ("no-obstacles", "static-obstacles", "dynamic-obstacles")
@@ -36,7 +37,6 @@ seeds = st.integers(0, 2**32 - 1)
 relaxed = settings(
     deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-from tests.support.command_line import airl
 
 
 def shipped(name: str) -> ArenaSpec:
@@ -579,9 +579,9 @@ def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
         (["no-obstacles", "--zone", "5"], "zone = 5: accepted: 0 <= value <= 2"),
         (
             ["no-obstacles", "--png", "a.jpg"],
-            "--png a.jpg: accepted: a file name that ends in .png",
+            "--png 'a.jpg': accepted: a file name that ends in .png",
         ),
-        (["no-obstacles", "--png", "/nowhere/a.png"], "--png /nowhere/a.png: cannot write"),
+        (["no-obstacles", "--png", "/nowhere/a.png"], "--png '/nowhere/a.png': cannot write"),
         (
             ["no-obstacles", "--vehicle-width", "0"],
             "--vehicle-width-m 0: accepted: 0 < value <= 100 m",

@@ -13,6 +13,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.safe_velocity import max_acceleration
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.forensics.camera_view import (
     PolicyCamera,
@@ -32,7 +33,6 @@ from airl_mav.report.forensics.evidence import (
     straight_m,
     time_lost_s,
 )
-from airl_mav.latency.safe_velocity import max_acceleration
 from airl_mav.report.forensics.swings import MIN_TURNS, SPOT_M, longest_swing, stretches
 
 CAMERA = load_vehicle("quad").camera

@@ -18,8 +18,8 @@ import onnx
 from airl_mav.core.errors import UsageError
 from airl_mav.policy import card as card_module
 from airl_mav.policy.card import (
-    PolicyCard,
     MeasuredResult,
+    PolicyCard,
     Training,
     digest,
     load_card,

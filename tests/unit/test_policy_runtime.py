@@ -540,7 +540,7 @@ def test_a_learned_policy_flies_a_rehearsal(folder: Path, tmp_path: Path) -> Non
     write_card(folder, read_card(folder).model_copy(update={"hold_s": 0.3, "epsilon": 0.2}))
     run = tmp_path / "run"
     words = [*SITL_WITHOUT_REPORT, *choose_ports().options(), "--policy", str(folder)]
-    words += ["--out", str(run), "--episodes", "2", "--speed", "3", "--time-limit", "4"]
+    words += ["--out", str(run), "--episodes", "2", "--speed", "3", "--time-limit-s", "4"]
     with running(words, tmp_path) as process:
         process.find_children("firmware", "companion")
         assert process.wait(250.0) == 0, process.text()

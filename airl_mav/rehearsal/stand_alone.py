@@ -1,0 +1,90 @@
+"""The vehicle alone: flight controller, plant and camera, for any client, until told to stop."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, field
+
+from airl_mav.arena.generate import generate
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
+from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
+from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.external.programs import how_to_start
+from firmware_sim.pacing import Unpaced, WallPacing
+from firmware_sim.simulation import EpisodeSetup
+from firmware_sim.stand_alone import fly
+from firmware_sim.warm_up import warm_up
+
+
+@dataclass
+class Listener:
+    """Who is told what happens. All calls come from the thread that flies."""
+
+    waiting: Callable[[str], None] = field(default=lambda _what: None)
+    """Real firmware is waited for: how the user starts it."""
+    ready: Callable[[str, tuple[float, float]], None] = field(default=lambda _camera, _goal: None)
+    """The vehicle stands ready: ZeroMQ address of its camera; goal (north, east) [m]."""
+    text: Callable[[Message], None] = field(default=lambda _message: None)
+    """The autopilot said something."""
+    say: Callable[[str], None] = field(default=lambda _line: None)
+    """How it went, a line at a time."""
+
+
+def fly_vehicle(
+    asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
+) -> None:
+    """Fly whatever clients ask for, in real time or at another pace.
+
+    Args:
+        asked: What flies, and where.
+        stop: Set from outside to end it.
+        listener: Who is told what happens.
+
+    Raises:
+        UsageError: The input cannot be used.
+        FirmwareLostError: Real firmware is gone.
+    """
+    listener = listener or Listener()
+    check_vehicle(asked)
+    vehicle = load_vehicle(asked.vehicle)
+    firmware = build_firmware(
+        asked,
+        vehicle,
+        Unpaced() if asked.pace is None else WallPacing(asked.pace),
+        bind=asked.bind,
+        companion_host=asked.companion_host,
+        gcs_host=asked.gcs_host,
+        insecure=asked.insecure,
+        log=asked.firmware_log,
+        # It may fly for days, and nobody collects what would be recorded.
+        recording=False,
+    )
+    with closing(firmware):
+        firmware.on_message = listener.text
+        episode, goal = episode_of(asked, vehicle)
+        warm_up(vehicle)
+        if (hint := how_to_start(asked, vehicle)) is not None:
+            listener.waiting(hint)
+        firmware.load(episode, asked.tlog, unix_us())
+        listener.ready(firmware.camera_endpoint, goal)
+        fly(firmware, stop, asked.duration, listener.say)
+
+
+def episode_of(
+    asked: StandAloneVehicle, vehicle: VehicleProfile
+) -> tuple[EpisodeSetup, tuple[float, float]]:
+    """Return the episode that is flown, and its goal (north, east) [m].
+
+    Raises:
+        UsageError: No arena can be made of the seed.
+    """
+    spec = load_profile("arenas", asked.arena, ArenaSpec)
+    width_m = vehicle.body.width_m
+    arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
+    goal = (float(arena.goal[0]), float(arena.goal[1]))
+    return EpisodeSetup(vehicle, arena, asked.seed, asked), goal

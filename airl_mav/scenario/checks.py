@@ -1,0 +1,88 @@
+"""Fields that contradict each other: found before a profile is read or a port is bound."""
+
+from __future__ import annotations
+
+from airl_mav.core.errors import FieldError
+from airl_mav.scenario.model import Aircraft, LevelName, Ports, Scenario
+
+SITL_SPEEDS = 0.5, 10.0
+"""Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
+(1 Hz of simulated time, 3 s allowed); faster, its 20 Hz of setpoints come near offboard loss."""
+
+REAL_FIRMWARE_NEEDS = {
+    "px4": ("px4_dir", "px4_connect"),
+    "ardupilot": ("ardupilot_dir", "ardupilot_connect"),
+    "px4-hitl": ("serial",),
+}
+"""Exactly one of these fields comes with each kind of real firmware."""
+
+
+def check_level(scenario: Scenario) -> None:
+    """Raise FieldError for a field that the level does not have."""
+    level = scenario.level
+    if level == "sitl":
+        if scenario.ablate is not None:
+            raise FieldError("ablate", scenario.ablate, "at level gym or lockstep")
+        low, high = SITL_SPEEDS
+        if scenario.speed is not None and not low <= scenario.speed <= high:
+            raise FieldError(
+                "speed", f"{scenario.speed:g}", f"{low:g} <= value <= {high:g} at level sitl"
+            )
+    elif level == "gym":
+        usual = Scenario()
+        for field in ("wind", "estimator", "max_speed_m_s", "speed"):
+            if (value := getattr(scenario, field)) != getattr(usual, field):
+                raise FieldError(field, value, "at level lockstep or sitl; the twin has none")
+    if level != "lockstep" and scenario.tlogs:
+        raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
+    if level == "sitl" and scenario.workers is not None:
+        raise FieldError("workers", scenario.workers, "at level gym or lockstep")
+
+
+def check_ports(ports: Ports, *, any_camera: bool) -> None:
+    """Raise FieldError for a port that no client could be told, or two links on one port.
+
+    Args:
+        ports: What was asked for.
+        any_camera: Whether the camera's port may be 0, any free one.
+    """
+    for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
+        if getattr(ports, field) == 0:
+            raise FieldError(f"ports.{field}", 0, "1 <= value <= 65535")
+    if ports.api_port == ports.gcs_port:
+        raise FieldError("ports.gcs_port", ports.gcs_port, "another than that of the onboard API")
+
+
+def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None) -> None:
+    """Raise FieldError for real firmware that is asked for in a way that cannot be.
+
+    Args:
+        asked: What flies.
+        level: Rung of the fidelity ladder.
+        speed: Simulated seconds per wall second; None: as usual.
+    """
+    firmware, real = asked.firmware, asked.real
+    given = {name for name, value in real if value not in (None, False)}
+    for kind, names in REAL_FIRMWARE_NEEDS.items():
+        mine = [name for name in names if name in given]
+        if kind != firmware and mine:
+            raise FieldError(f"real.{mine[0]}", getattr(real, mine[0]), f"with firmware {kind}")
+        if kind == firmware and len(mine) != 1:
+            raise FieldError("firmware", firmware, f"with {' or '.join(names)}")
+    if firmware == "builtin":
+        return
+    if level != "sitl":
+        raise FieldError(
+            "firmware",
+            firmware,
+            f"at level sitl, not {level}: only the built-in autopilot shares its clock",
+        )
+    if firmware == "px4-hitl" and speed not in (None, 1.0):
+        raise FieldError("speed", speed, "1 with firmware px4-hitl, a board's own pace")
+    if firmware == "px4":
+        usual = Ports()
+        for name, value in asked.ports:
+            if name != "camera_port" and value != getattr(usual, name):
+                raise FieldError(
+                    f"ports.{name}", value, "its default: PX4 SITL's ports move with instance"
+                )

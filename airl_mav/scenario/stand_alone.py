@@ -1,0 +1,209 @@
+"""What the two programs can be asked for that fly apart: the vehicle alone, the companion alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import quantity
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.scenario.checks import check_firmware, check_ports
+from airl_mav.scenario.model import (
+    DEFAULT_ARENA,
+    DEFAULT_POLICY,
+    GREATEST_SEED,
+    Aircraft,
+    Decisions,
+    Lateness,
+)
+from airl_mav.scenario.piloting import TRANSPORT_US
+
+SPEEDS = 0.0, 100.0
+"""Limits of the pace; what a host cannot keep up with is given up and reported."""
+
+LOCKSTEP_SPEEDS = 0.1, 1000.0
+"""The same in lockstep; slower, the companion would take the vehicle for gone between two turns."""
+
+TURN_US = 20_000
+"""A companion in lockstep that does not ask for its next turn has it this long later [µs]."""
+
+LONGEST_REST_US = US_PER_S
+"""The companion has a turn at least this often, wanted or not, so that what is sent to it fits into
+its socket's buffer even when it does not read [µs]."""
+
+COMPANION_TIMEOUT_S = 60.0
+"""Longest turn of the companion in lockstep [s of wall time]."""
+
+FARTHEST_M = 10_000.0
+"""Limit of a goal's distance on each axis."""
+
+
+class StandAloneVehicle(Aircraft):
+    """Flight controller, vehicle and camera by themselves, for any client."""
+
+    arena: str = Field(
+        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
+    )
+    seed: int = quantity("seed of arena, sensors and wind", "1", ge=0, le=GREATEST_SEED, default=1)
+    speed: float | Literal["max"] | None = Field(
+        default=None,
+        description="simulated seconds per wall second, above 0, at most 100; max: as fast as it"
+        " goes, for clients that do not live by the wall clock; by default 1, in lockstep max",
+    )
+    duration: float | None = quantity(
+        "end after this simulated time; by default on Ctrl-C", "s", ge=0, le=1e6, default=None
+    )
+    firmware_log: Path | None = Field(
+        default=None,
+        description="with real firmware that is started here: what it prints goes to this file",
+    )
+    bind: str = Field(default=LOOPBACK, description="IPv4 address that links and camera bind")
+    companion_host: str = Field(
+        default=LOOPBACK, description="IPv4 address of the companion computer"
+    )
+    gcs_host: str = Field(default=LOOPBACK, description="IPv4 address of the ground station")
+    insecure: bool = Field(
+        default=False,
+        description="allow addresses that other machines can reach; MAVLink has no authentication"
+        " here yet",
+    )
+    lockstep: bool = Field(
+        default=False,
+        description="simulated time waits for one companion that passes turns (airl-companion"
+        " --lockstep, or any program that keeps to docs/lockstep.md): the same flight every time,"
+        " bit by bit; there is no ground station then, and the companion's end ends the flight",
+    )
+    transport_ms: float = quantity(
+        "in lockstep: from a frame's exposure until the companion sees it",
+        "ms",
+        ge=0,
+        le=1000,
+        default=TRANSPORT_US / US_PER_MS,
+    )
+    turn_us: int = quantity(
+        "in lockstep: a companion that does not say when it wants its next turn has it this long"
+        " after the last, in simulated time",
+        "us",
+        ge=1,
+        le=LONGEST_REST_US,
+        default=TURN_US,
+    )
+    companion_timeout: float = quantity(
+        "in lockstep: longest turn of the companion, wall time",
+        "s",
+        ge=1,
+        le=3600,
+        default=COMPANION_TIMEOUT_S,
+    )
+    goal_radius_m: float | None = quantity(
+        "in lockstep: judge the flight, and tell the companion when it is lost; the goal is reached"
+        " closer than this, seen from above; by default nobody judges",
+        "m",
+        ge=0.2,
+        le=50,
+        default=None,
+    )
+    time_limit_s: float = quantity(
+        "with a goal radius: longest flight from the start of navigation",
+        "s",
+        ge=1,
+        le=3600,
+        default=120.0,
+    )
+    tlog: Path | None = Field(
+        default=None, description="write the MAVLink log of the onboard link to this file"
+    )
+
+    @property
+    def pace(self) -> float | None:
+        """Simulated seconds per wall second; None: as fast as it goes."""
+        if self.speed is None:
+            return None if self.lockstep else 1.0
+        return self.speed if isinstance(self.speed, float) else None
+
+
+class StandAloneCompanion(Lateness, Decisions):
+    """What flies a policy, by itself: on an onboard computer, or against any simulator."""
+
+    policy: str = Field(
+        default=DEFAULT_POLICY,
+        description="policy that decides: a name, or a path to a folder with policy.onnx and"
+        " card.json",
+    )
+    goal: tuple[float, float] = Field(
+        default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
+    )
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    camera: str = Field(
+        default="tcp://127.0.0.1:5600", description="ZeroMQ address of the depth camera"
+    )
+    lockstep: bool = Field(
+        default=False,
+        description="take turns with a simulator that waits for this program (airl-firmware"
+        " --lockstep): every flight of a seed is the same",
+    )
+    speed: float = quantity(
+        "simulated seconds per wall second of the simulator; 1 on a real aircraft",
+        "1",
+        ge=0.1,
+        le=100,
+        default=1.0,
+    )
+    seed: int = quantity(
+        "seed of the injected latency, and of random actions if the policy's card has any",
+        "1",
+        ge=0,
+        le=GREATEST_SEED,
+        default=1,
+    )
+    connect_timeout: float = quantity(
+        "longest wait for the flight controller; in lockstep for each of its turns, too",
+        "s",
+        ge=0.1,
+        le=3600,
+        default=30.0,
+    )
+    log: Path | None = Field(
+        default=None, description="write the stamps of every decision to this .npz file"
+    )
+
+
+def check_vehicle(asked: StandAloneVehicle) -> None:
+    """Raise FieldError for what can be seen to be wrong before a port is bound."""
+    check_ports(asked.ports, any_camera=True)
+    speed = asked.speed
+    check_firmware(asked, "lockstep" if asked.lockstep else "sitl", speed)
+    low, high = LOCKSTEP_SPEEDS if asked.lockstep else SPEEDS
+    if isinstance(speed, float) and not (low < speed <= high or low == speed > 0.0):
+        sign = "<=" if asked.lockstep else "<"
+        raise FieldError("speed", speed, f"{low:g} {sign} value <= {high:g}, or max")
+    hosts = {asked.bind, asked.companion_host, asked.gcs_host}
+    if asked.firmware in ("px4", "ardupilot") and hosts != {LOOPBACK}:
+        raise FieldError(
+            "firmware",
+            asked.firmware,
+            "without bind, companion-host and gcs-host; its links are its own, on this machine",
+        )
+    _check_folder("tlog", asked.tlog)
+
+
+def check_companion(asked: StandAloneCompanion) -> None:
+    """Raise FieldError for what can be seen to be wrong before a connection is opened."""
+    for metres in asked.goal:
+        if not abs(metres) <= FARTHEST_M:
+            raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")
+    _check_folder("log", asked.log)
+
+
+def _check_folder(field: str, file: Path | None) -> None:
+    """Raise FieldError for a file in a folder that is not there."""
+    if file is not None and not file.parent.is_dir():
+        raise FieldError(field, file, problem=f"no folder {file.parent}")

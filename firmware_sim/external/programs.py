@@ -1,0 +1,47 @@
+"""Programs of real firmware: are they there, and how does the user start them?
+
+Light to import: whoever starts a rehearsal asks before anything that flies is loaded.
+"""
+
+from __future__ import annotations
+
+import shlex
+
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.model import Aircraft, RealFirmware
+from firmware_sim.external.ardupilot import program as ardupilot_program
+from firmware_sim.external.ardupilot.program import find_arducopter
+from firmware_sim.external.px4 import program as px4_program
+from firmware_sim.external.px4.program import find_px4
+
+
+def check_program(real: RealFirmware) -> None:
+    """Look for the program that is to be started. Raises UsageError if it is not there."""
+    if real.px4_dir is not None:
+        find_px4(real.px4_dir)
+    if real.ardupilot_dir is not None:
+        find_arducopter(real.ardupilot_dir)
+
+
+def load_timeout_s(aircraft: Aircraft) -> float | None:
+    """Return the longest wait until the vehicle stands ready [wall s]; None: as for any answer.
+
+    To connect, a heartbeat, the parameters read and set, ready to arm: each within the time-out.
+    """
+    if aircraft.firmware == "builtin":
+        return None
+    return 30.0 + 5.0 * aircraft.real.firmware_timeout
+
+
+def how_to_start(aircraft: Aircraft, vehicle: VehicleProfile) -> str | None:
+    """Return the command with which the user starts what is waited for; None: nothing is."""
+    real, ports = aircraft.real, aircraft.ports
+    if real.px4_connect and vehicle.px4 is not None:
+        return px4_program.how_to_start(real.instance, vehicle.px4.airframe)
+    if real.ardupilot_connect:
+        observer = ardupilot_program.OBSERVER_PORT + real.instance
+        links = ardupilot_program.Links(ports.api_port, ports.gcs_port, observer)
+        start = ardupilot_program.how_to_start(real.instance, links)
+        file = shlex.join(["--vehicle", aircraft.vehicle, "--out", ardupilot_program.PARAMETERS])
+        return f"airl parameters ardupilot {file} && {start}"
+    return None
