@@ -31,7 +31,7 @@ from airl_mav.conformance.steps import (
     measure,
     plan,
 )
-from airl_mav.conformance.vehicle import Vehicle, raw_setpoints
+from airl_mav.conformance.vehicle import SetpointStream, Vehicle
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
@@ -130,7 +130,7 @@ def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceRes
     if not settings.steps_only:
         checklist.perform_all(OFFBOARD_CHECKS, vehicle)
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
-        with raw_setpoints(vehicle, FACING_EAST) as stream:
+        with SetpointStream(vehicle, FACING_EAST) as stream:
             checklist.perform_all(setpoint_checks(stream), vehicle)
     if settings.steps:
         checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))

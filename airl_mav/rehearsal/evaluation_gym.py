@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from airl_mav.arena.geometry import Arena, Shape
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.contact import FLOOR, WALL
-from airl_mav.envs.evaluation import OUTCOMES, Flown, Pilots, fly_seeds
+from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, Pilots, fly_seeds
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
@@ -73,7 +73,7 @@ def fly_gym(
 
 
 def _episode(
-    plan: GymPlan, navigation: Navigation, trace: Trace, slot: int, flown: Flown, index: int
+    plan: GymPlan, navigation: Navigation, trace: Trace, slot: int, flown: EpisodeResult, index: int
 ) -> FlownEpisode:
     """Return the flight whose end its slot still shows."""
     arena, rules = navigation.arenas[slot], plan.environment.episode

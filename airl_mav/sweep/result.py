@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.versioned import write_json
-from airl_mav.envs.evaluation import OUTCOMES, Flown
+from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult
 from airl_mav.flight.judge import Outcome
 from airl_mav.sweep.trial import Trial
 
@@ -62,7 +62,7 @@ _RESULT = TypeAdapter(TrialResult)
 
 
 def judged(
-    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[Flown]
+    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[EpisodeResult]
 ) -> TrialResult:
     """Return the figures of a trial's flights, at least one."""
     # Flights end in an order of their own: sums must not depend on it.

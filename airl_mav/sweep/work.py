@@ -15,7 +15,7 @@ import numpy as np
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.evaluation import SLOTS, Flown, LearnedPilots, fly_seeds
+from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.policy.learned import load_learned
 from airl_mav.sweep.result import Trained, TrialResult, judged
@@ -75,7 +75,7 @@ class TrialWork:
         return result
 
 
-def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[Flown]:
+def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[EpisodeResult]:
     """Fly the exported policy of a training as `airl evaluate` would, at level gym."""
     policy = load_learned(training.policy)
     navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))

@@ -1,4 +1,4 @@
-"""From a trained network to a policy that flies: ONNX and its card, checked against torch."""
+"""Exports a trained network to a policy folder: ONNX and its card, checked against torch."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def _hooked(module: nn.Module, hook: Callable[[nn.Module, Any, Any], None]) -> I
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence what torch's exporter has to say about its own future and about torchvision."""
+    """Silence the deprecation warnings of torch's exporter."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)

@@ -21,7 +21,7 @@ from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.delay import bounded
-from airl_mav.envs.evaluation import Flown, fly_episodes, success_rate
+from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv
@@ -278,7 +278,7 @@ def greedy(model: BaseAlgorithm) -> Callable[[Encoded], NDArray[Any]]:
 
 
 def summary(
-    flown: Sequence[Flown],
+    flown: Sequence[EpisodeResult],
     *,
     steps: int,
     seconds: float,

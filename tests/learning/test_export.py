@@ -379,7 +379,7 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--layout", "paper", "--image", "32x10"],
-            ["height_px 10", "more than 10"],
+            ["height_px = 10", "more than 10"],
         ),
         (
             "dqn.zip",
@@ -394,7 +394,7 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         (
             "sac.zip",
             ["--algorithm", "SAC", "--actions", "velocity", "--epsilon", "0.1"],
-            ["epsilon 0.1", "0 with the action set 'velocity'"],
+            ["epsilon = 0.1", "0 with the action set 'velocity'"],
         ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else value,
