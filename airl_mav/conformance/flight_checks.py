@@ -231,7 +231,7 @@ def _lose_setpoints(vehicle: Vehicle) -> str:
         )
         stream.stop()
         since = len(telemetry.texts)
-        last_s, _ = vehicle.clock.sending_time()
+        last_s = vehicle.clock.sending_time()
         stream.send(NORTH)
     vehicle.transcript.add("sent", "the last setpoint")
     expected = vehicle.autopilot.loss

@@ -9,8 +9,7 @@ from typing import NamedTuple
 from pydantic import Field
 
 from airl_mav.conformance.checklist import CheckFailedError, require
-from airl_mav.conformance.step_response import StepResponse
-from airl_mav.conformance.steps import MeasuredStep, StepName
+from airl_mav.conformance.steps import MeasuredStep, StepName, StepResponse
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile

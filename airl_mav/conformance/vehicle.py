@@ -158,13 +158,13 @@ class Vehicle:
         flags = CUSTOM_MODE_FLAG | (ARMED_FLAG if self.armed else 0)
         return self.command(MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
-    def fly(self, setpoint: Setpoint) -> tuple[float, bool]:
+    def fly(self, setpoint: Setpoint) -> float:
         """Give MAVSDK a setpoint, which it sends at once and then repeats at 20 Hz.
 
         Returns:
-            When it reached the vehicle, by its clock [s], and whether from an exchange.
+            When it reached the vehicle, by its clock [s].
         """
-        reached: list[tuple[float, bool]] = []
+        reached: list[float] = []
 
         def send() -> None:
             reached.append(self.clock.sending_time())
@@ -175,9 +175,9 @@ class Vehicle:
 
         values = ", ".join(f"{value:g}" for value in setpoint[1:])
         self.call(f"set_velocity_{setpoint.frame}({values})", send, must_succeed=True)
-        (reached_s, exact), latest = reached[0], self.clock.exchange()
+        latest = self.clock.exchange()
         # A simulation may have stalled in between: it was not later than this second exchange.
-        return (reached_s if latest is None else min(reached_s, latest.boot_s)), exact
+        return reached[0] if latest is None else min(reached[0], latest.boot_s)
 
     def send(self, name: str, fields: dict[str, Any]) -> None:
         """Send a raw message; None in a field is NaN. Raises LinkError."""

@@ -35,12 +35,7 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
-from airl_mav.policy.layouts import (
-    Encoded,
-    ObservationSpec,
-    camera_mismatch,
-    encode_layout,
-)
+from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

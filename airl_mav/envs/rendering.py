@@ -16,13 +16,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from airl_mav.arena.draw import (
-    GRID_COLOUR,
-    MOVING_COLOURS,
-    START_COLOUR,
-    TEXT_COLOUR,
-    draw_arena,
-)
+from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError

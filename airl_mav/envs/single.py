@@ -46,11 +46,7 @@ class NavigationEnv(gym.Env[Encoded, Any]):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(
-        self,
-        spec: EnvironmentSpec | None = None,
-        *,
-        render_mode: str | None = None,
-        **knobs: Any,
+        self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
     ) -> None:
         """Make the environment.
 

@@ -79,10 +79,7 @@ class Trace:
         self._take(fleet, np.array([i]))
 
     def advance(
-        self,
-        fleet: Fleet,
-        ticks: NDArray[np.int64],
-        fly: Callable[[NDArray[np.int64]], None],
+        self, fleet: Fleet, ticks: NDArray[np.int64], fly: Callable[[NDArray[np.int64]], None]
     ) -> None:
         """Advance all flights in steps that end on the samples.
 

@@ -23,7 +23,7 @@ from airl_mav.sweep.store import Progress, SweepFolder
 from airl_mav.sweep.trial import Trial, size_of, training_of
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import export_best, fit, nominal
-from airl_mav.training.store import CONFIG_FILE, Evaluation, TrainingFolder
+from airl_mav.training.store import CONFIG_FILE, Evaluation, TrainingFolder, TrainingProgress
 
 NOTE_US = 2 * US_PER_S
 """How often a training says how far it is [wall µs]."""
@@ -108,8 +108,8 @@ def _held(training: TrainingFolder) -> Iterator[None]:
         lock.__exit__(None, None, None)
 
 
-class _Note:
-    """Leaves a note of the progress now and then. A `training.run.TrainingProgress`."""
+class _Note(TrainingProgress):
+    """Leaves a note of the progress now and then."""
 
     def __init__(self, folder: SweepFolder, trial: Trial) -> None:
         self._folder, self._trial = folder, trial
@@ -126,6 +126,3 @@ class _Note:
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:  # noqa: ARG002
         """An evaluation is done."""
         self._success = evaluation.success_rate
-
-    def checkpointed(self, steps: int) -> None:
-        """A checkpoint lies on the disk."""

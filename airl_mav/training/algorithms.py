@@ -68,10 +68,7 @@ ON_POLICY_BATCH = 256
 ROLLOUT = 4096
 """Steps of all vehicles between two rounds of updates of `ppo` and `trpo`."""
 
-OPTION_DEFAULTS: dict[str, dict[str, Any]] = {
-    "ppo": {"n_epochs": 4, "ent_coef": 0.005},
-    "trpo": {},
-}
+OPTION_DEFAULTS: dict[str, dict[str, Any]] = {"ppo": {"n_epochs": 4, "ent_coef": 0.005}, "trpo": {}}
 """Defaults that differ from those of stable-baselines3."""
 
 

@@ -18,14 +18,7 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.policy.card import (
-    ONNX_FILE,
-    TORCH_FILE,
-    PolicyCard,
-    PolicyFacts,
-    digest,
-    write_card,
-)
+from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
 from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime
 
@@ -67,11 +60,6 @@ def layers(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> list[Layer]:
     with _hooked(module, note), torch.no_grad():
         module(*inputs)
     return found
-
-
-def count_macs(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
-    """Return the multiply-accumulates of one inference, in convolutions and dense layers."""
-    return sum(layer.macs for layer in layers(module, inputs))
 
 
 def count_parameters(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:

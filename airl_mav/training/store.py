@@ -59,6 +59,25 @@ class Evaluation:
         return self.success_rate, -(self.flight_time_s or 1e9)
 
 
+class TrainingProgress:
+    """Receives the progress of a training run; by itself it ignores it."""
+
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        """Called after each step of all vehicles.
+
+        Args:
+            steps: Decisions of all vehicles so far.
+            success: Share of the last recent episodes that reached the goal; None before one.
+            zone: Open curriculum zone; None without a curriculum.
+        """
+
+    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
+        """Called after an evaluation; `best`: better than all before it."""
+
+    def checkpointed(self, steps: int) -> None:
+        """Called when a checkpoint is on the disk."""
+
+
 class TrainingFolder:
     """A training run on disk; it can be read and resumed after a kill at any moment."""
 
