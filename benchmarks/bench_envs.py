@@ -64,7 +64,7 @@ def measure_ours() -> list[Result]:
     from airl_mav.camera.render import Mount
     from airl_mav.core.constants import TICK_S, TICK_US
     from airl_mav.envs.arenas import batch_of
-    from airl_mav.envs.camera import lens_of, look
+    from airl_mav.envs.cameras import lens_of, render_images
     from airl_mav.envs.fleet import Rules, Verdict, hover, new_fleet, vehicle_of
     from airl_mav.envs.flight import advance
     from airl_mav.profiles.arena import ArenaSpec
@@ -98,7 +98,9 @@ def measure_ours() -> list[Result]:
                 start = time.process_time()
                 advance(fleet, arenas, ticks, vehicle, rules)
                 if camera:
-                    look(fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images)
+                    render_images(
+                        fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images
+                    )
                 seconds += time.process_time() - start
             # Only what was flown counts: some touch an obstacle before the stretch is over.
             return float(fleet.time_us.sum()) / (TICK_US * ticks[0]), seconds

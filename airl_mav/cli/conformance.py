@@ -67,10 +67,7 @@ class ConformanceOptions(BaseModel):
 
 
 OPTIONS = ConformanceOptions
-RENAMED_OPTIONS = {
-    "--altitude": ("--altitude-m",),
-    "--connect-timeout": ("--connect-timeout-s",),
-}
+RENAMED_OPTIONS = {"--altitude": ("--altitude-m",), "--connect-timeout": ("--connect-timeout-s",)}
 EXTRAS = ()
 
 

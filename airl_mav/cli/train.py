@@ -7,7 +7,7 @@ import signal
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import BaseModel, Field
 from rich.console import Console
@@ -16,9 +16,7 @@ from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.loading import load_profile
-
-if TYPE_CHECKING:
-    from airl_mav.training.store import Evaluation
+from airl_mav.training.store import Evaluation, TrainingProgress
 
 
 class TrainOptions(BaseModel):
@@ -69,8 +67,7 @@ class TrainOptions(BaseModel):
         description="decisions of all vehicles together; by default the configuration's",
     )
     name: str | None = Field(
-        default=None,
-        description="name of the policy on its card; by default the configuration's",
+        default=None, description="name of the policy on its card; by default the configuration's"
     )
     resume: bool = Field(
         default=False,
@@ -146,7 +143,7 @@ def run(
     return 0
 
 
-class TrainingBar:
+class TrainingBar(TrainingProgress):
     """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
 
     def __init__(self, progress: RichProgress, steps: int) -> None:
@@ -167,6 +164,3 @@ class TrainingBar:
             f"{evaluation.steps:>11,} decisions {evaluation.seconds:7.0f} s  success "
             f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
         )
-
-    def checkpointed(self, steps: int) -> None:
-        """Print nothing."""

@@ -20,7 +20,6 @@ from airl_mav.conformance.vehicle import (
     RawSetpoint,
     SetpointStream,
     Vehicle,
-    raw_setpoints,
 )
 
 CLIMB_S = 60.0  # Longest take-off [s]
@@ -54,11 +53,12 @@ NORTH = RawSetpoint(vx=CRUISE_M_S)
 def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
     """Take off; expect landed_state ON_GROUND, TAKEOFF, IN_AIR, and the mode after it."""
     start_m, start_s = vehicle.height_m, vehicle.telemetry.boot_s
-    vehicle.call_or_fail(
+    vehicle.call(
         f"action.set_takeoff_altitude({altitude_m:g})",
         lambda: vehicle.action.set_takeoff_altitude(altitude_m),
+        must_succeed=True,
     )
-    vehicle.call_or_fail("action.takeoff()", vehicle.action.takeoff)
+    vehicle.call("action.takeoff()", vehicle.action.takeoff, must_succeed=True)
 
     def arrived() -> bool:
         climbed = vehicle.height_m - start_m > CLIMB_SHARE * altitude_m
@@ -80,7 +80,7 @@ def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
 def start_offboard(vehicle: Vehicle, setpoint: Setpoint) -> None:
     """Enter offboard by MAVSDK. Raises CheckFailedError when the mode does not come."""
     vehicle.fly(setpoint)
-    vehicle.call_or_fail("offboard.start()", vehicle.offboard.start)
+    vehicle.call("offboard.start()", vehicle.offboard.start, must_succeed=True)
     mode = vehicle.autopilot.offboard_mode
     if not vehicle.reaches_mode(mode):
         expected = vehicle.autopilot.mode_name(mode)
@@ -220,7 +220,7 @@ def _nan_velocity(stream: SetpointStream, vehicle: Vehicle) -> str:
 
 def _lose_setpoints(vehicle: Vehicle) -> str:
     telemetry = vehicle.telemetry
-    with raw_setpoints(vehicle, NORTH) as stream:
+    with SetpointStream(vehicle, NORTH) as stream:
         vehicle.wait(FLY_S / 4)
         _request_offboard(vehicle)
         vehicle.wait(2.0 * FLY_S)
@@ -231,7 +231,7 @@ def _lose_setpoints(vehicle: Vehicle) -> str:
         )
         stream.stop()
         since = len(telemetry.texts)
-        last_s, _ = vehicle.clock.sending_time()
+        last_s = vehicle.clock.sending_time()
         stream.send(NORTH)
     vehicle.transcript.add("sent", "the last setpoint")
     expected = vehicle.autopilot.loss
@@ -280,7 +280,7 @@ def _motion_after_loss(vehicle: Vehicle, cruise: float) -> str:
 
 
 def _resume_setpoints(vehicle: Vehicle) -> str:
-    with raw_setpoints(vehicle, NORTH):
+    with SetpointStream(vehicle, NORTH):
         vehicle.transcript.add("sent", "setpoints again")
         offboard = vehicle.reaches_mode(vehicle.autopilot.offboard_mode)
         vehicle.wait(FLY_S)
@@ -297,7 +297,7 @@ def hold(vehicle: Vehicle) -> str:
     """Leave offboard at 1 m/s; expect hold, a stop, and no drift."""
     start_offboard(vehicle, NORTH_NED)
     vehicle.wait(FLY_S)
-    vehicle.call_or_fail("offboard.stop()", vehicle.offboard.stop)
+    vehicle.call("offboard.stop()", vehicle.offboard.stop, must_succeed=True)
     autopilot = vehicle.autopilot
     if not vehicle.reaches_mode(*autopilot.hold_modes):
         expected = " or ".join(map(autopilot.mode_name, autopilot.hold_modes))
@@ -320,7 +320,7 @@ def _land(vehicle: Vehicle) -> str:
     telemetry = vehicle.telemetry
     before, start_s = len(telemetry.landed_states), telemetry.boot_s
     longest_s = max(vehicle.height_m, 0.0) / LANDING_M_S + LANDING_S
-    vehicle.call_or_fail("action.land()", vehicle.action.land)
+    vehicle.call("action.land()", vehicle.action.land, must_succeed=True)
     mode = vehicle.autopilot.land_mode
     right_mode = vehicle.reaches_mode(mode)
     if not vehicle.wait_for(lambda: vehicle.landed_state == LandedState.ON_GROUND, longest_s):

@@ -9,9 +9,8 @@ from typing import NamedTuple
 from pydantic import Field
 
 from airl_mav.conformance.checklist import CheckFailedError, require
-from airl_mav.conformance.step_response import StepResponse
-from airl_mav.conformance.steps import MeasuredStep, StepName
-from airl_mav.core.errors import UsageError
+from airl_mav.conformance.steps import MeasuredStep, StepName, StepResponse
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import list_profiles, load_profile
 
@@ -136,7 +135,6 @@ def load_reference(name: str, autopilot: int) -> Reference:
         if reference.autopilot == autopilot:
             return reference
     known = ", ".join(list_profiles("conformance"))
-    raise UsageError(
-        f"reference {AUTO}: nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: "
-        f"{known}, or a path to a .toml"
-    )
+    accepted = f"{known}, or a path to a .toml"
+    problem = f"nothing stored for HEARTBEAT.autopilot {autopilot}; accepted: {accepted}"
+    raise FieldError("reference", AUTO, problem=problem)

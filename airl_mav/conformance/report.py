@@ -10,8 +10,7 @@ from rich.text import Text
 from airl_mav.conformance.checklist import Line, Outcome
 from airl_mav.conformance.reference import JUDGED, Reference, StoredStep, deviations
 from airl_mav.conformance.result import ConformanceResult
-from airl_mav.conformance.step_response import StepResponse
-from airl_mav.conformance.steps import STEP_NAMES
+from airl_mav.conformance.steps import STEP_NAMES, StepResponse
 
 FIGURES: dict[str, tuple[str, float, int]] = {
     "latency_s": ("latency\nms", 1e3, 0),

@@ -9,8 +9,7 @@ from typing import Any
 
 from airl_mav.conformance.checklist import Check, Line, Outcome
 from airl_mav.conformance.reference import Reference
-from airl_mav.conformance.step_response import StepResponse
-from airl_mav.conformance.steps import STEP_NAMES, MeasuredStep, StepName
+from airl_mav.conformance.steps import STEP_NAMES, MeasuredStep, StepName, StepResponse
 from airl_mav.conformance.telemetry import Fields
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError, UsageError

@@ -19,7 +19,6 @@ from airl_mav.conformance.flight_checks import (
 from airl_mav.conformance.ground_checks import GROUND_CHECKS, heartbeat
 from airl_mav.conformance.reference import AUTO, judge, load_reference, summary
 from airl_mav.conformance.result import ConformanceResult, Settings
-from airl_mav.conformance.step_response import StepResponse
 from airl_mav.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
@@ -28,10 +27,11 @@ from airl_mav.conformance.steps import (
     Leg,
     MeasuredStep,
     StepName,
+    StepResponse,
     measure,
     plan,
 )
-from airl_mav.conformance.vehicle import Vehicle, raw_setpoints
+from airl_mav.conformance.vehicle import SetpointStream, Vehicle
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from companion.interfaces import LinkError
@@ -130,7 +130,7 @@ def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceRes
     if not settings.steps_only:
         checklist.perform_all(OFFBOARD_CHECKS, vehicle)
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
-        with raw_setpoints(vehicle, FACING_EAST) as stream:
+        with SetpointStream(vehicle, FACING_EAST) as stream:
             checklist.perform_all(setpoint_checks(stream), vehicle)
     if settings.steps:
         checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))
@@ -147,32 +147,32 @@ def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, Me
     steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
     start_offboard(vehicle, STOP_NED)
     vehicle.wait(FACE_NORTH_S)
-    inexact = 0
+    inexact = vehicle.clock.inexact
     for repetition in range(settings.repeat):
         for leg in plan(settings.steps, mirrored=repetition % 2 == 1):
-            response, exact = _fly_leg(vehicle, leg)
-            inexact += not exact
+            response = _fly_leg(vehicle, leg)
             if leg.step is not None and response is not None:
                 name = leg.step.name
                 vehicle.transcript.add("note", f"{name}: {summary(response)}")
                 measured.setdefault(name, MeasuredStep(steps[name], [])).flights.append(response)
+    inexact = vehicle.clock.inexact - inexact
     finding = f"{sum(len(each.flights) for each in measured.values())} steps"
     finding += f", timed by {vehicle.clock.method.value}"
     return finding + (f", {inexact} setpoints only by the newest telemetry" if inexact else "")
 
 
-def _fly_leg(vehicle: Vehicle, leg: Leg) -> tuple[StepResponse | None, bool]:
-    """Hold a setpoint for its time; return the response, and whether its time is exact."""
-    sent_s, exact = vehicle.fly(leg.setpoint)
+def _fly_leg(vehicle: Vehicle, leg: Leg) -> StepResponse | None:
+    """Hold a setpoint for its time; return the response to its step."""
+    sent_s = vehicle.fly(leg.setpoint)
     vehicle.wait(leg.seconds - (vehicle.telemetry.boot_s - sent_s))
     offboard = vehicle.mode == vehicle.autopilot.offboard_mode
     require(offboard, f"it left offboard: {vehicle.mode_name}")
     if leg.step is None:
-        return None, exact
+        return None
     motion = vehicle.telemetry.recent(leg.seconds + 2.0 * BEFORE_S)
     try:
         motion = motion.between(sent_s - BEFORE_S, sent_s + leg.seconds)
-        return measure(leg.step, motion, sent_s), exact
+        return measure(leg.step, motion, sent_s)
     except ValueError as error:
         raise CheckFailedError(f"{leg.step.name}: {error}") from None
 

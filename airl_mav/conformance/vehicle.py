@@ -10,8 +10,7 @@ import json
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from mavsdk import ComponentType
@@ -33,7 +32,7 @@ from airl_mav.conformance.mavlink_names import (
 from airl_mav.conformance.steps import Setpoint
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 from companion.interfaces import LinkError
 from companion.mavsdk_connection import first_autopilot, open_connection
 
@@ -86,10 +85,8 @@ class Vehicle:
         """Wait for a flight controller. Raises UsageError if none is heard in time [wall s]."""
         system = first_autopilot(self._mavsdk, timeout_s)
         if system is None:
-            raise UsageError(
-                f"--connect {self.url}: no flight controller heard in {timeout_s:g} s "
-                "(--connect-timeout-s)"
-            )
+            heard = f"no flight controller heard in {timeout_s:g} s (connect_timeout_s)"
+            raise FieldError("connect", self.url, problem=heard)
         self._target = system.get_system_id()
         self._direct = MavlinkDirect(system)
         for names, receive in (
@@ -104,9 +101,8 @@ class Vehicle:
         """Expect the behaviour of a HEARTBEAT.autopilot. Raises UsageError if it is not known."""
         if number not in AUTOPILOTS:
             known = ", ".join(f"{key} {each.title}" for key, each in AUTOPILOTS.items())
-            raise UsageError(
-                f"--connect {self.url}: HEARTBEAT.autopilot = {number}; accepted: {known}"
-            )
+            problem = f"HEARTBEAT.autopilot = {number}; accepted: {known}"
+            raise FieldError("connect", self.url, problem=problem)
         self.autopilot = AUTOPILOTS[number]
         self.telemetry.mode_name = self.autopilot.mode_name
 
@@ -119,8 +115,11 @@ class Vehicle:
 
     # --- commands
 
-    def call(self, what: str, call: Callable[[], Any]) -> str:
-        """Make a call into MAVSDK; return "" when it succeeded, else the result's name."""
+    def call(self, what: str, call: Callable[[], Any], *, must_succeed: bool = False) -> str:
+        """Make a call into MAVSDK; return "" when it succeeded, else the result's name.
+
+        Raises LinkError when it is refused and must succeed.
+        """
         self.transcript.add("sent", what)
         try:
             call()
@@ -128,13 +127,10 @@ class Vehicle:
             result = getattr(error, "result", None) or error.args[0]
             name = str(getattr(result, "name", result))
             self.transcript.add("heard", f"{what}: {name}")
+            if must_succeed:
+                raise LinkError(f"{what}: {name}") from None
             return name
         return ""
-
-    def call_or_fail(self, what: str, call: Callable[[], Any]) -> None:
-        """Make a call into MAVSDK. Raises LinkError when it is refused."""
-        if reason := self.call(what, call):
-            raise LinkError(f"{what}: {reason}")
 
     def command(self, number: int, *params: float, note: str = "") -> int:
         """Send a COMMAND_LONG, repeat it while it is not answered, and return its MAV_RESULT.
@@ -162,13 +158,13 @@ class Vehicle:
         flags = CUSTOM_MODE_FLAG | (ARMED_FLAG if self.armed else 0)
         return self.command(MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
-    def fly(self, setpoint: Setpoint) -> tuple[float, bool]:
+    def fly(self, setpoint: Setpoint) -> float:
         """Give MAVSDK a setpoint, which it sends at once and then repeats at 20 Hz.
 
         Returns:
-            When it reached the vehicle, by its clock [s], and whether from an exchange.
+            When it reached the vehicle, by its clock [s].
         """
-        reached: list[tuple[float, bool]] = []
+        reached: list[float] = []
 
         def send() -> None:
             reached.append(self.clock.sending_time())
@@ -178,10 +174,10 @@ class Vehicle:
                 self.offboard.set_velocity_body(VelocityBodyYawspeed(*setpoint[1:]))
 
         values = ", ".join(f"{value:g}" for value in setpoint[1:])
-        self.call_or_fail(f"set_velocity_{setpoint.frame}({values})", send)
-        (reached_s, exact), latest = reached[0], self.clock.exchange()
+        self.call(f"set_velocity_{setpoint.frame}({values})", send, must_succeed=True)
+        latest = self.clock.exchange()
         # A simulation may have stalled in between: it was not later than this second exchange.
-        return (reached_s if latest is None else min(reached_s, latest.boot_s)), exact
+        return reached[0] if latest is None else min(reached[0], latest.boot_s)
 
     def send(self, name: str, fields: dict[str, Any]) -> None:
         """Send a raw message; None in a field is NaN. Raises LinkError."""
@@ -298,13 +294,24 @@ class RawSetpoint(NamedTuple):
 
 
 class SetpointStream:
-    """Repeats the newest raw setpoint, and stops while heartbeats go on: MAVSDK's own cannot."""
+    """Repeats the newest raw setpoint until the context ends, or it is stopped.
+
+    It stops while heartbeats go on, which MAVSDK's own repetition cannot.
+    """
 
     def __init__(self, vehicle: Vehicle, setpoint: RawSetpoint) -> None:
         self._vehicle, self._setpoint = vehicle, setpoint
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="setpoints", daemon=True)
+
+    def __enter__(self) -> SetpointStream:
+        """Begin to send."""
         self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        self.stop()
 
     def send(self, setpoint: RawSetpoint) -> None:
         """Send another setpoint, now and from now on."""
@@ -333,13 +340,3 @@ class SetpointStream:
             # Missed setpoints are not made up for.
             due_us = max(due_us + int(STREAM_PERIOD_S * US_PER_S), clock.time_us())
             clock.sleep_until(due_us, self._stop)
-
-
-@contextmanager
-def raw_setpoints(vehicle: Vehicle, setpoint: RawSetpoint) -> Iterator[SetpointStream]:
-    """Repeat raw setpoints until the context ends, or they are stopped."""
-    stream = SetpointStream(vehicle, setpoint)
-    try:
-        yield stream
-    finally:
-        stream.stop()

@@ -61,6 +61,8 @@ class VehicleClock:
         """Time since boot [s], and when it was received [wall µs]."""
         self._answered = threading.Event()
         self.method = Method.TIMESYNC
+        self.inexact = 0
+        """How many sending times came from telemetry, for want of an answer."""
 
     def receive(self, message: Any, _: object) -> None:
         """Take a SYSTEM_TIME or TIMESYNC of MAVSDK's mavlink_direct."""
@@ -103,20 +105,18 @@ class VehicleClock:
         found = self.exchange()
         return self._telemetry.boot_s if found is None else found.boot_s
 
-    def sending_time(self) -> tuple[float, bool]:
-        """Return when a message that is sent right after this call reaches the vehicle.
+    def sending_time(self) -> float:
+        """Return when a message that is sent right after this call reaches the vehicle [s].
 
         It is asked before sending and not after: a call into MAVSDK sends at once, but returns only
         when Python's other threads let it.
-
-        Returns:
-            Time since boot [s], and whether it comes from an exchange rather than from telemetry.
         """
         newest_s, found = self._telemetry.boot_s, self.exchange()
         if found is None:
-            return newest_s, False
+            self.inexact += 1
+            return newest_s
         since_us = self.wall.time_us() - found.middle_us
-        return found.boot_s + since_us * self._speed / US_PER_S, True
+        return found.boot_s + since_us * self._speed / US_PER_S
 
     def _ask(self) -> Exchange | None:
         """Exchange once; None when there is no answer, or one by another clock."""

@@ -8,7 +8,7 @@ from airl_mav.envs.spec import Curriculum
 
 
 class CurriculumState:
-    """Which zone is open, and the outcomes that will open the next one.
+    """The open zone, and the outcomes that will open the next one.
 
     The window is a rolling one and must be full; it starts empty in every zone.
     """
@@ -32,10 +32,10 @@ class CurriculumState:
             self._outcomes.clear()
 
     def state(self) -> tuple[int, tuple[bool, ...]]:
-        """Return what `restore` takes."""
+        """Return zone and outcomes, for `restore`."""
         return self.zone, tuple(self._outcomes)
 
     def restore(self, zone: int, outcomes: tuple[bool, ...]) -> None:
-        """Go on from a saved state."""
+        """Restore a saved state."""
         self.zone = zone
         self._outcomes = deque(outcomes, maxlen=self._settings.window)

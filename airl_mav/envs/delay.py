@@ -1,4 +1,4 @@
-"""How late the decisions of an environment are, and how fast it may fly because of that."""
+"""Decision latency of an environment, and the speed limit that follows from it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 
 @dataclass(frozen=True)
 class SpeedBound:
-    """The safe velocity of an environment, and what went into it."""
+    """The safe velocity of an environment, and its inputs."""
 
     latency_s: float
     """T: frame exposed -> motors reflect it, at the longest t2 [s]."""
@@ -31,7 +31,7 @@ class SpeedBound:
         return min(self.asked_m_s, self.safe_velocity_m_s)
 
     def describe(self) -> str:
-        """Return one line for people, also where the bound changes nothing."""
+        """Return the bound in one line."""
         facts = (
             f"safe velocity {self.safe_velocity_m_s:.2f} m/s (latency {self.latency_s:.3f} s, "
             f"sensing distance {self.sensing_distance_m:g} m, "
@@ -40,11 +40,11 @@ class SpeedBound:
         if self.safe_velocity_m_s < self.asked_m_s:
             share = self.max_speed_m_s / self.asked_m_s
             return f"{facts}: actions scaled by {share:.3f}, from {self.asked_m_s:g} m/s"
-        return f"{facts}: above the fastest action, {self.asked_m_s:g} m/s: nothing is scaled"
+        return f"{facts}: above the fastest action, {self.asked_m_s:g} m/s: actions are not scaled"
 
 
 def injections_of(delay: Delay) -> tuple[Injection, ...]:
-    """Return where t2 comes from, one source or more. Raises UsageError for a wrong one."""
+    """Return the sources of t2. Raises UsageError for an invalid one."""
     if delay.latency:
         option = "environment.delay.latency"
         return tuple(parse_latency(source, option) for source in delay.latency)
@@ -52,7 +52,7 @@ def injections_of(delay: Delay) -> tuple[Injection, ...]:
 
 
 def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
-    """Return the safe velocity that an environment asks for; None: it asks for none.
+    """Return the safe velocity of an environment; None if it has no bound.
 
     The latency is the longest of all its sources, with transport and link.
 
@@ -81,7 +81,7 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
 
 
 def bounded(spec: EnvironmentSpec) -> EnvironmentSpec:
-    """Return an environment with its fastest action bounded by its safe velocity, if it asks.
+    """Return an environment with its fastest action bounded by its safe velocity, if it has one.
 
     Bounding again changes nothing. Raises UsageError as `speed_bound`.
     """

@@ -1,7 +1,7 @@
-"""What chance decides in an episode: every draw comes from the episode's own seed.
+"""Random draws of an episode, each from the episode's own seed.
 
-So an episode is the same whatever flies beside it, and however many do. Draws that a decision
-needs are made ahead, a block of decisions at a time.
+So an episode is the same however many fly beside it. Draws that a decision needs are made ahead, a
+block of decisions at a time.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.envs.estimation import N_ERRORS
-from airl_mav.envs.state import State, pack_generators, restore, take, unpack_generators
+from airl_mav.envs.saved_state import State, restore_array
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 
 BLOCK = 32
-"""Decisions whose draws are made at a time."""
+"""Number of decisions that are drawn at a time."""
 
 NOT_BEGUN = -1
 """Seed of a slot in which no episode has begun."""
@@ -46,7 +45,7 @@ class DelayDraws:
     def __init__(
         self, n: int, injections: Sequence[Injection], native_us: int, *, draw: int = 0
     ) -> None:
-        """Take where the latency comes from.
+        """Prepare n slots.
 
         Args:
             n: Number of slots.
@@ -89,47 +88,15 @@ class DelayDraws:
             self._blocks[i] += 1
 
     def get_state(self) -> State:
-        """Return what the draws are made again from."""
+        """Return the state from which the draws can be repeated."""
         return {"seeds": self._seeds.copy(), "blocks": self._blocks.copy()}
 
     def set_state(self, state: State) -> None:
-        """Draw again what a saved state had drawn. Raises UsageError when it does not fit."""
+        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
         seeds, blocks = self._seeds.copy(), self._blocks.copy()
-        restore(seeds, state, "seeds")
-        restore(blocks, state, "blocks")
+        restore_array(seeds, state, "seeds")
+        restore_array(blocks, state, "blocks")
         for i in np.flatnonzero(seeds != NOT_BEGUN):
             self.begin(int(i), int(seeds[i]))
             for _ in range(int(blocks[i])):
                 self._draw_block(int(i))
-
-
-class NormalDraws:
-    """Standard normal numbers of n episodes: as many as there are estimation errors a decision."""
-
-    def __init__(self, n: int) -> None:
-        self._rngs: list[np.random.Generator | None] = [None] * n
-        self._block = np.zeros((n, BLOCK, N_ERRORS))
-
-    def begin(self, i: int, seed: int) -> NDArray[np.float64]:
-        """Start the episode of slot i; return the numbers (N_ERRORS,) of its start."""
-        rng = stream(seed, Stream.ESTIMATION)
-        self._rngs[i], self._block[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
-        first: NDArray[np.float64] = self._block[i, 0]
-        return first
-
-    def take(self, decisions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return numbers (n, N_ERRORS) after each slot's 1st, 2nd, ... decision, one by one."""
-        for i in np.flatnonzero(decisions % BLOCK == 0):
-            rng = self._rngs[i]
-            if rng is not None:
-                self._block[i] = rng.standard_normal((BLOCK, N_ERRORS))
-        return self._block[np.arange(len(decisions)), decisions % BLOCK]
-
-    def get_state(self) -> State:
-        """Return what is drawn already, and where the generators stand."""
-        return {"block": self._block.copy(), "generators": pack_generators(self._rngs)}
-
-    def set_state(self, state: State) -> None:
-        """Go on from a saved state. Raises UsageError when it does not fit."""
-        restore(self._block, state, "block")
-        self._rngs = unpack_generators(take(state, "generators"))

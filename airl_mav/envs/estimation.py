@@ -1,12 +1,11 @@
-"""What the flight controller believes: the EKF's error as noise on the batch twin's true state.
+"""Estimation error: the EKF's error as noise on the batch twin's true state.
 
 Nine errors a vehicle: position NED [m], velocity NED [m/s], attitude as a turn about north, east
 and down [rad]. Each is a stationary first-order Gauss-Markov process of its own. In truth they are
 not quite that: where the magnetic field dips steeply, a tilt about north turns the heading with it;
 and attitude is worst in the first seconds, until an acceleration has shown the sensors' biases.
 
-Pure functions: the caller brings the random numbers, so that every episode draws from its own
-Generator.
+Every episode draws its random numbers from its own seed.
 """
 
 from __future__ import annotations
@@ -17,6 +16,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.envs.draws import BLOCK, Stream, stream
+from airl_mav.envs.saved_state import (
+    State,
+    join_states,
+    pack_generators,
+    restore_array,
+    saved_array,
+    state_of_part,
+    unpack_generators,
+)
+from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import Estimation
 
 N_ERRORS: Final = 9
@@ -35,9 +45,6 @@ GROUPS: Final[dict[str, tuple[str, tuple[int, ...]]]] = {
 """`Estimation` field of the standard deviation -> field of the time, and the errors they are of."""
 
 Array = NDArray[np.float64]
-
-_LAGS = 40  # of the autocorrelation, evenly spaced on a logarithmic scale
-_TIMES_S: Final = np.geomspace(0.02, 10_000.0, 4000)  # correlation times tried
 
 
 @dataclass(frozen=True)
@@ -93,60 +100,80 @@ def perturbed(
     return position + errors[..., POSITION], velocity + errors[..., VELOCITY], estimated
 
 
-def errors_between(
-    truth: tuple[Array, Array, Array], estimate: tuple[Array, Array, Array]
-) -> Array:
-    """Return the errors (..., 9) that turn `truth` into `estimate`; undoes `perturbed`.
-
-    Args:
-        truth: Position (..., 3), velocity (..., 3), quaternion (..., 4).
-        estimate: The same, as estimated.
-    """
-    turn = _multiply(estimate[2], truth[2] * np.array([1.0, -1.0, -1.0, -1.0]))
-    turn = turn * np.where(turn[..., :1] < 0.0, -1.0, 1.0)
-    sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, turn[..., :1])
-    vector = turn[..., 1:] * np.where(sine > 0.0, angle / np.where(sine > 0.0, sine, 1.0), 2.0)
-    return np.concatenate([estimate[0] - truth[0], estimate[1] - truth[1], vector], axis=-1)
-
-
-def autocorrelation(errors: Array, lag: int) -> Array:
-    """Return the correlation (9,) of errors (flights, samples, 9) with those `lag` samples on.
-
-    Their mean is taken as zero: what is constant over a flight is error too.
-    """
-    later = np.mean(errors[:, lag:] * errors[:, : errors.shape[1] - lag], axis=(0, 1))
-    power = np.mean(errors**2, axis=(0, 1))
-    result: Array = later / power
-    return result
-
-
-def fit(errors: Array, dt: float) -> Estimation:
-    """Return the model that describes recorded errors.
-
-    The standard deviation is their rms. The correlation time is the one whose exponential is
-    closest, in least squares, to their autocorrelation at lags up to half a flight.
-
-    Args:
-        errors: (flights, samples, 9).
-        dt: Between samples [s].
-    """
-    lags = np.unique(np.geomspace(1, errors.shape[1] // 2, _LAGS).astype(int))
-    found = np.array([autocorrelation(errors, int(lag)) for lag in lags])  # (lags, 9)
-    models = np.exp(-np.outer(lags * dt, 1.0 / _TIMES_S))  # (lags, times)
-    table: dict[str, float] = {}
-    for name, (time_name, group) in GROUPS.items():
-        columns = list(group)
-        table[name] = float(np.sqrt(np.mean(errors[..., columns] ** 2)))
-        measured = found[:, columns].mean(axis=1)
-        misfit = np.sum((models - measured[:, None]) ** 2, axis=0)
-        table[time_name] = float(_TIMES_S[np.argmin(misfit)])
-    return Estimation(**table)
-
-
 def _multiply(a: Array, b: Array) -> Array:
     """Return the Hamilton product a ⊗ b of quaternions (..., 4)."""
     w, v = a[..., :1], a[..., 1:]
     s, u = b[..., :1], b[..., 1:]
     scalar = w * s - np.sum(v * u, axis=-1, keepdims=True)
     return np.concatenate([scalar, w * u + s * v + np.cross(v, u)], axis=-1)
+
+
+class NormalDraws:
+    """Standard normal numbers of n episodes, `N_ERRORS` per decision."""
+
+    def __init__(self, n: int) -> None:
+        self._rngs: list[np.random.Generator | None] = [None] * n
+        self._block = np.zeros((n, BLOCK, N_ERRORS))
+
+    def begin(self, i: int, seed: int) -> NDArray[np.float64]:
+        """Start the episode of slot i; return the numbers (N_ERRORS,) of its start."""
+        rng = stream(seed, Stream.ESTIMATION)
+        self._rngs[i], self._block[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
+        first: NDArray[np.float64] = self._block[i, 0]
+        return first
+
+    def take(self, decisions: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return numbers (n, N_ERRORS) after each slot's 1st, 2nd, ... decision, one by one."""
+        for i in np.flatnonzero(decisions % BLOCK == 0):
+            rng = self._rngs[i]
+            if rng is not None:
+                self._block[i] = rng.standard_normal((BLOCK, N_ERRORS))
+        return self._block[np.arange(len(decisions)), decisions % BLOCK]
+
+    def get_state(self) -> State:
+        """Return the drawn block and the states of the generators."""
+        return {"block": self._block.copy(), "generators": pack_generators(self._rngs)}
+
+    def set_state(self, state: State) -> None:
+        """Restore a saved state. Raises UsageError if it does not fit."""
+        restore_array(self._block, state, "block")
+        self._rngs = unpack_generators(saved_array(state, "generators"))
+
+
+class Telemetry:
+    """Telemetry of n episodes: the truth with errors that change once a decision."""
+
+    def __init__(self, n: int, table: Estimation | None) -> None:
+        """Make n slots with the errors of a vehicle profile; None: no errors."""
+        self._model = None if table is None else EstimationError.from_profile(table)
+        self._errors = np.zeros((n, N_ERRORS))
+        self._normals = NormalDraws(n)
+
+    def begin(self, i: int, seed: int) -> None:
+        """Start the episode of slot i."""
+        if self._model is not None:
+            self._errors[i] = first_errors(self._model, self._normals.begin(i, seed))
+
+    def step(self, decisions: NDArray[np.int64], flown_s: NDArray[np.float64]) -> None:
+        """Step the errors after each slot's n-th decision (n,), which took `flown_s` (n,) [s]."""
+        if self._model is not None:
+            normals = self._normals.take(decisions)
+            self._errors = step_errors(self._model, self._errors, normals, flown_s)
+
+    def report(self, truth: Kinematics) -> Kinematics:
+        """Return the state of all n as telemetry reports it."""
+        if self._model is None:
+            return truth
+        return Kinematics(
+            *perturbed(truth.position, truth.velocity, truth.quaternion, self._errors)
+        )
+
+    def get_state(self) -> State:
+        """Return the present errors and the drawn numbers."""
+        errors = {"errors": self._errors.copy()}
+        return join_states({"now": errors, "normals": self._normals.get_state()})
+
+    def set_state(self, state: State) -> None:
+        """Restore a saved state. Raises UsageError if it does not fit."""
+        restore_array(self._errors, state_of_part(state, "now"), "errors")
+        self._normals.set_state(state_of_part(state, "normals"))

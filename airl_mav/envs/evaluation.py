@@ -24,7 +24,7 @@ Decide = Callable[[Encoded], NDArray[Any]]
 """From the observations of n vehicles to their n actions; must treat each one for itself."""
 
 SLOTS = 256
-"""Flights at a time."""
+"""Default number of flights at a time."""
 
 OUTCOMES = {
     Verdict.SUCCESS: Outcome.SUCCESS,
@@ -32,11 +32,11 @@ OUTCOMES = {
     Verdict.BATTERY: Outcome.BATTERY,
     Verdict.TIMEOUT: Outcome.TIMEOUT,
 }
-"""How a record calls the end of a flight of the batch twin."""
+"""The record's name of each verdict of the batch twin."""
 
 
 @dataclass(frozen=True)
-class Flown:
+class EpisodeResult:
     """How one episode went."""
 
     seed: int
@@ -48,7 +48,7 @@ class Flown:
 
 
 class Pilots(Protocol):
-    """Whoever decides for n vehicles, for each as if it were alone."""
+    """Decides for n vehicles, for each as if it were alone."""
 
     def begin(self, slot: int, seed: int) -> None:
         """An episode begins in a slot."""
@@ -58,17 +58,17 @@ class Pilots(Protocol):
         """Return the velocity commands (n, 3) as `action_sets.commands` does.
 
         Args:
-            seen: Of n vehicles.
-            flying: (n,) whose command will be flown.
+            seen: The observations of n vehicles.
+            flying: (n,) vehicles whose command will be flown.
         """
         ...
 
 
 class LearnedPilots:
-    """A network that decides for all at once."""
+    """A network that decides for all vehicles at once."""
 
     def __init__(self, policy: LearnedPolicy, chance: Callable[[int], np.random.Generator]) -> None:
-        """Take the policy; `chance` gives the source of random actions of an episode's seed."""
+        """Take the policy; `chance` returns the generator of random actions for a seed."""
         self._policy = policy
         self._chance = chance
         self._rngs: dict[int, np.random.Generator] = {}
@@ -100,10 +100,10 @@ class LearnedPilots:
 
 
 class SinglePilots:
-    """A policy object for each vehicle, new with each episode: for those with a memory."""
+    """One policy object per vehicle, new with each episode: for policies with a memory."""
 
     def __init__(self, make: Callable[[], Policy], max_speed_m_s: float) -> None:
-        """Take what makes a policy, and the speed that its actions are limited to [m/s]."""
+        """Take the policy's factory, and the speed limit of its actions [m/s]."""
         self._make = make
         self._max_speed_m_s = max_speed_m_s
         self._policies: dict[int, Policy] = {}
@@ -142,7 +142,7 @@ class _EncodedPilots:
         self._decide = decide
 
     def begin(self, slot: int, seed: int) -> None:
-        """Nothing is remembered."""
+        """Do nothing: the function has no memory."""
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:  # noqa: ARG002
         """Return the commands; see `Pilots`."""
@@ -157,7 +157,7 @@ def fly_episodes(
     *,
     slots: int = SLOTS,
     zone: int | None = None,
-) -> Iterator[Flown]:
+) -> Iterator[EpisodeResult]:
     """Fly one episode a seed and yield each as it ends, in the order in which they end.
 
     An episode's result depends on its seed alone, not on what flies beside it.
@@ -165,8 +165,8 @@ def fly_episodes(
     Args:
         spec: The environment.
         decide: The policy.
-        seeds: Of the episodes.
-        slots: Flights at a time.
+        seeds: Seeds of the episodes.
+        slots: Number of flights at a time.
         zone: Curriculum zone that bounds the goals; None is the largest.
     """
     if not seeds:
@@ -183,15 +183,15 @@ def fly_seeds(
     *,
     zone: int | None = None,
     stop: Callable[[], bool] = lambda: False,
-) -> Iterator[tuple[int, Flown]]:
+) -> Iterator[tuple[int, EpisodeResult]]:
     """Fly one episode a seed and yield slot and result of each as it ends.
 
     The slot shows the flight's end until the next item is asked for.
 
     Args:
         navigation: No more slots than seeds.
-        pilots: Who decides.
-        seeds: Of the episodes.
+        pilots: Decides.
+        seeds: Seeds of the episodes.
         zone: Curriculum zone that bounds the goals; None is the largest.
         stop: Asked before each decision; True leaves the flights in the air unfinished.
     """
@@ -218,7 +218,7 @@ def fly_seeds(
             busy[i] = False
             yield (
                 i,
-                Flown(
+                EpisodeResult(
                     seed=int(navigation.seeds[i]),
                     verdict=Verdict(int(now.verdict[i])),
                     flight_time_s=float(now.time_s[i]),
@@ -231,6 +231,6 @@ def fly_seeds(
             begin(ended[: len(waiting)])
 
 
-def success_rate(flown: Sequence[Flown]) -> float:
+def success_rate(flown: Sequence[EpisodeResult]) -> float:
     """Return the share of the episodes that reached the goal."""
     return sum(each.verdict == Verdict.SUCCESS for each in flown) / len(flown)

@@ -13,10 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.cascade import (
-    new_memory,
-    trim_for_hover,
-)
+from airl_mav.control.cascade import new_memory, trim_for_hover
 from airl_mav.control.gains import Gains
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.envs.contact import NOTHING

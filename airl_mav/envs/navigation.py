@@ -23,24 +23,19 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of, put_arena
+from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws, Stream, stream
-from airl_mav.envs.exposure import Cameras
+from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.randomise import draw_airframe
+from airl_mav.envs.saved_state import State, join_states, restore_array, saved_array, state_of_part
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.state import State, join, part_of, restore, take
-from airl_mav.envs.telemetry import Telemetry
 from airl_mav.envs.trace import Trace
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
-from airl_mav.policy.layouts import (
-    Encoded,
-    ObservationSpec,
-    camera_mismatch,
-    encode_layout,
-)
+from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -50,7 +45,7 @@ from airl_mav.profiles.vehicle import Camera, VehicleProfile, load_vehicle
 
 @dataclass(frozen=True)
 class Flights:
-    """How n flights stand; arrays (n,)."""
+    """Status of n flights; arrays (n,)."""
 
     verdict: NDArray[np.int64]
     """`fleet.Verdict`."""
@@ -69,7 +64,7 @@ class Flights:
 
 
 class Navigation:
-    """N vehicles, each flying to its goal. Slots are begun and flown; nothing resets by itself."""
+    """N vehicles, each flying to its goal. No slot resets by itself."""
 
     def __init__(
         self,
@@ -83,16 +78,16 @@ class Navigation:
         arena_seed: int | None = None,
         trace: Trace | None = None,
     ) -> None:
-        """Load what the environment is made of.
+        """Load the profiles.
 
         Args:
             spec: The environment.
             n: Number of vehicles.
             vehicle: The profile that `spec` names, where it has been loaded; None: it is loaded.
             arena: The same of the arena.
-            injection: Where t2 comes from; None: what `spec.delay` says.
-            latency_draw: 0, or another number for other draws of the same latency.
-            arena_seed: Of the arena and goal of all episodes; None: each one's own seed.
+            injection: Source of t2; None: that of `spec.delay`.
+            latency_draw: Another number gives other draws of the same latency.
+            arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
             trace: Records the flights; None records nothing, and changes nothing.
 
         Raises:
@@ -160,7 +155,7 @@ class Navigation:
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
             who[i] = True
-        self._look(who)
+        self._capture(who)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         arena = self._arena(seed, zone)
@@ -168,7 +163,7 @@ class Navigation:
         try:
             put_arena(self._batch, i, arena)
         except (ValueError, IndexError):
-            # More room: at the start, and when an arena comes that is fuller than all before.
+            # The arena is larger than all before: make room.
             self._batch = batch_of([a if a is not None else arena for a in self.arenas])
         randomisation = self.spec.randomisation
         airframe = draw_airframe(
@@ -186,19 +181,19 @@ class Navigation:
         self._cameras.begin(i, seed)
 
     def see(self) -> Observation:
-        """Return what all n vehicles sense now, with a leading axis (n,)."""
+        """Return the present observations of all vehicles, with a leading axis (n,)."""
         return observe(self._cameras.image, self.intrinsics, self.kinematics(), self._batch.goal)
 
     def observe(self) -> Encoded:
-        """Return what all n policies see now, in the environment's layout."""
+        """Return the present observations of all vehicles in the environment's layout."""
         return encode_layout(self.observation, self.see())
 
     def kinematics(self) -> Kinematics:
         """Return the state of all n as telemetry reports it: with the estimator's error."""
-        return self._telemetry.tell(self.truth())
+        return self._telemetry.report(self.truth())
 
     def flights(self) -> Flights:
-        """Return how all n flights stand."""
+        """Return the status of all flights."""
         fleet = self._fleet
         to_goal = self._batch.goal - fleet.position[:, :2]
         return Flights(
@@ -218,7 +213,7 @@ class Navigation:
         return Kinematics(fleet.position.copy(), fleet.velocity.copy(), fleet.quaternion.copy())
 
     def fly(self, commands: NDArray[np.float64]) -> None:
-        """Fly one decision of every flight that goes on.
+        """Fly one decision of every flight that has not ended.
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s].
@@ -241,7 +236,7 @@ class Navigation:
         left = sent + self._hold_us // TICK_US - accepted
         age = np.minimum(_ticks(self._cameras.age_us(self._fleet.time_us + left * TICK_US)), left)
         self._advance(left - age)
-        self._look(self._fleet.verdict >= 0)
+        self._capture(self._fleet.verdict >= 0)
         self._advance(age)
         self._decision += 1
         self._telemetry.step(self._decision, (self._fleet.time_us - began_us) / US_PER_S)
@@ -249,11 +244,11 @@ class Navigation:
             self._trace.decided(self._fleet, t2_us, self._transport_us, self._link_us)
 
     def get_state(self) -> State:
-        """Return all that the future depends on, as copies."""
+        """Return the whole state, as copies."""
         own = {key: array.copy() for key, array in self._arrays().items()}
         own["begun"] = np.array([arena is not None for arena in self.arenas])
         fleet = {key: array.copy() for key, array in self._fleet._asdict().items()}
-        return join(
+        return join_states(
             {
                 "navigation": own,
                 "fleet": fleet,
@@ -264,22 +259,24 @@ class Navigation:
         )
 
     def set_state(self, state: State) -> None:
-        """Go on from a saved state; arenas are made anew from their seeds.
+        """Restore a saved state; arenas are generated again from their seeds.
 
         Raises:
             UsageError: It is not one of this environment.
         """
-        own, fleet = part_of(state, "navigation"), part_of(state, "fleet")
+        own, fleet = state_of_part(state, "navigation"), state_of_part(state, "fleet")
         for key, array in self._arrays().items():
-            restore(array, own, key)
+            restore_array(array, own, key)
         for key, array in self._fleet._asdict().items():
-            restore(array, fleet, key)
-        self._delays.set_state(part_of(state, "delays"))
-        self._telemetry.set_state(part_of(state, "telemetry"))
-        self._cameras.set_state(part_of(state, "cameras"))
+            restore_array(array, fleet, key)
+        self._delays.set_state(state_of_part(state, "delays"))
+        self._telemetry.set_state(state_of_part(state, "telemetry"))
+        self._cameras.set_state(state_of_part(state, "cameras"))
         self.arenas = [
             self._arena(int(seed), None if zone < 0 else int(zone)) if begun else None
-            for seed, zone, begun in zip(self.seeds, self.zones, take(own, "begun"), strict=True)
+            for seed, zone, begun in zip(
+                self.seeds, self.zones, saved_array(own, "begun"), strict=True
+            )
         ]
         spare = next((arena for arena in self.arenas if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.arenas]
@@ -304,7 +301,7 @@ class Navigation:
         )
 
     def _wait(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:
-        """Fly on the last setpoint from one tick to another; it may run out on the way."""
+        """Fly on the last setpoint from one tick to another; it may expire in between."""
         if self._hover_us is None:
             self._advance(end - start)
             return
@@ -335,7 +332,7 @@ class Navigation:
             )
 
     def _advance(self, ticks: NDArray[np.int64]) -> None:
-        """Let time pass: the only place where it does."""
+        """Advance all flights by ticks (n,); the only place where time passes."""
         if self._trace is not None:
             self._trace.advance(self._fleet, ticks, self._fly)
         else:
@@ -344,10 +341,10 @@ class Navigation:
     def _fly(self, ticks: NDArray[np.int64]) -> None:
         advance(self._fleet, self._batch, ticks, self._vehicle, self._rules)
 
-    def _look(self, who: NDArray[np.bool_]) -> None:
+    def _capture(self, who: NDArray[np.bool_]) -> None:
         if self._trace is not None:
-            self._trace.looked(self._fleet, who)
-        self._cameras.look(self._fleet, self._batch, who)
+            self._trace.captured(self._fleet, who)
+        self._cameras.capture(self._fleet, self._batch, who)
 
 
 def _ticks(time_us: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -21,42 +21,42 @@ PROGRESS_1_M = 0.02
 """`shaped`: per metre of progress towards the goal; 50 m of it are worth as much as the goal."""
 
 DECISION_COST = 0.005
-"""`shaped`: of every decision, so that the sooner is the better."""
+"""`shaped`: cost of every decision, so that faster is better."""
 
 PAPER_BONUS = 1000.0
 
 
 @dataclass(frozen=True)
-class Happened:
-    """What a decision led to, of n vehicles."""
+class DecisionOutcome:
+    """Outcome of a decision of n vehicles."""
 
     success: NDArray[np.bool_]
     failure: NDArray[np.bool_]
-    """Collision or empty battery; running out of time is none."""
+    """Collision or empty battery; a timeout is no failure."""
     distance_before_m: NDArray[np.float64]
     """Horizontal distance to the goal at the decision."""
     distance_m: NDArray[np.float64]
-    """... and at its end."""
+    """Horizontal distance to the goal at its end."""
     speed_m_s: NDArray[np.float64]
     """Three-dimensional speed at its end."""
     hold_s: float
     """How long an action is held."""
 
 
-def rewards(name: RewardName, happened: Happened) -> NDArray[np.float64]:
+def rewards(name: RewardName, decision: DecisionOutcome) -> NDArray[np.float64]:
     """Return the rewards (n,)."""
     if name == "shaped":
-        return _shaped(happened)
-    paper = _paper(happened)
+        return _shaped(decision)
+    paper = _paper(decision)
     return paper / PAPER_BONUS if name == "paper-scaled" else paper
 
 
-def _shaped(h: Happened) -> NDArray[np.float64]:
+def _shaped(h: DecisionOutcome) -> NDArray[np.float64]:
     ended = h.success.astype(np.float64) - h.failure
     return ended + PROGRESS_1_M * (h.distance_before_m - h.distance_m) - DECISION_COST
 
 
-def _paper(h: Happened) -> NDArray[np.float64]:
+def _paper(h: DecisionOutcome) -> NDArray[np.float64]:
     """Return r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
 
     a: goal reached, b: collision, D_g: distance to the goal, D_c = (V_max - V_now) t_max with

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
-from airl_mav.envs.state import State, join, part_of, restore
+from airl_mav.envs.saved_state import State, join_states, restore_array, state_of_part
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.layouts import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
-"""What of an episode's info goes into SB3's `episode` info, beside return, length and time."""
+"""Keys of `info` that go into SB3's `episode` info, beside return, length and time."""
 
 
 class NavigationVecEnv(VecEnv):
@@ -34,7 +34,7 @@ class NavigationVecEnv(VecEnv):
         self._length = np.zeros(env.num_envs, np.int64)
 
     def reset(self) -> Encoded:
-        """Begin n episodes; `seed()` and `set_options()` before it say which."""
+        """Begin n episodes, as `seed()` and `set_options()` have set."""
         seed = next((s for s in self._seeds if s is not None), None)
         observation, _ = self.env.reset(seed=seed, options=self._options[0])
         self._reset_seeds()
@@ -69,24 +69,24 @@ class NavigationVecEnv(VecEnv):
         return seen, reward.astype(np.float32), done, infos
 
     def observe(self) -> Encoded:
-        """Return what all see now, as the last step or reset did: to go on after `set_state`."""
+        """Return the present observations, to continue after `set_state`."""
         return self.env.navigation.observe()
 
     def get_state(self) -> State:
-        """Return everything that the future depends on: arrays for a checkpoint."""
+        """Return the whole state as arrays for a checkpoint."""
         own = {"return": self._return.copy(), "length": self._length.copy()}
-        return join({"vector": self.env.get_state(), "adapter": own})
+        return join_states({"vector": self.env.get_state(), "adapter": own})
 
     def set_state(self, state: State) -> None:
-        """Go on from a saved state: the next step is as it would have been.
+        """Restore a saved state: the next step is as it would have been.
 
         Raises:
             UsageError: It is of another environment.
         """
-        self.env.set_state(part_of(state, "vector"))
-        own = part_of(state, "adapter")
-        restore(self._return, own, "return")
-        restore(self._length, own, "length")
+        self.env.set_state(state_of_part(state, "vector"))
+        own = state_of_part(state, "adapter")
+        restore_array(self._return, own, "return")
+        restore_array(self._length, own, "length")
 
     def close(self) -> None:
         """Nothing to release."""
@@ -109,7 +109,7 @@ class NavigationVecEnv(VecEnv):
         return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return whether a wrapper's work is done: that of Monitor is, there are no others."""
+        """Return whether a wrapper's job is done: only Monitor's is."""
         return [wrapper_class is Monitor] * len(list(self._get_indices(indices)))
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:

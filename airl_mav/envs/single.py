@@ -15,15 +15,16 @@ from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.picture import Picture, View, Window
+from airl_mav.envs.rendering import EpisodeRenderer, Snapshot, Window
 from airl_mav.envs.rewards import rewards
-from airl_mav.envs.spaces import action_space, observation_space
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.vector import (
+    action_space,
     curriculum_of,
+    decision_outcome,
     draw_seeds,
     endings,
-    happened,
+    observation_space,
     open_zone,
     outcome,
     quality,
@@ -45,11 +46,7 @@ class NavigationEnv(gym.Env[Encoded, Any]):
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 2}  # noqa: RUF012
 
     def __init__(
-        self,
-        spec: EnvironmentSpec | None = None,
-        *,
-        render_mode: str | None = None,
-        **knobs: Any,
+        self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
     ) -> None:
         """Make the environment.
 
@@ -77,7 +74,7 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         self._before: Flights | None = None
         self._depth = np.zeros((0, 0), np.uint8)
         self._trail: list[NDArray[np.float64]] = []
-        self._picture: Picture | None = None
+        self._renderer: EpisodeRenderer | None = None
         self._window = Window(fps) if render_mode == "human" else None
 
     def reset(
@@ -102,8 +99,8 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         self.navigation.begin([0], [episode], open_zone(self._zone, self.curriculum))
         self._before = self.navigation.flights()
         self._trail = []
-        if self._picture is not None:
-            self._picture.begin(self._arena())
+        if self._renderer is not None:
+            self._renderer.begin(self._arena())
         return self._observe(), self._info(self._before)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
@@ -115,7 +112,7 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         spec, navigation = self.environment, self.navigation
         navigation.fly(commands(spec.action_spec, np.asarray(action)[None]))
         now = navigation.flights()
-        reward = rewards(spec.reward, happened(self._before, now, spec))
+        reward = rewards(spec.reward, decision_outcome(self._before, now, spec))
         terminated, truncated = endings(now)
         self._before = now
         info = self._info(now)
@@ -150,14 +147,14 @@ class NavigationEnv(gym.Env[Encoded, Any]):
 
     def _frame(self) -> NDArray[np.uint8]:
         now, truth = self.navigation.flights(), self.navigation.truth()
-        if self._picture is None:
+        if self._renderer is None:
             spec = self.environment
-            self._picture = Picture(
+            self._renderer = EpisodeRenderer(
                 spec.episode.goal_radius_m, (spec.image_height_px, spec.image_width_px)
             )
-            self._picture.begin(self._arena())
-        return self._picture.draw(
-            View(
+            self._renderer.begin(self._arena())
+        return self._renderer.draw(
+            Snapshot(
                 time_us=round(now.time_s[0] * US_PER_S),
                 position=truth.position[0],
                 yaw=float(quat_yaw(truth.quaternion[0])),

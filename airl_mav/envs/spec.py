@@ -1,4 +1,4 @@
-"""What an environment is made of: the knobs of `airl/Navigation-v0` and of a training config."""
+"""Specification of an environment: arguments of `airl/Navigation-v0`, table of a training file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from airl_mav.profiles.arena import Each
 
 
 class EpisodeRules(ProfileModel):
-    """When an episode ends, and how often the policy decides."""
+    """Rules of an episode and the decision period."""
 
     goal_radius_m: float = quantity(
         "the goal is reached closer than this, seen from above",
@@ -48,7 +48,7 @@ class EpisodeRules(ProfileModel):
 
 
 class CameraChange(ProfileModel):
-    """Another camera than the vehicle's; what is left out stays as it is."""
+    """Changes to the vehicle's camera; what is left out stays as it is."""
 
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
     height_px: int | None = quantity("image height", "px", ge=6, le=480, default=None)
@@ -59,7 +59,7 @@ class CameraChange(ProfileModel):
 
 
 class Delay(ProfileModel):
-    """How late decisions are: the stages of docs/architecture.md, in simulated time."""
+    """Decision latency: the stages of docs/architecture.md, in simulated time."""
 
     computer: str = Field(default="workstation", description="computer profile to fly as")
     workload: str | None = Field(
@@ -117,7 +117,7 @@ class SafeVelocity(ProfileModel):
 
 
 class Randomisation(ProfileModel):
-    """What is drawn anew with every episode, around the profile's value; 0 leaves it alone."""
+    """Domain randomisation, drawn with every episode around the profile's value; 0 is none."""
 
     mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
     thrust: float = quantity("greatest thrust, +- this share", "1", ge=0, le=0.9, default=0.0)
@@ -155,7 +155,7 @@ class Curriculum(ProfileModel):
 
 
 class EnvironmentSpec(ProfileModel):
-    """The environment: what flies where, what is seen, done, rewarded and randomised."""
+    """An environment: vehicle, arena, observation, actions, reward, latency, randomisation."""
 
     vehicle: str = Field(default="quad", description="vehicle profile")
     arena: str = Field(default="static-obstacles", description="arena profile")
@@ -194,7 +194,7 @@ class EnvironmentSpec(ProfileModel):
 
 
 def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:
-    """Return the specification, or make it of knobs: its fields, nested tables as dicts.
+    """Return the specification, or make it from its fields, nested tables as dicts.
 
     Raises:
         UsageError: A knob is unknown, of the wrong type or out of range, or both are given.

@@ -1,4 +1,4 @@
-"""What a flight of the batch twin leaves behind: its path at 50 Hz, the stamps of its decisions.
+"""Record of a batch twin's flight: its path at 50 Hz and the stamps of its decisions.
 
 The files are those of a rehearsal (docs/run-folder.md), so that one report serves all levels.
 """
@@ -79,12 +79,9 @@ class Trace:
         self._take(fleet, np.array([i]))
 
     def advance(
-        self,
-        fleet: Fleet,
-        ticks: NDArray[np.int64],
-        fly: Callable[[NDArray[np.int64]], None],
+        self, fleet: Fleet, ticks: NDArray[np.int64], fly: Callable[[NDArray[np.int64]], None]
     ) -> None:
-        """Let time pass in steps that end on the samples.
+        """Advance all flights in steps that end on the samples.
 
         Args:
             fleet: Read after each step.
@@ -112,7 +109,7 @@ class Trace:
         self._samples.append(who, np.column_stack([now, *state, mean_w]))
         self._sampled_us[who], self._sampled_j[who] = now, fleet.energy[who]
 
-    def looked(self, fleet: Fleet, who: NDArray[np.bool_]) -> None:
+    def captured(self, fleet: Fleet, who: NDArray[np.bool_]) -> None:
         """Note that the cameras of `who` (n,) have just taken their frames."""
         self._capture_us[who] = fleet.time_us[who]
 

@@ -16,30 +16,32 @@ from airl_mav.envs.curriculum import CurriculumState
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.rewards import Happened, rewards
-from airl_mav.envs.spaces import action_space, observation_space
-from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.state import (
+from airl_mav.envs.rewards import DecisionOutcome, rewards
+from airl_mav.envs.saved_state import (
     State,
-    join,
+    join_states,
     pack,
     pack_generators,
-    part_of,
-    take,
+    saved_array,
+    state_of_part,
     unpack,
     unpack_generators,
 )
-from airl_mav.policy.action_sets import commands
-from airl_mav.policy.layouts import Encoded
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
+from airl_mav.policy.layouts import Encoded, ObservationSpec, boxes
 
 FIRST_TRAINING_SEED = 1_000_000
 """Episodes that draw their own seed draw it from here on: those below are for evaluation."""
 
 LAST_TRAINING_SEED = 2**31
 
+UNBOUNDED = 1e6
+"""Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
+
 
 class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
-    """N flights that begin anew in the very step they end in (Gymnasium's SAME_STEP).
+    """N flights that reset in the step in which they end (Gymnasium's SAME_STEP).
 
     `info` is what Gymnasium's SyncVectorEnv makes of n `NavigationEnv`: `seed`, `zone`,
     `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m` of the episodes that go on; in
@@ -131,7 +133,9 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
         navigation = self.navigation
         navigation.fly(commands(self.environment.action_spec, actions))
         now = navigation.flights()
-        reward = rewards(self.environment.reward, happened(self._before, now, self.environment))
+        reward = rewards(
+            self.environment.reward, decision_outcome(self._before, now, self.environment)
+        )
         seen = navigation.observe()
         terminated, truncated = endings(now)
         ended = terminated | truncated
@@ -144,7 +148,7 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
         return seen, reward, terminated, truncated, _masked(quality(navigation, now)) | final
 
     def _begin_anew(self, slots: NDArray[np.int64], ended: Flights) -> Encoded:
-        """Begin the next episodes of `slots`; return what all see now."""
+        """Begin the next episodes of `slots`; return all present observations."""
         if self.curriculum is not None:
             for i in slots:
                 success = bool(ended.verdict[i] == Verdict.SUCCESS)
@@ -157,7 +161,7 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
         return open_zone(self._zone, self.curriculum)
 
     def get_state(self) -> State:
-        """Return everything that the future depends on: arrays for a checkpoint."""
+        """Return the whole state as arrays for a checkpoint."""
         curriculum = None if self.curriculum is None else self.curriculum.state()
         own = {
             "spec": pack(self.environment.model_dump(mode="json")),
@@ -166,29 +170,48 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
             "curriculum": pack(curriculum),
             "generator": pack_generators([self._np_random]),
         }
-        return join({"env": own, "flights": self.navigation.get_state()})
+        return join_states({"env": own, "flights": self.navigation.get_state()})
 
     def set_state(self, state: State) -> None:
-        """Go on from a saved state: the next step is as it would have been.
+        """Restore a saved state: the next step is as it would have been.
 
         Raises:
             UsageError: It is of another environment.
         """
-        own = part_of(state, "env")
-        self._check_same(unpack(take(own, "spec")))
-        self.navigation.set_state(part_of(state, "flights"))
-        self._zone = unpack(take(own, "zone"))
-        (self._np_random,) = unpack_generators(take(own, "generator"))
-        curriculum = unpack(take(own, "curriculum"))
+        own = state_of_part(state, "env")
+        self._check_same(unpack(saved_array(own, "spec")))
+        self.navigation.set_state(state_of_part(state, "flights"))
+        self._zone = unpack(saved_array(own, "zone"))
+        (self._np_random,) = unpack_generators(saved_array(own, "generator"))
+        curriculum = unpack(saved_array(own, "curriculum"))
         if self.curriculum is not None:
             self.curriculum.restore(curriculum[0], tuple(curriculum[1]))
-        self._before = self.navigation.flights() if take(own, "started") else None
+        self._before = self.navigation.flights() if saved_array(own, "started") else None
 
     def _check_same(self, theirs: dict[str, Any]) -> None:
         ours = self.environment.model_dump(mode="json")
         changed = [key for key in ours if theirs.get(key) != ours[key]]
         if changed:
             raise UsageError(f"state: of an environment with another {', '.join(changed)}")
+
+
+def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:
+    """Return the Dict space of a layout."""
+    arrays: dict[str, gym.Space[Any]] = {
+        key: gym.spaces.Box(
+            max(box.low, -UNBOUNDED), min(box.high, UNBOUNDED), box.shape, box.dtype
+        )
+        for key, box in boxes(spec).items()
+    }
+    return gym.spaces.Dict(arrays)
+
+
+def action_space(spec: ActionSpec) -> gym.Space[Any]:
+    """Return Discrete(25), or Box(-1, 1, (2,)) of the continuous set."""
+    number = discrete_actions(spec)
+    if number is not None:
+        return gym.spaces.Discrete(number)
+    return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 def curriculum_of(navigation: Navigation) -> CurriculumState | None:
@@ -227,9 +250,9 @@ def endings(now: Flights) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     return (now.verdict != Verdict.FLYING) & ~truncated, truncated
 
 
-def happened(before: Flights, now: Flights, spec: EnvironmentSpec) -> Happened:
-    """Return what the rewards look at."""
-    return Happened(
+def decision_outcome(before: Flights, now: Flights, spec: EnvironmentSpec) -> DecisionOutcome:
+    """Return what the rewards depend on."""
+    return DecisionOutcome(
         success=now.verdict == Verdict.SUCCESS,
         failure=(now.verdict == Verdict.COLLISION) | (now.verdict == Verdict.BATTERY),
         distance_before_m=before.goal_distance_m,
@@ -240,7 +263,7 @@ def happened(before: Flights, now: Flights, spec: EnvironmentSpec) -> Happened:
 
 
 def quality(navigation: Navigation, flights: Flights) -> dict[str, NDArray[Any]]:
-    """Return what `info` says of every flight: which episode it is, and its quality so far."""
+    """Return `info` of every flight: its seed, zone and quality so far."""
     return {
         "seed": navigation.seeds.copy(),
         "zone": navigation.zones.copy(),
@@ -252,7 +275,7 @@ def quality(navigation: Navigation, flights: Flights) -> dict[str, NDArray[Any]]
 
 
 def outcome(flights: Flights, i: int) -> dict[str, Any]:
-    """Return what `info` says in addition of a flight that has ended."""
+    """Return what `info` has in addition for a flight that has ended."""
     verdict = Verdict(int(flights.verdict[i]))
     return {"success": verdict == Verdict.SUCCESS, "outcome": verdict.name.lower()}
 

@@ -12,7 +12,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.contact import FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
-    Flown,
+    EpisodeResult,
     LearnedPilots,
     Pilots,
     SinglePilots,
@@ -114,7 +114,7 @@ class GymFlier:
         return fly
 
     def _episode(
-        self, navigation: Navigation, trace: Trace, slot: int, flown: Flown, index: int
+        self, navigation: Navigation, trace: Trace, slot: int, flown: EpisodeResult, index: int
     ) -> FlownEpisode:
         """Return the flight whose end its slot still shows."""
         arena, rules = navigation.arenas[slot], navigation.spec.episode

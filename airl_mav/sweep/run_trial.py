@@ -14,7 +14,7 @@ import numpy as np
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.evaluation import SLOTS, Flown, LearnedPilots, fly_seeds
+from airl_mav.envs.evaluation import SLOTS, EpisodeResult, LearnedPilots, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.policy.learned import load_learned
 from airl_mav.sweep.store import SweepFolder, TrainingProgress
@@ -22,6 +22,7 @@ from airl_mav.sweep.trial import Trained, Trial, TrialResult, result_of, size_of
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import export_best, fit, nominal
 from airl_mav.training.store import CONFIG_FILE, Evaluation, TrainingFolder
+from airl_mav.training.store import TrainingProgress as TrainingListener
 
 NOTE_US = 2 * US_PER_S
 """How often a training says how far it is [wall µs]."""
@@ -65,7 +66,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
     return result
 
 
-def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[Flown]:
+def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[EpisodeResult]:
     """Fly the exported policy of a training as `airl evaluate` would, at level gym."""
     policy = load_learned(training.policy)
     navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))
@@ -93,8 +94,8 @@ def _held(training: TrainingFolder) -> Iterator[None]:
         lock.__exit__(None, None, None)
 
 
-class _Watcher:
-    """Leaves a note of the progress now and then. A `training.run.TrainingProgress`."""
+class _Watcher(TrainingListener):
+    """Leaves a note of the progress now and then."""
 
     def __init__(self, folder: SweepFolder, trial: Trial) -> None:
         self._folder, self._trial = folder, trial
@@ -111,6 +112,3 @@ class _Watcher:
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:  # noqa: ARG002
         """An evaluation is done."""
         self._success = evaluation.success_rate
-
-    def checkpointed(self, steps: int) -> None:
-        """A checkpoint lies on the disk."""

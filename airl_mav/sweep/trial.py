@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from airl_mav.envs.evaluation import OUTCOMES, Flown
+from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
 from airl_mav.policy.template import Size, template_size
@@ -126,7 +126,7 @@ class TrialResult:
 
 
 def result_of(
-    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[Flown]
+    trial: Trial, parameters: int, macs: int, trained: Trained, flown: Sequence[EpisodeResult]
 ) -> TrialResult:
     """Return the figures of a trial's flights, at least one."""
     # Flights end in an order of their own: sums must not depend on it.

@@ -32,7 +32,7 @@ CLASSES = {
     "tqc": "sb3_contrib.TQC",
     "trpo": "sb3_contrib.TRPO",
 }
-"""Algorithms that can look at a Dict, need no action mask and have no memory."""
+"""Algorithms that take Dict observations, need no action mask and have no memory."""
 
 DISCRETE_ONLY = frozenset({"dqn", "qrdqn"})
 CONTINUOUS_ONLY = frozenset({"ddpg", "sac", "td3", "tqc"})
@@ -53,7 +53,7 @@ DQN_FIELDS = {
 """Fields that only `dqn` has, and their names there."""
 
 DQN_OPTIONS = ("max_grad_norm", "tau", "stats_window_size")
-"""Arguments of stable-baselines3's DQN that no field of ours covers."""
+"""Arguments of stable-baselines3's DQN that have no field."""
 
 NOT_OPTIONS = frozenset(
     {"self", "policy", "env", "seed", "device", "verbose", "policy_kwargs", "tensorboard_log"}
@@ -68,11 +68,8 @@ ON_POLICY_BATCH = 256
 ROLLOUT = 4096
 """Steps of all vehicles between two rounds of updates of `ppo` and `trpo`."""
 
-OPTION_DEFAULTS: dict[str, dict[str, Any]] = {
-    "ppo": {"n_epochs": 4, "ent_coef": 0.005},
-    "trpo": {},
-}
-"""What we set otherwise than stable-baselines3 does."""
+OPTION_DEFAULTS: dict[str, dict[str, Any]] = {"ppo": {"n_epochs": 4, "ent_coef": 0.005}, "trpo": {}}
+"""Defaults that differ from those of stable-baselines3."""
 
 
 def make_model(

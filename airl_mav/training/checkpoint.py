@@ -1,7 +1,7 @@
-"""Checkpoints: everything a training run needs to go on as if it had never stopped.
+"""Checkpoints: everything that a training run needs to resume exactly.
 
 A checkpoint is a folder. It is written under another name, brought to the disk and renamed; then
-the file `latest` names it. Whenever the process dies, a whole one lies there. Save between two
+the file `latest` names it. A kill at any moment leaves a whole one. Save between two
 rollouts only (stable-baselines3's `on_rollout_start`): within one there is state that nobody owns.
 
 Nothing is unpickled: weights are read with `weights_only`, arrays without objects, the rest is
@@ -48,7 +48,7 @@ WEIGHTS, ARRAYS, STATE, MANIFEST = "weights.pt", "arrays.npz", "state.json", "ma
 
 
 class DamagedError(Exception):
-    """A checkpoint is not what was written."""
+    """A checkpoint does not match its manifest."""
 
 
 def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> Path:
@@ -104,14 +104,14 @@ def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None
 def load_latest(
     folder: Path, model: BaseAlgorithm, refused: Callable[[str], None] = warnings.warn
 ) -> dict[str, Any] | None:
-    """Put a learner and its environment back to the newest checkpoint that is whole.
+    """Restore a learner and its environment from the newest whole checkpoint.
 
-    Go on with `model.learn(total - model.num_timesteps, reset_num_timesteps=False)`.
+    Continue with `model.learn(total - model.num_timesteps, reset_num_timesteps=False)`.
 
     Args:
         folder: The folder of all checkpoints of the run.
         model: A learner made from the same specification.
-        refused: Is told, one line each, of damaged checkpoints that were passed over.
+        refused: Called with one line per damaged checkpoint that is skipped.
 
     Returns:
         The caller's `meta`; None when there is no checkpoint yet.

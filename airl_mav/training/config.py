@@ -13,8 +13,8 @@ from airl_mav.policy.action_sets import discrete_actions
 from airl_mav.profiles.computer import load_computer
 
 SELECTION_SEED = 500_000
-"""First seed of the episodes that choose the best checkpoint: neither those of training, which
-begin at a million, nor those that people evaluate with, which begin at one."""
+"""First seed of the selection episodes; those of training begin at a million, those of evaluation
+at one."""
 
 NetworkKind = Literal["small", "appendix", "template"]
 Precision = Literal["float32", "bfloat16"]
@@ -120,7 +120,7 @@ class Selection(ProfileModel):
 
 
 class TrainingConfig(ProfileModel):
-    """What is trained, on what, how long."""
+    """A training run: environment, network, algorithm, duration."""
 
     description: str = Field(description="one line for people")
     seed: int = quantity("of weights, exploration and episodes", "1", ge=0, le=2**31, default=1)
@@ -131,12 +131,10 @@ class TrainingConfig(ProfileModel):
     checkpoint_every: int = quantity(
         "steps between checkpoints", "1", ge=1, le=10**9, default=20_000
     )
-    environment: EnvironmentSpec = Field(
-        default_factory=EnvironmentSpec, description="what flies where"
-    )
-    network: NetworkSpec = Field(default_factory=NetworkSpec, description="what decides")
-    algorithm: AlgorithmSpec = Field(default_factory=AlgorithmSpec, description="what learns")
-    selection: Selection = Field(default_factory=Selection, description="which weights are kept")
+    environment: EnvironmentSpec = Field(default_factory=EnvironmentSpec, description="environment")
+    network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")
+    algorithm: AlgorithmSpec = Field(default_factory=AlgorithmSpec, description="algorithm")
+    selection: Selection = Field(default_factory=Selection, description="periodic evaluation")
 
     @property
     def discrete(self) -> bool:

@@ -123,7 +123,7 @@ class DoubleDQN(DQN):
         self.logger.record("rollout/exploration_rate", self.exploration_rate)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Make the updates that the last step of all vehicles has earned."""
+        """Make the updates that are due after the last step of all vehicles."""
         updates = gradient_steps * self._due(self.env_steps_per_update)
         if not updates:
             return

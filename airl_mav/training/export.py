@@ -1,4 +1,4 @@
-"""Stable-Baselines3 models, ours or foreign, to policies that fly."""
+"""Exports Stable-Baselines3 models, our own or foreign, to policy folders."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class _MeanOfQuantiles(nn.Module):
 
 
 class _Actor(nn.Module):
-    """The way from observations to actions alone: no noise, no value function."""
+    """The path from observations to actions, without noise and value function."""
 
     def __init__(self, owner: Any, extractor: nn.Module, *layers: nn.Module) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""All that a learner and its environment consist of, as weights, arrays and plain values."""
+"""The state of a learner and its environment as weights, arrays and plain values."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ COUNTERS = (
 
 
 class Restorable(Protocol):
-    """A VecEnv that can be put back to where it was."""
+    """A VecEnv whose state can be saved and restored."""
 
     def get_state(self) -> Mapping[str, NDArray[Any]]:
-        """Return everything that its future depends on, by name."""
+        """Return its whole state by name."""
         ...
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take over what `get_state` gave."""
+        """Restore what `get_state` returned."""
         ...
 
 
 def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
-    """Return all that a learner and its environment consist of: weights, arrays, the rest."""
+    """Return the state of a learner and its environment: weights, arrays, the rest."""
     weights: dict[str, Any] = {
         "states": model.get_parameters(),
         "variables": {n: attrgetter(n)(model).detach() for n in _variables(model)},
@@ -74,7 +74,7 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
 def restore(
     model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
 ) -> None:
-    """Put back what `collect` gave.
+    """Restore what `collect` returned.
 
     Raises:
         KeyError, RuntimeError, ValueError: It is of a learner of another specification.

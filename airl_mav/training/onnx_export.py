@@ -1,4 +1,4 @@
-"""From a trained network to a policy that flies: ONNX and its card, checked against torch."""
+"""Exports a trained network to a policy folder: ONNX and its card, checked against torch."""
 
 from __future__ import annotations
 
@@ -18,14 +18,7 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.policy.card import (
-    ONNX_FILE,
-    TORCH_FILE,
-    PolicyCard,
-    PolicyFacts,
-    digest,
-    write_card,
-)
+from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
 from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime
 
@@ -67,11 +60,6 @@ def layers(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> list[Layer]:
     with _hooked(module, note), torch.no_grad():
         module(*inputs)
     return found
-
-
-def count_macs(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
-    """Return the multiply-accumulates of one inference, in convolutions and dense layers."""
-    return sum(layer.macs for layer in layers(module, inputs))
 
 
 def count_parameters(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
@@ -224,7 +212,7 @@ def _hooked(module: nn.Module, hook: Callable[[nn.Module, Any, Any], None]) -> I
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence what torch's exporter has to say about its own future and about torchvision."""
+    """Silence the deprecation warnings of torch's exporter."""
     log = logging.getLogger("torch.onnx")
     level = log.level
     log.setLevel(logging.ERROR)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.policy.layouts import Encoded
 
 RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
-"""How a step left its episode."""
+"""Status of an episode after a step."""
 
 NOT_ASIDE = -1
 
@@ -142,7 +142,7 @@ class NStepReplay:
         )
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return everything that the memory holds, by name; views, not copies."""
+        """Return the whole memory by name; views, not copies."""
         named = self._named_rows()
         state = {name: array[: self.filled] for name, array in named.items()}
         state |= {f"last/{key}": array for key, array in self._last.items()}
@@ -151,7 +151,7 @@ class NStepReplay:
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take over what `get_state` gave.
+        """Restore what `get_state` returned.
 
         Raises:
             ValueError: It is of a memory with other shapes.

@@ -9,7 +9,7 @@ import io
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.delay import bounded
-from airl_mav.envs.evaluation import Flown, fly_episodes, success_rate
+from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv
@@ -33,43 +33,13 @@ from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 from airl_mav.training.export import export_sb3
-from airl_mav.training.store import Evaluation, TrainingFolder
+from airl_mav.training.store import Evaluation, TrainingFolder, TrainingProgress
 
 RECENT = 200
 """Episodes in training that the shown success rate is of."""
 
 LOG_EVERY = 100
 """Episodes (off-policy) between two points of the TensorBoard curves."""
-
-
-class TrainingProgress(Protocol):
-    """Receives the progress of a training run."""
-
-    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Called after each step of all vehicles.
-
-        Args:
-            steps: Decisions of all vehicles so far.
-            success: Share of the last `RECENT` episodes that reached the goal; None before one.
-            zone: Open curriculum zone; None without a curriculum.
-        """
-
-    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Called after an evaluation; `best`: better than all before it."""
-
-    def checkpointed(self, steps: int) -> None:
-        """Called when a checkpoint is on the disk."""
-
-
-class _NoProgress:
-    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        pass
-
-    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        pass
-
-    def checkpointed(self, steps: int) -> None:
-        pass
 
 
 class TrainingResult(NamedTuple):
@@ -119,7 +89,7 @@ def train(
     config = config.model_copy(update={"environment": bounded(config.environment)})
     folder = TrainingFolder.begin(out, config, command, resume=resume)
     with folder.locked():
-        best = fit(config, folder, progress or _NoProgress(), device)
+        best = fit(config, folder, progress or TrainingProgress(), device)
     return TrainingResult(folder, best, export_best(folder, config, name))
 
 
@@ -278,7 +248,7 @@ def greedy(model: BaseAlgorithm) -> Callable[[Encoded], NDArray[Any]]:
 
 
 def summary(
-    flown: Sequence[Flown],
+    flown: Sequence[EpisodeResult],
     *,
     steps: int,
     seconds: float,

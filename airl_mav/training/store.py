@@ -38,14 +38,14 @@ SCHEMA = 1
 CONFIG_FILE = "train.json"
 EVALUATIONS_FILE = "evaluations.jsonl"
 LOCK_FILE = ".lock"
-"""Held while a process trains; the system lets go of it however the process ends."""
+"""Locked while a process trains; the system unlocks it however the process ends."""
 BEST_FILE = "best.json"
 BEST_MODEL = "model.zip"
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One evaluation on the selection seeds, and how training stood."""
+    """One evaluation on the selection seeds, and the state of the training."""
 
     steps: int
     """Decisions of all vehicles so far."""
@@ -64,15 +64,34 @@ class Evaluation:
 
     @property
     def rank(self) -> tuple[float, float]:
-        """What is better is greater: success, then speed."""
+        """Better is greater: success rate first, then flight time."""
         return self.success_rate, -(self.flight_time_s or 1e9)
 
 
 _EVALUATION = TypeAdapter(Evaluation)
 
 
+class TrainingProgress:
+    """Receives the progress of a training run; by itself it ignores it."""
+
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        """Called after each step of all vehicles.
+
+        Args:
+            steps: Decisions of all vehicles so far.
+            success: Share of the last recent episodes that reached the goal; None before one.
+            zone: Open curriculum zone; None without a curriculum.
+        """
+
+    def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
+        """Called after an evaluation; `best`: better than all before it."""
+
+    def checkpointed(self, steps: int) -> None:
+        """Called when a checkpoint is on the disk."""
+
+
 class TrainingFolder:
-    """A training run on disk. Whatever is killed when: it can be read, and gone on from."""
+    """A training run on disk; it can be read and resumed after a kill at any moment."""
 
     def __init__(self, path: Path) -> None:
         """Wrap a folder; use `begin`, `create` or `open`."""
@@ -112,7 +131,7 @@ class TrainingFolder:
 
     @classmethod
     def open(cls, path: Path, config: TrainingConfig) -> TrainingFolder:
-        """Go on with a run. Raises UsageError when there is none, or one of another config."""
+        """Open a run. Raises UsageError if there is none, or it has another configuration."""
         folder = cls(path)
         theirs = TrainingConfig.model_validate(folder.about()["config"])
         if theirs != config:
@@ -133,7 +152,7 @@ class TrainingFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep the folder to this process. Raises UsageError when another one trains in it."""
+        """Lock the folder. Raises UsageError if another process trains in it."""
         with (self.path / LOCK_FILE).open("wb") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -178,14 +197,14 @@ class TrainingFolder:
         )
 
     def best(self) -> Evaluation | None:
-        """Return which evaluation the best weights are of."""
+        """Return the evaluation of the best weights; None before the first."""
         file = self.path / "best" / BEST_FILE
         if not file.exists() or not self.best_model.exists():
             return None
         return read_typed(file, _EVALUATION, None, "training run")
 
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:
-        """Keep the best weights. Killed in between, the old line stands for the new weights."""
+        """Save the best weights, then their evaluation."""
         self.best_model.parent.mkdir(exist_ok=True)
         replace_file(self.best_model, model)
         write_json(self.best_model.parent / BEST_FILE, asdict(evaluation))

@@ -13,15 +13,13 @@ from airl_mav.envs.estimation import (
     GROUPS,
     N_ERRORS,
     EstimationError,
-    autocorrelation,
-    errors_between,
     first_errors,
-    fit,
     perturbed,
     step_errors,
 )
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.profiles.vehicle import Estimation, VehicleProfile
+from tests.support.estimation_fit import autocorrelation, errors_between, fit
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 TABLE = quad().estimation

@@ -14,7 +14,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.camera import Lens, lens_of, look
+from airl_mav.envs.cameras import Lens, lens_of, render_images
 from airl_mav.envs.fleet import Fleet, new_fleet
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -51,7 +51,7 @@ def expected(world: Arena, fleet: Fleet, i: int, range_m: float) -> np.ndarray:
 def test_sees_what_the_rehearsal_s_camera_sees(worlds: list[Arena], range_m: float) -> None:
     fleet, arenas = scattered(np.random.default_rng(1)), batch_of(worlds)
     out = np.full((N, 48, 64), 7, np.uint16)
-    look(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(CAMERA, range_m), out)
+    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(CAMERA, range_m), out)
     for i, world in enumerate(worlds):
         assert np.array_equal(out[i], expected(world, fleet, i, range_m))
     assert len(np.unique(out)) > 1000  # it is a picture
@@ -61,7 +61,7 @@ def test_only_those_that_look_get_an_image(worlds: list[Arena]) -> None:
     fleet, arenas = scattered(np.random.default_rng(2)), batch_of(worlds)
     out = np.full((N, 48, 64), 7, np.uint16)
     who = np.arange(N) % 3 == 1
-    look(fleet, arenas, who, MOUNT, lens_of(CAMERA, 20.0), out)
+    render_images(fleet, arenas, who, MOUNT, lens_of(CAMERA, 20.0), out)
     for i, world in enumerate(worlds):
         image = expected(world, fleet, i, 20.0) if who[i] else np.full((48, 64), 7)
         assert np.array_equal(out[i], image)
@@ -77,7 +77,7 @@ def test_obstacles_are_seen_where_they_are_at_the_vehicle_s_time() -> None:
         fleet.time_us[0] = time_us
         for i in range(4):
             fleet.quaternion[0] = quat_from_euler(0.0, 0.0, 0.5 * math.pi * i)
-            look(fleet, arenas, np.ones(1, np.bool_), MOUNT, lens_of(CAMERA, 40.0), out)
+            render_images(fleet, arenas, np.ones(1, np.bool_), MOUNT, lens_of(CAMERA, 40.0), out)
             assert np.array_equal(out[0], expected(world, fleet, 0, 40.0))
             seen.append(out.copy())
     assert np.array_equal(seen[:4], seen[8:12])
@@ -92,9 +92,9 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0]
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)
-    look(fleet, arenas, np.ones(1, np.bool_), Mount((10.0, 0.0, 0.0), 0.0),
+    render_images(fleet, arenas, np.ones(1, np.bool_), Mount((10.0, 0.0, 0.0), 0.0),
          Lens(40.0, 4.0, 4.0, 200.0), out)  # fmt: skip
     assert np.all(out == 65_535)
-    look(fleet, arenas, np.ones(1, np.bool_), Mount((40.0, 0.0, 0.0), 0.0),
+    render_images(fleet, arenas, np.ones(1, np.bool_), Mount((40.0, 0.0, 0.0), 0.0),
          Lens(40.0, 4.0, 4.0, 200.0), out)  # fmt: skip
     assert out[0, 4, 4] == 60_000

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.rewards import Happened, RewardName, rewards
+from airl_mav.envs.rewards import DecisionOutcome, RewardName, rewards
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.vector import NavigationVectorEnv, happened
+from airl_mav.envs.vector import NavigationVectorEnv, decision_outcome
 
 NEARER, AWAY, GOAL, CRASH, FAST, STILL = range(6)
-HAPPENED = Happened(
+HAPPENED = DecisionOutcome(
     success=np.array([False, False, True, False, False, False]),
     failure=np.array([False, False, False, True, False, False]),
     distance_before_m=np.array([20.0, 20.0, 4.0, 20.0, 20.0, 20.0]),
@@ -57,7 +57,7 @@ def test_shaped_pays_progress_once_whatever_the_steps() -> None:
     """The progress terms of a flight telescope: no reward for flying to and fro."""
     way = np.array([30.0, 25.0, 27.0, 22.0, 10.0, 12.0, 2.0])
     none = np.zeros(6, np.bool_)
-    h = Happened(none, none, way[:-1], way[1:], np.zeros(6), 0.5)
+    h = DecisionOutcome(none, none, way[:-1], way[1:], np.zeros(6), 0.5)
     assert rewards("shaped", h).sum() == pytest.approx(0.02 * 28.0 - 6 * 0.005)
 
 
@@ -67,7 +67,7 @@ def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
     navigation.begin(range(5), range(5))
     before = navigation.flights()
     navigation._fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
-    found = happened(before, navigation.flights(), spec)
+    found = decision_outcome(before, navigation.flights(), spec)
     assert found.success.tolist() == [False, True, False, False, False]
     assert found.failure.tolist() == [False, False, True, True, False]
     assert rewards("shaped", found).round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]

@@ -13,7 +13,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.envs.evaluation import Flown, SinglePilots, fly_seeds
+from airl_mav.envs.evaluation import EpisodeResult, SinglePilots, fly_seeds
 from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay, EnvironmentSpec, EpisodeRules
@@ -41,7 +41,7 @@ def pilots() -> SinglePilots:
 class Kept:
     """A flight and what the trace says of it."""
 
-    flown: Flown
+    flown: EpisodeResult
     path: Trajectory
     latency: dict[str, np.ndarray]
 

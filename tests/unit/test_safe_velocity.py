@@ -65,7 +65,7 @@ def test_a_bound_above_the_fastest_action_is_told_and_does_nothing() -> None:
     bound = speed_bound(spec)
     assert bound is not None
     assert bounded(spec) == spec
-    assert "nothing is scaled" in bound.describe()
+    assert "actions are not scaled" in bound.describe()
     assert speed_bound(spec_of(None, {"delay": PI})) is None
 
 

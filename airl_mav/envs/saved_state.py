@@ -1,4 +1,4 @@
-"""The state of environments as named arrays: what a checkpoint keeps, and how it comes back."""
+"""The state of environments as named arrays, for checkpoints."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ State = dict[str, NDArray[Any]]
 """Arrays by name; "fleet/position" is `position` of the part `fleet`."""
 
 
-def join(parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> State:
+def join_states(parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> State:
     """Return the states of several parts as one."""
     return {f"{part}/{key}": value for part, state in parts.items() for key, value in state.items()}
 
 
-def part_of(state: Mapping[str, NDArray[Any]], part: str) -> State:
+def state_of_part(state: Mapping[str, NDArray[Any]], part: str) -> State:
     """Return the state of one part. Raises UsageError when there is none."""
     found = {key[len(part) + 1 :]: value for key, value in state.items() if _is_of(key, part)}
     if not found:
@@ -28,13 +28,13 @@ def part_of(state: Mapping[str, NDArray[Any]], part: str) -> State:
     return found
 
 
-def restore(target: NDArray[Any], state: Mapping[str, NDArray[Any]], key: str) -> None:
+def restore_array(target: NDArray[Any], state: Mapping[str, NDArray[Any]], key: str) -> None:
     """Write a saved array over one in place.
 
     Raises:
         UsageError: It is missing, or of another shape or type.
     """
-    value = take(state, key)
+    value = saved_array(state, key)
     if value.shape != target.shape or value.dtype != target.dtype:
         raise UsageError(
             f"state: {key} is {value.dtype} {value.shape}; accepted: {target.dtype} {target.shape}"
@@ -42,7 +42,7 @@ def restore(target: NDArray[Any], state: Mapping[str, NDArray[Any]], key: str) -
     target[...] = value
 
 
-def take(state: Mapping[str, NDArray[Any]], key: str) -> NDArray[Any]:
+def saved_array(state: Mapping[str, NDArray[Any]], key: str) -> NDArray[Any]:
     """Return a saved array. Raises UsageError when it is missing."""
     if key not in state:
         raise UsageError(f"state: {key} is missing: not of this environment")
@@ -60,12 +60,12 @@ def unpack(array: NDArray[Any]) -> Any:
 
 
 def pack_generators(generators: Iterable[np.random.Generator | None]) -> NDArray[np.uint8]:
-    """Return where generators stand, as bytes (k,)."""
+    """Return the states of generators as bytes (k,)."""
     return pack([None if rng is None else rng.bit_generator.state for rng in generators])
 
 
 def unpack_generators(array: NDArray[Any]) -> list[np.random.Generator | None]:
-    """Return generators that go on where those that were packed stood."""
+    """Return generators with the packed states."""
     return [None if state is None else _generator(state) for state in unpack(array)]
 
 

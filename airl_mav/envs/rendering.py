@@ -1,6 +1,6 @@
-"""Pictures of an environment: the arena from above, what the network sees, and the figures.
+"""Images of an episode: the arena from above, the depth image, and the figures.
 
-What stays the same over an episode is drawn once; a frame is that, and a few things on top.
+What stays the same over an episode is drawn once; a frame adds the moving parts.
 """
 
 from __future__ import annotations
@@ -16,13 +16,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from airl_mav.arena.draw import (
-    GRID_COLOUR,
-    MOVING_COLOURS,
-    START_COLOUR,
-    TEXT_COLOUR,
-    draw_arena,
-)
+from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
@@ -30,15 +24,15 @@ from airl_mav.core.errors import UsageError
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100
 VEHICLE_M = 1.4
-"""Length of the drawn vehicle: to be seen, it is larger than any that flies here [m]."""
+"""Length of the drawn vehicle, larger than any real one to be visible [m]."""
 
 TRAIL_COLOUR = "#c0392b"
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
 @dataclass(frozen=True)
-class View:
-    """What a picture shows besides the arena."""
+class Snapshot:
+    """What an image shows besides the arena."""
 
     time_us: int
     """Since the start of the episode [µs]."""
@@ -50,15 +44,15 @@ class View:
     goal_distance_m: float
     energy_j: float
     trail: Sequence[NDArray[np.float64]]
-    """Where it has been: north, east [m]."""
+    """Path so far: north, east [m]."""
     depth: NDArray[np.uint8]
     """(h, w) as the network sees it."""
     outcome: str
     """How the episode ended, "flying" before that."""
 
 
-class Picture:
-    """Draws one environment; pictures are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+class EpisodeRenderer:
+    """Draws one environment; images are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
 
     def __init__(self, goal_radius_m: float, image_px: tuple[int, int]) -> None:
         """Take the radius of the goal's disc [m], and rows and columns of the depth image."""
@@ -110,34 +104,34 @@ class Picture:
         )
         self._background = None
 
-    def draw(self, view: View) -> NDArray[np.uint8]:
-        """Return the picture of a moment of the episode that was begun."""
+    def draw(self, now: Snapshot) -> NDArray[np.uint8]:
+        """Return the image of a moment of the present episode."""
         if self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._canvas.restore_region(self._background)
-        self._update(view)
+        self._update(now)
         for artist in (self._moving, self._trail, self._vehicle):
             self._map.draw_artist(artist)
         self._eye.draw_artist(self._image)
         self._figure.draw_artist(self._text)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _update(self, view: View) -> None:
-        centers = self._arena.centers_at(view.time_us)[self._arena.n_static :, 1::-1]
+    def _update(self, now: Snapshot) -> None:
+        centers = self._arena.centers_at(now.time_us)[self._arena.n_static :, 1::-1]
         self._moving.set_verts(
             [outline + at for outline, at in zip(self._outlines, centers, strict=True)]
         )
-        trail = np.array(view.trail)
+        trail = np.array(now.trail)
         self._trail.set_data(trail[:, 1], trail[:, 0])
-        self._vehicle.set_xy(_arrow(view.yaw) + view.position[1::-1])
-        self._image.set_data(view.depth)
+        self._vehicle.set_xy(_arrow(now.yaw) + now.position[1::-1])
+        self._image.set_data(now.depth)
         self._text.set_text(
-            f"time   {view.time_us / US_PER_S:7.2f} s     {view.outcome}\n"
-            f"goal   {view.goal_distance_m:7.2f} m\n"
-            f"speed  {view.speed_m_s:7.2f} m/s\n"
-            f"height {-view.position[2]:7.2f} m\n"
-            f"energy {view.energy_j / 1000.0:7.2f} kJ"
+            f"time   {now.time_us / US_PER_S:7.2f} s     {now.outcome}\n"
+            f"goal   {now.goal_distance_m:7.2f} m\n"
+            f"speed  {now.speed_m_s:7.2f} m/s\n"
+            f"height {-now.position[2]:7.2f} m\n"
+            f"energy {now.energy_j / 1000.0:7.2f} kJ"
         )
 
 
@@ -186,7 +180,7 @@ def _movers(arena: Arena) -> range:
 
 
 def _standing(arena: Arena) -> Arena:
-    """Return the arena without what moves."""
+    """Return the arena without its moving obstacles."""
     o, n = arena.obstacles, arena.n_static
     standing = Obstacles(o.shape[:n], o.center[:n], o.half_size[:n], o.yaw[:n])
     return replace(arena, obstacles=standing, tours=())

@@ -1,0 +1,157 @@
+"""The depth cameras of n vehicles: when frames are taken, and what is on them (Z16).
+
+One compiled call renders the images of all vehicles.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.raycast import render_depth
+from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.core.kernels import kernel
+from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.draws import Stream, stream
+from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.randomise import noisy_depth
+from airl_mav.envs.saved_state import (
+    State,
+    pack_generators,
+    restore_array,
+    saved_array,
+    unpack_generators,
+)
+from airl_mav.envs.spec import Randomisation
+from airl_mav.profiles.vehicle import Camera
+
+
+class Lens(NamedTuple):
+    """The pinhole camera's constants; a tuple, so that compiled loops take it."""
+
+    focal: float
+    """Focal length [px]."""
+    cx: float
+    """Column of the optical axis [px]; pixel centres are at whole numbers."""
+    cy: float
+    """Row of the optical axis [px]."""
+    range_m: float
+    """Greatest depth along the optical axis that gives a return [m]."""
+
+
+def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
+    """Return the lens of a camera that sees `range_m` [m] far."""
+    return Lens(intrinsics.focal, intrinsics.cx, intrinsics.cy, range_m)
+
+
+class Cameras:
+    """Frames come at the camera's rate; their phase to the decisions is drawn from the seed."""
+
+    def __init__(
+        self, n: int, camera: Camera, transport_us: int, randomisation: Randomisation
+    ) -> None:
+        """Make n cameras; `transport_us` is the time from capture to decoded [µs]."""
+        self.intrinsics = Intrinsics.of(camera)
+        self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
+        """(n, h, w) newest frames, Z16 [mm]."""
+        self._period_us = camera.period_us
+        self._transport_us = transport_us
+        self._randomisation = randomisation
+        self._noisy = bool(randomisation.depth_noise or randomisation.depth_dropout)
+        self._mount = Mount(
+            (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
+        )
+        self._lens = lens_of(self.intrinsics, camera.range_m)
+        self._first_us = np.zeros(n, np.int64)
+        self._rngs: list[np.random.Generator | None] = [None] * n
+
+    def begin(self, i: int, seed: int) -> None:
+        """Start the episode of slot i."""
+        self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self._period_us)
+        self._rngs[i] = stream(seed, Stream.DEPTH)
+
+    def age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return how old the newest decoded frame is at a time (n,) [µs] of each episode."""
+        since_us = time_us - self._transport_us - self._first_us
+        age: NDArray[np.int64] = self._transport_us + since_us % self._period_us
+        return age
+
+    def capture(self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_]) -> None:
+        """Take the frames of the vehicles in `who` (n,), from where they are now."""
+        render_images(fleet, arenas, who, self._mount, self._lens, self.image)
+        if self._noisy:
+            for i in np.flatnonzero(who):
+                rng = self._rngs[i]
+                if rng is not None:
+                    self.image[i] = noisy_depth(self.image[i], self._randomisation, rng)
+
+    def get_state(self) -> State:
+        """Return the frames, their phases, and where the generators of the noise stand."""
+        return {
+            "image": self.image.copy(),
+            "first_us": self._first_us.copy(),
+            "generators": pack_generators(self._rngs),
+        }
+
+    def set_state(self, state: State) -> None:
+        """Go on from a saved state. Raises UsageError when it does not fit."""
+        restore_array(self.image, state, "image")
+        restore_array(self._first_us, state, "first_us")
+        self._rngs = unpack_generators(saved_array(state, "generators"))
+
+
+@kernel
+def render_images(
+    fleet: Fleet,
+    arenas: ArenaBatch,
+    who: NDArray[np.bool_],
+    mount: Mount,
+    lens: Lens,
+    out: NDArray[np.uint16],
+) -> None:
+    """Render the depth image of every vehicle in `who`, from where it is now.
+
+    Args:
+        fleet: Poses and times.
+        arenas: One a vehicle; moving obstacles are put where they are at its time.
+        who: (n,) whose image is rendered; the others' stays as it is.
+        mount: The camera's place on the body.
+        lens: The camera.
+        out: (n, height, width) depth along the optical axis [mm], written; 0 = no return. Rounded
+            and clipped as `camera.frame.depth_to_z16` does.
+    """
+    image = np.empty(out.shape[1:], np.float32)
+    for i in range(len(who)):
+        if not who[i]:
+            continue
+        move_obstacles(arenas, i, fleet.time_us[i])
+        count = arenas.n_obstacles[i]
+        position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
+        render_depth(
+            image,
+            position,
+            quaternion,
+            lens.focal,
+            lens.cx,
+            lens.cy,
+            lens.range_m,
+            arenas.bounds[i],
+            arenas.shape[i, :count],
+            arenas.center[i, :count],
+            arenas.half_size[i, :count],
+            arenas.yaw[i, :count],
+        )
+        _to_z16(image, out[i])
+
+
+@kernel
+def _to_z16(depth_m: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
+    """Write depth [m] as millimetres: `camera.frame.depth_to_z16` without temporaries."""
+    for v in range(depth_m.shape[0]):
+        for u in range(depth_m.shape[1]):
+            mm = np.rint(depth_m[v, u] * np.float32(MM_PER_M))
+            out[v, u] = np.uint16(min(mm, np.float32(MAX_MM)))
