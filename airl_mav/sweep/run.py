@@ -17,9 +17,10 @@ from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, Sweep, summarize, write_sweep
 from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
+from airl_mav.training.store import TrainingFolder
 
 LOOK_US = US_PER_S
-"""Interval at which the notes of the trainings are read [wall µs]."""
+"""Interval at which the evaluations of the trainings are read [wall µs]."""
 
 MOST_BARS = 12
 """Trials under way that get a bar of their own."""
@@ -141,14 +142,15 @@ class _TrialBars:
         self._due_us = self._clock.time_us() + LOOK_US
         done = self._done
         for trial, work in self._left.items():
-            now = self._folder.progress(trial)
-            if now is None:
+            evaluations = TrainingFolder(self._folder.trial_path(trial)).evaluations()
+            if not evaluations:
                 continue
-            done += work * min(now.steps / self._steps, 1.0)
+            last = evaluations[-1]
+            done += work * min(last.steps / self._steps, 1.0)
             if trial not in self._bars and len(self._bars) < MOST_BARS:
                 self._bars[trial] = self._progress.bar(trial.name, self._steps, unit="decisions")
             if trial in self._bars:
-                success = None if now.success is None else f"success {now.success:.0%}"
-                self._bars[trial].update(completed=now.steps, postfix=success)
+                success = f"success {last.success_rate:.0%}"
+                self._bars[trial].update(completed=last.steps, postfix=success)
         ended = self._total - len(self._left)
         self._bar.update(completed=done, postfix=f"{ended}/{self._total} trials")

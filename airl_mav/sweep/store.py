@@ -4,7 +4,6 @@ campaign.json           what was asked for
 sweep.json              every result and network so far
 sweep.md, .html, .png   the same for people
 <trial>/                a training folder (`training.store`), and of the sweep:
-    progress.json       how far the training is, while it runs
     result.json         what came out: its being there is what ends a trial
 
 A trial is carried out by whoever gets it, in whatever process, on whatever machine sees the
@@ -13,10 +12,8 @@ folder, and goes on where the last one was cut off.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +31,6 @@ SCHEMA = 1
 
 SWEEP_FILE = "sweep.json"
 RESULT_FILE = "result.json"
-PROGRESS_FILE = "progress.json"
 
 MAY_CHANGE = ("description", "grids", "seeds")
 """Fields with which a sweep can go on changed: they add trials, or leave some for later."""
@@ -51,16 +47,6 @@ class _ResultFile:
 
 
 _RESULT_FILE = TypeAdapter(_ResultFile)
-
-
-@dataclass(frozen=True)
-class TrainingProgress:
-    """How far a training is."""
-
-    steps: int
-    """Decisions of all vehicles so far."""
-    success: float | None
-    """Success rate at its last evaluation, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -105,22 +91,6 @@ class SweepFolder:
         held = _ResultFile(self.evaluation, result)
         write_json(folder / RESULT_FILE, _RESULT_FILE.dump_python(held, mode="json"))
         shutil.rmtree(checkpoints, ignore_errors=True)
-        (folder / PROGRESS_FILE).unlink(missing_ok=True)
-
-    def note_progress(self, trial: Trial, progress: TrainingProgress) -> None:
-        """Say how far a trial is, to whoever looks on. Lost by a power cut, and no loss."""
-        path = self.trial_path(trial) / PROGRESS_FILE
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(json.dumps(asdict(progress)), encoding="utf-8")
-        partial.replace(path)
-
-    def progress(self, trial: Trial) -> TrainingProgress | None:
-        """Return how far a trial is; None when it has not begun, or has ended."""
-        with suppress(OSError, ValueError, TypeError):
-            return TrainingProgress(
-                **json.loads((self.trial_path(trial) / PROGRESS_FILE).read_bytes())
-            )
-        return None
 
 
 def as_data(config: SweepConfig) -> dict[str, Any]:

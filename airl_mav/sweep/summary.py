@@ -20,8 +20,6 @@ from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
 
-_RESULT = TypeAdapter(TrialResult)
-
 
 @dataclass(frozen=True)
 class Computer:
@@ -62,6 +60,9 @@ class Cell:
     def network(self) -> str:
         """The template in short: layers x filters."""
         return f"{self.layers}x{self.filters}"
+
+
+_CELL = TypeAdapter(Cell)
 
 
 @dataclass(frozen=True)
@@ -234,11 +235,6 @@ def _best(sweep: Sweep, arena: str) -> dict[str, Any] | None:
 
 
 def _cell_data(cell: Cell) -> dict[str, Any]:
-    keys = (
-        *("arena", "layers", "filters", "parameters", "macs", "t2_ms", "planned"),
-        *("success_std", "flight_time_s", "distance_m", "energy_j", "decisions"),
-    )
-    data = {key: getattr(cell, key) for key in keys}
-    data["success_rate"] = asdict(cell.success_rate)
-    data["trials"] = [_RESULT.dump_python(result, mode="json") for result in cell.results]
+    data: dict[str, Any] = _CELL.dump_python(cell, mode="json")
+    data["trials"] = data.pop("results")
     return data

@@ -89,12 +89,15 @@ def train(
     config = config.model_copy(update={"environment": bounded(config.environment)})
     folder = TrainingFolder.begin(out, config, command, resume=resume)
     with folder.locked():
-        best = fit(config, folder, progress or TrainingProgress(), device)
+        best = fit(config, folder, progress, device)
     return TrainingResult(folder, best, export_best(folder, config, name))
 
 
 def fit(
-    config: TrainingConfig, folder: TrainingFolder, progress: TrainingProgress, device: str = "cpu"
+    config: TrainingConfig,
+    folder: TrainingFolder,
+    progress: TrainingProgress | None = None,
+    device: str = "cpu",
 ) -> Evaluation:
     """Train to the end in a locked folder, from the newest checkpoint if there is one.
 
@@ -108,7 +111,7 @@ def fit(
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
-    callback = _BetweenRollouts(config, folder, progress, env)
+    callback = _BetweenRollouts(config, folder, progress or _NoProgress(), env)
     meta = load_latest(folder.checkpoints, model)
     if meta is not None:
         callback.restore(meta)

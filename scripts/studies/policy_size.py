@@ -25,12 +25,13 @@ from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from numpy.typing import NDArray
 from pydantic import Field
 from rich.console import Console
-from rich.progress import Progress
+from size_latency_fit import Fit, fit_times
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
+from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import MIN_SAMPLES, percentile
 from airl_mav.policy.action_sets import ActionSpec
@@ -41,10 +42,9 @@ from airl_mav.profiles.arena import Each
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
-from airl_mav.sweep.document import count, t2_ms
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
-from airl_mav.sweep.size_fit import Fit, fit_times
+from airl_mav.sweep.document import count, t2_ms
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_suffix(".toml")
@@ -149,18 +149,18 @@ def study(command: Command, config: StudyConfig, console: Console) -> None:
     )
     done = {cell: read(cells, cell, config, command.threads) for cell in grid}
     work = {cell: size_of(config, *cell).macs * runs for cell in grid}
-    with Progress(console=console, transient=True) as progress:
-        bar = progress.add_task("", total=sum(work.values()))
+    with RichProgress(console) as progress:
+        bar = progress.bar("networks", sum(work.values()))
         for cell in grid:
-            progress.update(bar, description=f"{cell[0]}x{cell[1]}")
+            bar.update(postfix=f"{cell[0]}x{cell[1]}")
             held = done[cell]
             if held is None or held.runs < runs:
                 timed = time_network(config, *cell, runs, command.threads)
                 write(cells / f"{timed.network}.json", asdict(timed) | shared(config))
                 done[cell] = timed
-                console.print(told(timed), highlight=False)
+                progress.note(told(timed))
                 conclude(command.out, config, [t for t in done.values() if t is not None])
-            progress.advance(bar, work[cell])
+            bar.advance(work[cell])
     everything = [timed for timed in done.values() if timed is not None]
     conclude(command.out, config, everything)
     print_table(table(everything), console, wrap=True)

@@ -30,7 +30,6 @@ from airl_mav.report.heatmap import Field, HeatMap, _ink_on, colours, draw_heat_
 from airl_mav.report.theme import new_figure, render_png
 from airl_mav.sweep.config import SweepConfig, load_sweep
 from airl_mav.sweep.document import document_of
-from airl_mav.sweep.size_fit import fit_times, neighbours
 from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
 from airl_mav.sweep.trial import size_of, training_of, trials
@@ -273,21 +272,6 @@ def test_estimated_latency_is_in_proportion_to_the_nearest_workload() -> None:
     network = pi.workloads["template-5x32"].network
     assert estimated_ms(pi, network.macs) == pytest.approx(396.0)
     assert estimated_ms(pi, network.macs // 100) == pytest.approx(3.96, rel=1e-6)
-
-
-def test_fit_of_times_that_follow_a_line_exactly() -> None:
-    sizes = {(n, f): template_size(n, f, 24, 32, 25) for n in (1, 2, 3) for f in (4, 8)}
-    fit = fit_times(sizes, {cell: 0.5 + 3.0 * size.macs / 1e9 for cell, size in sizes.items()})
-    assert fit is not None
-    assert fit.intercept_ms == pytest.approx(0.5)
-    assert fit.ms_per_gmac == pytest.approx(3.0)
-    assert fit.r_squared == pytest.approx(1.0) == fit.both_r_squared
-    assert fit.parameters_r_squared < 1.0
-    assert fit.grows == 1.0
-    flat = fit_times(sizes, {cell: 100.0 * size.macs for cell, size in sizes.items()})
-    assert flat is not None and flat.estimate_error_worst == pytest.approx(0.0, abs=1e-12)
-    assert fit_times(sizes, dict.fromkeys(list(sizes)[:3], 1.0)) is None
-    assert ((1, 4), (2, 4)) in neighbours(list(sizes)) and len(neighbours(list(sizes))) == 7
 
 
 # --- what is kept

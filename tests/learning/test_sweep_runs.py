@@ -114,7 +114,6 @@ def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
         assert card.training.seed == trial.seed
         # What was only there to go on with has gone.
         assert not (policy.parent / "checkpoints").exists()
-        assert not (policy.parent / "progress.json").exists()
 
 
 def test_a_network_is_judged_as_airl_evaluate_judges_it(undisturbed: Path) -> None:
