@@ -17,7 +17,7 @@ from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
 
 DEFAULT_POLICY = "static-obstacles"
-"""What flies when nobody says what."""
+"""The default policy."""
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (
@@ -82,6 +82,7 @@ def load_policy(
     threads: int = 1,
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
+    trust: bool = False,
 ) -> Policy:
     """Return a policy by name, or by the path of its folder.
 
@@ -92,6 +93,8 @@ def load_policy(
         threads: Threads of one of its inferences.
         rng: Source of its random actions; a card with an epsilon needs one.
         ablate: Input of a learned policy that is made zero; None: none.
+        trust: Whether the maker of a policy's folder may run code on this machine: a torch program
+            of another maker than this package is refused without it.
 
     Raises:
         UsageError: There is no such policy (lists those that exist), its card does not fit it, or
@@ -99,7 +102,9 @@ def load_policy(
     """
     folder = _folder(name)
     if folder is not None:
-        return load_learned(folder, runtime=runtime, threads=threads, rng=rng, ablate=ablate)
+        return load_learned(
+            folder, runtime=runtime, threads=threads, rng=rng, ablate=ablate, trust=trust
+        )
     if runtime != "onnx" or ablate is not None:
         raise UsageError(f"--policy {name!r}: not a learned policy: no runtime or ablation of it")
     return POLICIES[name][1](hold_s)
