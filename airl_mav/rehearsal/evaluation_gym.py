@@ -16,7 +16,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.latency.injection import Injection
-from airl_mav.rehearsal.chunks import Saver
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.evaluation import Evaluation, Watch
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 
@@ -65,7 +65,7 @@ def fly_gym(
         arena_seed=plan.arena_seed,
         trace=trace,
     )
-    with Saver(folder) as saver:
+    with EpisodeSaver(folder) as saver:
         for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=watch.stop):
             episode = _episode(plan, navigation, trace, slot, flown, index_of[flown.seed])
             saver.add(episode)

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Protocol
 
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.rehearsal.chunks import Saver
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.evaluation import Evaluation, Job, Watch
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.rehearsal.workers import Workers
@@ -59,7 +59,7 @@ def fly_lockstep(
     workers: Workers[Job, FlownEpisode] = Workers(
         start, run.workers, name=lambda job: f"seed {job.seed}", lost=watch.say
     )
-    with Saver(folder) as saver, workers:
+    with EpisodeSaver(folder) as saver, workers:
         for episode in workers.do(run.evaluation.jobs(done), watch.stop):
             saver.add(episode)
             watch.finished(episode.record)
