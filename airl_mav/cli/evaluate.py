@@ -16,8 +16,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import run_sha256
 from airl_mav.flight.statistics import aggregate
-from airl_mav.policy.card import Result as CardResult
-from airl_mav.policy.card import add_result
+from airl_mav.policy.card import MeasuredResult, add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.rehearsal.run_folder import RUN_FILE
 from airl_mav.rehearsal.workers import GREATEST_WORKERS
@@ -127,7 +126,7 @@ def _write_on_card(command: EvaluateCommand, task: Task, result: EvaluationResul
     quality = aggregate(result.episodes)
     add_result(
         task.policy.folder,
-        CardResult(
+        MeasuredResult(
             arena=task.arena_name,
             level=command.level,
             latency=command.latency or _workload(command),

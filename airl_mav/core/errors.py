@@ -9,7 +9,7 @@ import errno
 import reprlib
 
 MISSING = object()
-"""Value of a field that nobody gave."""
+"""Value of a field that was not given."""
 
 LONGEST_VALUE = 80
 """Characters of a value that a message shows."""

@@ -49,7 +49,7 @@ class Training(ProfileModel):
     date_utc: str | None = Field(default=None, description="when it was exported, ISO 8601")
 
 
-class Result(ProfileModel):
+class MeasuredResult(ProfileModel):
     """How a policy flew a set of episodes; means over the successful ones."""
 
     arena: str = Field(description="arena profile")
@@ -89,7 +89,7 @@ class PolicyFacts(ProfileModel):
     algorithm: str = Field(default="", description="what trained it")
     epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)
     training: Training = Field(default_factory=Training)
-    results: tuple[Result, ...] = Field(default=(), description="how well it flies")
+    results: tuple[MeasuredResult, ...] = Field(default=(), description="how well it flies")
 
     @model_validator(mode="after")
     def _random_actions_are_discrete(self) -> PolicyFacts:
@@ -107,7 +107,7 @@ class PolicyCard(PolicyFacts):
     torch_sha256: Digest | None = Field(
         default=None, description=f"SHA-256 digest of {TORCH_FILE}, if there is one"
     )
-    network: str = Field(description="its layers, in words")
+    network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
 
@@ -177,7 +177,7 @@ def write_card(folder: Path, card: PolicyCard) -> None:
     write_json(folder / CARD_FILE, plain)
 
 
-def add_result(folder: Path, result: Result) -> PolicyCard:
+def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
     """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
 
     Raises:
@@ -191,7 +191,7 @@ def add_result(folder: Path, result: Result) -> PolicyCard:
     return card
 
 
-def _conditions(result: Result) -> tuple[str, str, str]:
+def _conditions(result: MeasuredResult) -> tuple[str, str, str]:
     return result.level, result.arena, result.latency or ""
 
 

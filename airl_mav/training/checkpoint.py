@@ -2,7 +2,8 @@
 
 A checkpoint is a folder. It is written under another name, brought to the disk and renamed; then
 the file `latest` names it. Whenever the process dies, a whole one lies there. Save between two
-rollouts only (stable-baselines3's `on_rollout_start`): within one there is state that nobody owns.
+rollouts only (stable-baselines3's `on_rollout_start`): within one, part of the state is in local
+variables.
 
 Nothing is unpickled: weights are read with `weights_only`, arrays without objects, the rest is
 JSON.

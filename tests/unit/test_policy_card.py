@@ -18,8 +18,8 @@ import onnx
 from airl_mav.core.errors import UsageError
 from airl_mav.policy import card as card_module
 from airl_mav.policy.card import (
+    MeasuredResult,
     PolicyCard,
-    Result,
     Training,
     digest,
     load_card,
@@ -74,8 +74,10 @@ def test_what_is_written_is_read(folder: Path) -> None:
     rich = card.model_copy(
         update={
             "results": (
-                Result(arena="no-obstacles", level="gym", episodes=100, seed=7, success_rate=0.0),
-                Result(
+                MeasuredResult(
+                    arena="no-obstacles", level="gym", episodes=100, seed=7, success_rate=0.0
+                ),
+                MeasuredResult(
                     arena="static-obstacles",
                     level="sitl",
                     episodes=20,
