@@ -11,13 +11,12 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.registry import find_policy, load_policy
+from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
-    action_generator,
     check_quota,
-    check_trust,
     decide_piloting,
+    load_asked_policy,
     select_latency,
 )
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
@@ -48,19 +47,11 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     """
     check_companion(asked)
     policy = find_policy(asked.policy)
-    check_trust(asked, policy)
     pilot, watchdog = decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
     injection = select_latency(asked, policy, on_this_computer=not asked.lockstep)
     check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
-    loaded = load_policy(
-        policy,
-        pilot.hold_s,
-        runtime=asked.runtime,
-        threads=asked.threads,
-        rng=action_generator(asked.seed),
-        ablate=asked.ablate,
-    )
+    loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     return Mission(asked.goal, loaded, pilot, watchdog, sampler)
 

@@ -24,8 +24,14 @@ from airl_mav.core.files import replace_file, save_arrays
 from airl_mav.core.machine import MachineState, machine_state
 from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import summarize
-from airl_mav.profiles.computer import ComputerProfile, Latency, Workload
-from airl_mav.profiles.computer_file import with_workload, write_profile, write_samples
+from airl_mav.profiles.computer import (
+    ComputerProfile,
+    Latency,
+    Workload,
+    with_workload,
+    write_profile,
+    write_samples,
+)
 from companion.interfaces import LinkError
 
 SCHEMA = 1

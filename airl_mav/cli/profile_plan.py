@@ -25,8 +25,7 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
 from airl_mav.policy.layouts import LayoutName, ObservationSpec, camera_mismatch
 from airl_mav.policy.registry import find_policy
 from airl_mav.policy.template import write_template
-from airl_mav.profiles.computer import ComputerProfile, Network
-from airl_mav.profiles.computer_file import existing_profile
+from airl_mav.profiles.computer import ComputerProfile, Network, existing_profile
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings

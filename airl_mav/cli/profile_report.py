@@ -14,7 +14,12 @@ from airl_mav.cli.profile_plan import Measured, ProfilePlan
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.machine import NOT_OFFERED, MachineState
 from airl_mav.latency.autocorrelation import autocorrelation, independent_below, integrated_time
-from airl_mav.latency.omission import CommandAges, ages_in_closed_loop, command_ages, corrected
+from airl_mav.latency.coordinated_omission import (
+    CommandAges,
+    ages_in_closed_loop,
+    command_ages,
+    corrected,
+)
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary, summarize
 from airl_mav.latency.stages import SHOWN_STAGES, Samples, pool, stage_samples
 from airl_mav.profiles.computer import load_computer

@@ -1,6 +1,6 @@
 """Time. Everything else takes a Clock; nothing else reads the time.
 
-All times are integer microseconds of simulated time. `SimClock` is moved by whoever owns it;
+All times are integer microseconds of simulated time. `SimClock` is advanced by its owner;
 `WallClock` follows the host's monotonic clock, multiplied by a speed factor.
 """
 

@@ -1,4 +1,4 @@
-"""Hold this process to a share of a core, for real, by a control group of its own (Linux).
+"""Limit the processor time of this process by a control group of its own (Linux).
 
 The kernel lets the group run for its quota in every period and stops all its threads for the rest
 (Documentation/scheduler/sched-bwc.rst). Version 2 has `cpu.max`, version 1 `cpu.cfs_quota_us`.
@@ -15,12 +15,12 @@ from pathlib import Path
 from airl_mav.core.errors import UsageError
 
 LEAST_QUOTA_US = 1_000
-"""The kernel's least quota [µs]. It is what is given of less than a core, in a period that is as
-short as can be: a decision is slowed all along and not stopped once for long. One that takes less
-than this is not slowed at all."""
+"""The kernel's least quota [µs]. Shares of less than a core get it in the shortest period that is
+possible, so that a decision is slowed evenly instead of stopped once for long. One that takes
+less than this is not slowed at all."""
 
 PERIOD_US = 10_000
-"""Period of a core or more [µs]."""
+"""Period for a core or more [µs]."""
 
 LEAST_PERCENT, MOST_PERCENT = 1.0, 6400.0
 
@@ -30,7 +30,7 @@ OPTION = "--cpu-quota"
 
 @dataclass(frozen=True)
 class CpuGroup:
-    """A control group that holds its processes to a share of a core."""
+    """A control group that limits its processes to a share of a core."""
 
     path: Path
     version: int
@@ -56,7 +56,7 @@ class CpuGroup:
 
 @dataclass(frozen=True)
 class _Home:
-    """Where this process is, and where its own groups can be made."""
+    """The group of this process, and the groups in which it can make one of its own."""
 
     version: int
     own: Path
@@ -65,14 +65,14 @@ class _Home:
 
 @contextmanager
 def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup | None]:
-    """Hold this process, all threads and children to come, to a share of a core for a while.
+    """Limit this process, with its threads and future children, to a share of a core.
 
     Args:
-        percent: Of one core, 100 is all of it, 200 two; None: nothing is done.
+        percent: Share of one core [%]: 100 is one core, 200 two. None: no limit.
         root: Where /proc and /sys are found.
 
     Raises:
-        UsageError: It is not permitted here; says why.
+        UsageError: The system does not permit it; says why.
     """
     if percent is None:
         yield None
@@ -94,7 +94,7 @@ def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup 
 
 
 def check_permitted(percent: float | None, root: Path = Path("/")) -> None:
-    """Raise UsageError, with the reason, unless a process can be held to a share of a core here."""
+    """Raise UsageError, with the reason, unless this process can be limited to the share."""
     if percent is None:
         return
     if not LEAST_PERCENT <= percent <= MOST_PERCENT:

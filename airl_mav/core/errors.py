@@ -18,7 +18,7 @@ EXIT_INTERRUPTED = 130
 """Ctrl-C (128 + SIGINT)."""
 
 MISSING = object()
-"""Value of a field that nobody gave."""
+"""Value of a field that was not given."""
 
 LONGEST_VALUE = 80
 """Characters of a value that a message shows."""

@@ -251,7 +251,7 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def deeper_than(value: object, most: int) -> bool:
-    """Return whether lists and tables are nested in more than so many levels."""
+    """Return whether lists and tables are nested in more than `most` levels."""
     level = [value]
     for _ in range(most + 1):
         level = [

@@ -1,17 +1,18 @@
 """What a machine's speed depends on at a moment: governor, frequency, temperature, throttling.
 
-Everything is read from where Linux and the Raspberry Pi's firmware offer it; None stands for what
-a system does not offer.
+psutil reads what it knows; governor and throttling are read from where Linux and the Raspberry Pi's
+firmware offer them. None stands for what a system does not offer.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+
+import psutil
 
 NOT_OFFERED = "not offered by this system"
 VCGENCMD_TIMEOUT_S = 5.0
@@ -29,7 +30,7 @@ PI_FLAGS = {
 """Bits of the Raspberry Pi's `get_throttled` (raspberrypi.com, documentation of vcgencmd)."""
 
 CPU_SENSORS = ("cpu", "soc", "x86_pkg", "coretemp", "k10temp", "package")
-"""Beginnings or parts of the names of thermal zones that belong to a processor."""
+"""Parts of the names of sensors that belong to a processor."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,12 @@ class MachineState:
     temperature_c: float | None
     """Of the processor; the hottest sensor of it."""
     throttling: str | None
-    """In words: none, or what the system reports."""
+    """`none`, or what the system reports."""
     load: tuple[float, float, float] | None
     """Load average over 1, 5 and 15 minutes."""
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Return what is known, in words."""
+        """Return what is known, as names and texts."""
         mhz, limit, load = self.frequency_mhz, self.frequency_limit_mhz, self.load
         frequency = None
         if mhz is not None:
@@ -74,52 +75,41 @@ def machine_state(
     """Return the state of this machine.
 
     Args:
-        root: Where /sys and /proc are found.
+        root: Where /sys is found, for what psutil does not read: governor and throttling.
         ask_pi: Returns what `vcgencmd get_throttled` says, None where there is no such program;
             None asks it.
     """
-    cpus = sorted((root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq"))
-    governors = sorted({text for cpu in cpus if (text := _text(cpu / "scaling_governor"))})
-    now = [khz / 1e3 for cpu in cpus if (khz := _number(cpu / "scaling_cur_freq")) is not None]
-    limits = [khz / 1e3 for cpu in cpus if (khz := _number(cpu / "scaling_max_freq")) is not None]
+    governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
+    cores = psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else []
+    now = [core.current for core in cores or ()]
     return MachineState(
-        governor=", ".join(governors) or None,
-        frequency_mhz=(min(now), max(now)) if now else _cpuinfo_mhz(root),
-        frequency_limit_mhz=max(limits, default=None),
-        temperature_c=_temperature_c(root),
+        governor=", ".join(sorted({text for path in governors if (text := _text(path))})) or None,
+        frequency_mhz=(min(now), max(now)) if now else None,
+        # 0: not known.
+        frequency_limit_mhz=max((core.max for core in cores or ()), default=0.0) or None,
+        temperature_c=_temperature_c(),
         throttling=_throttling(root, ask_pi or _vcgencmd),
-        load=_load(root),
+        load=psutil.getloadavg(),
     )
 
 
-def _cpuinfo_mhz(root: Path) -> tuple[float, float] | None:
-    """Return the frequencies that /proc/cpuinfo lists: x86 without a frequency driver."""
-    lines = (_text(root / "proc/cpuinfo") or "").splitlines()
-    found = []
-    for line in lines:
-        key, _, value = line.partition(":")
-        if key.strip() == "cpu MHz":
-            found.append(float(value))
-    return (min(found), max(found)) if found else None
-
-
-def _temperature_c(root: Path) -> float | None:
+def _temperature_c() -> float | None:
     """Return the hottest sensor of the processor [°C]."""
-    found = []
-    for zone in sorted((root / "sys/class/thermal").glob("thermal_zone*")):
-        name, value = _text(zone / "type"), _number(zone / "temp")
-        if name and value is not None and any(word in name.lower() for word in CPU_SENSORS):
-            found.append(value / 1e3)
-    for monitor in sorted((root / "sys/class/hwmon").glob("hwmon*")):
-        name = _text(monitor / "name") or ""
-        if any(word in name.lower() for word in CPU_SENSORS):
-            values = (_number(path) for path in sorted(monitor.glob("temp*_input")))
-            found += [value / 1e3 for value in values if value is not None]
-    return max(found, default=None)
+    if not hasattr(psutil, "sensors_temperatures"):  # Linux and FreeBSD have it.
+        return None
+    return max(
+        (
+            sensor.current
+            for name, sensors in psutil.sensors_temperatures().items()
+            if any(word in name.lower() for word in CPU_SENSORS)
+            for sensor in sensors
+        ),
+        default=None,
+    )
 
 
 def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
-    """Return what slows the processor down, in words; None where nothing tells."""
+    """Return what slows the processor down, as text; None where the system does not tell."""
     bits = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
     if bits is None and (answer := ask_pi()) is not None:
         bits = answer.partition("=")[2]
@@ -141,7 +131,7 @@ def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
 
 
 def pi_throttling(bits: int) -> str:
-    """Return the Raspberry Pi's word of flags in words."""
+    """Return the names of the Raspberry Pi's throttling flags."""
     flags = [text for bit, text in PI_FLAGS.items() if bits >> bit & 1]
     return ", ".join(flags) or "none"
 
@@ -161,17 +151,6 @@ def _vcgencmd() -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None
-
-
-def _load(root: Path) -> tuple[float, float, float] | None:
-    text = _text(root / "proc/loadavg")
-    if text is not None:
-        one, five, fifteen = (float(value) for value in text.split()[:3])
-        return one, five, fifteen
-    try:
-        return os.getloadavg()
-    except (OSError, AttributeError):
-        return None
 
 
 def _text(path: Path) -> str | None:

@@ -10,6 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from airl_mav import __version__
 from airl_mav.core.clock import utc_now
 
@@ -65,7 +67,7 @@ def describe_machine() -> dict[str, Any]:
         "architecture": platform.machine(),
         "cores": os.cpu_count() or 1,
         "cores_usable": usable_cores(),
-        "memory_bytes": _memory_bytes(),
+        "memory_bytes": psutil.virtual_memory().total,
         "os": f"{platform.system()} {platform.release()}",
         "python": f"{platform.python_implementation()} {platform.python_version()}",
     }
@@ -88,14 +90,6 @@ def _cpu_model() -> str:
         key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
     }
     return fields.get("model name") or fields.get("Model") or platform.machine()
-
-
-def _memory_bytes() -> int | None:
-    """Return the machine's memory, None where the system does not say."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):
-        return None
 
 
 def git_state(checkout: Path | None = None) -> dict[str, Any] | None:

@@ -20,7 +20,7 @@ from airl_mav.experiments.lockstep_flier import LockstepFlier
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.rehearsal.chunks import Saver
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.evaluation import another_config, open_folder
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
@@ -206,7 +206,7 @@ class _OpenCell:
                     f"{self.folder.path}: {len(self.done)} of {planned} episodes are there",
                     "yellow",
                 )
-            self._saver = stack.enter_context(Saver(self.folder))
+            self._saver = stack.enter_context(EpisodeSaver(self.folder))
             self._bar = progress.bar(cell.title, planned, completed=len(self.done), unit="episodes")
             stack.callback(self._bar.close)
             self.stack = stack.pop_all()

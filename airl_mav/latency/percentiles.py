@@ -33,7 +33,7 @@ def percentile(samples: ArrayLike, p: float) -> float | None:
     """Return the p-th percentile, a value that was seen (nearest rank); None with too few samples.
 
     Raises:
-        KeyError: p is none of 50, 90, 99, 99.9.
+        KeyError: p is not 50, 90, 99 or 99.9.
     """
     values = np.asarray(samples)
     if values.size < MIN_SAMPLES[p]:

@@ -115,7 +115,7 @@ def build_sampler(latency: Latency, rng: np.random.Generator) -> LatencySampler:
         rng: Source of all draws; the same seed gives the same latencies.
 
     Raises:
-        ValueError: The latency still names a sample file that nobody read.
+        ValueError: The latency still names a sample file that was not read.
     """
     if latency.distribution == "samples":
         if latency.samples_ms is None:

@@ -1,4 +1,4 @@
-"""Latency sources in words: what `--latency` takes.
+"""Latency sources written as text: what `--latency` takes.
 
 `150ms` (fixed), `lognormal:396ms,20ms` and `normal:396ms,20ms` (mean, standard deviation; a third
 number is the least), `COMPUTER/WORKLOAD` (an entry of a computer profile), or a path to a text file
@@ -45,7 +45,7 @@ def select_injection(
     macs: int | None = None,
     option: str = "--latency",
 ) -> Injection:
-    """Choose the latency that a policy flies with: a source in words, or as a computer.
+    """Choose the latency that a policy flies with: a source written as text, or a computer.
 
     Args:
         source: See above; None: as `choose_injection` has it.
@@ -66,7 +66,7 @@ def select_injection(
 
 
 def parse_latency(text: str, option: str = "--latency") -> Injection:
-    """Return the latency that a source in words stands for.
+    """Return the latency of a source written as text.
 
     Args:
         text: See above.

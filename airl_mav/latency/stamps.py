@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 NO_STAMP = -1
-"""Stands for a time that never came: no frame, a setpoint nobody accepted."""
+"""Stands for a time that never came: no frame, a setpoint that was not accepted."""
 
 STAMPS = (
     "capture_us",

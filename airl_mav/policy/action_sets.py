@@ -71,7 +71,7 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     speed = np.hypot(wanted[:, 0], wanted[:, 1])
     wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
     course = np.arctan2(wanted[:, 1], wanted[:, 0])
-    # Whoever stands has no course to turn to; the turn grows with the speed.
+    # A vehicle that hovers has no course to turn to; the turn grows with the speed.
     turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)
     turn *= np.minimum(1.0, speed / (0.2 * spec.max_speed_m_s))
     return np.concatenate([wanted, turn[:, None]], axis=1)

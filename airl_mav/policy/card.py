@@ -107,7 +107,7 @@ class PolicyCard(PolicyFacts):
     torch_sha256: Digest | None = Field(
         default=None, description=f"SHA-256 digest of {TORCH_FILE}, if there is one"
     )
-    network: str = Field(description="its layers, in words")
+    network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
 

@@ -24,6 +24,7 @@ from airl_mav.policy.card import (
 from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.runtime import Runtime, RuntimeName, TorchRuntime, outputs_of
+from airl_mav.profiles.loading import profiles_dir
 
 
 class LearnedPolicy:
@@ -148,6 +149,7 @@ def load_learned(
     threads: int = 1,
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
+    trust: bool = False,
 ) -> LearnedPolicy:
     """Load a policy from a folder with `policy.onnx` and `card.json`.
 
@@ -158,22 +160,45 @@ def load_learned(
         threads: Threads of one inference.
         rng: Source of random actions; a card with an epsilon needs one.
         ablate: Input that is made zero; None: none.
+        trust: Whether a torch program may run code of its maker; see `open_network`.
 
     Raises:
-        UsageError: Card and policy do not fit each other, or the runtime is not installed.
+        UsageError: Card and policy do not fit each other, or the runtime is not installed or not
+            trusted.
     """
     card = card or read_card(folder)
-    network = open_network(folder, card, runtime, threads)
+    network = open_network(folder, card, runtime, threads, trust=trust)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     _warm_up(policy, network)
     return policy
 
 
-def open_network(folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int) -> Runtime:
-    """Return the network of a card, ready for its first inference. Raises as `load_learned`."""
+def open_network(
+    folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int, *, trust: bool = False
+) -> Runtime:
+    """Return the network of a card, ready for its first inference.
+
+    Args:
+        folder: The policy's folder.
+        card: Its card.
+        runtime: What runs the network.
+        threads: Threads of one inference.
+        trust: Whether the folder's maker may run code on this machine. `torch.export.load` falls
+            back to unpickling, which runs whatever the file says. An ONNX model is data, and the
+            policies that come with this package are trusted.
+
+    Raises:
+        UsageError: As `load_learned`.
+    """
     if runtime == "onnx":
         return open_model(folder, card, threads)
     program = read_torch_program(folder, card)
+    shipped = folder.resolve().is_relative_to((profiles_dir() / "policies").resolve())
+    if not (trust or shipped):
+        raise UsageError(
+            f"{folder}: its {TORCH_FILE} can run any code on this machine; accepted: with --trust, "
+            "if you trust its maker, or with the onnx runtime"
+        )
     try:
         return TorchRuntime(program, card.observation, threads)
     except ValueError as error:

@@ -79,6 +79,7 @@ def load_policy(
     threads: int = 1,
     rng: np.random.Generator | None = None,
     ablate: str | None = None,
+    trust: bool = False,
 ) -> Policy:
     """Return a policy, ready to decide.
 
@@ -89,6 +90,8 @@ def load_policy(
         threads: Threads of one of its inferences.
         rng: Source of its random actions; a card with an epsilon needs one.
         ablate: Input of a learned policy that is made zero; None: none.
+        trust: Whether the maker of a policy's folder may run code on this machine: a torch program
+            of another maker than this package is refused without it.
 
     Raises:
         UsageError: There is no such policy (lists those that exist), its card does not fit it, or
@@ -97,7 +100,13 @@ def load_policy(
     known = find_policy(policy) if isinstance(policy, str) else policy
     if known.folder is not None and known.card is not None:
         return load_learned(
-            known.folder, known.card, runtime=runtime, threads=threads, rng=rng, ablate=ablate
+            known.folder,
+            known.card,
+            runtime=runtime,
+            threads=threads,
+            rng=rng,
+            ablate=ablate,
+            trust=trust,
         )
     for field, value in (("runtime", None if runtime == "onnx" else runtime), ("ablate", ablate)):
         if value is not None:

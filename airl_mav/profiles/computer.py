@@ -5,14 +5,17 @@ A computer has latencies per workload (a network on a runtime), never one number
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import tomli_w
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
 LONGEST_MS = 60_000.0
@@ -164,3 +167,43 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
     if outside.size:
         raise UsageError(f"{path}: {outside[0]:g}: accepted: 0 < value <= {LONGEST_MS:g} ms")
     return tuple(float(value) for value in values)
+
+
+# --- what was measured, written into a profile
+
+
+def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
+    """Return the profile that a file holds, None when there is none.
+
+    Args:
+        path: The file, with the suffix .toml.
+        cpu: Processor of this machine.
+
+    Raises:
+        UsageError: The file is no computer profile, or that of another processor.
+    """
+    if not path.exists():
+        return None
+    profile = load_profile("computers", str(path), ComputerProfile)
+    if profile.cpu != cpu:
+        raise UsageError(
+            f"{path}: cpu = {profile.cpu!r}, this is {cpu!r}; accepted: another --on or --out"
+        )
+    return profile
+
+
+def write_samples(path: Path, samples_ms: Sequence[float], remarks: Sequence[str]) -> None:
+    """Write measured latencies in their order, one a line in ms, with remarks above them."""
+    lines = [f"# {remark}" for remark in remarks] + [f"{value:.3f}" for value in samples_ms]
+    replace_file(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def write_profile(path: Path, profile: ComputerProfile) -> None:
+    """Write a profile as TOML; the old file stays until the new one is whole."""
+    plain = profile.model_dump(mode="json", exclude_none=True)
+    replace_file(path, tomli_w.dumps(plain, multiline_strings=False).encode())
+
+
+def with_workload(profile: ComputerProfile, name: str, workload: Workload) -> ComputerProfile:
+    """Return the profile with a workload added, in place of one of the same name."""
+    return profile.model_copy(update={"workloads": {**profile.workloads, name: workload}})

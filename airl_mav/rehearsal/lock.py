@@ -12,11 +12,11 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 
-PATIENCE_S = 20.0
+WAIT_S = 20.0
 """How long the processes of a run that was killed may take to end [wall s]."""
 
-LOOK_S = 0.05
-"""How often they are looked for [wall s]."""
+POLL_S = 0.05
+"""Time between two attempts to take the lock [wall s]."""
 
 
 @contextmanager
@@ -28,7 +28,7 @@ def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
 
     Args:
         path: The folder.
-        say: Is told, in words, when somebody else has it.
+        say: Called with a message when another process holds the lock.
 
     Yields:
         A descriptor to be passed to child processes.
@@ -56,9 +56,9 @@ def _acquire(descriptor: int, path: Path, say: Callable[[str], None]) -> None:
     clock = WallClock()
     while not _try(descriptor):
         now_us = clock.time_us()
-        if now_us > PATIENCE_S * US_PER_S:
+        if now_us > WAIT_S * US_PER_S:
             raise UsageError(f"--out {path}: another run flies into it; accepted: a new folder")
-        clock.sleep_until(now_us + int(LOOK_S * US_PER_S))
+        clock.sleep_until(now_us + int(POLL_S * US_PER_S))
 
 
 def _try(descriptor: int) -> bool:
@@ -67,7 +67,7 @@ def _try(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     except OSError:
-        # Not every file system (of a network, above all) has such locks. Then two runs in one
-        # folder are the user's own business.
+        # Some file systems, above all those of a network, have no such locks. Then nothing keeps
+        # two runs out of one folder.
         return True
     return True

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.latency.omission import CommandAges, command_ages
+from airl_mav.latency.coordinated_omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun

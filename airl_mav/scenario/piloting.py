@@ -15,10 +15,9 @@ from airl_mav.core.cpu_quota import check_permitted
 from airl_mav.core.errors import FieldError
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.source import select_injection
-from airl_mav.policy.card import TORCH_FILE
-from airl_mav.policy.registry import PolicyInfo
+from airl_mav.policy.actions import Policy
+from airl_mav.policy.registry import PolicyInfo, load_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.model import (
     Decisions,
     Lateness,
@@ -88,18 +87,6 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
     check_permitted(asked.cpu_quota)
 
 
-def check_trust(asked: Decisions, policy: PolicyInfo) -> None:
-    """Raise FieldError for a torch program of unknown origin that nobody said to trust."""
-    if asked.runtime != "torch" or asked.trust or policy.folder is None:
-        return
-    if not policy.folder.resolve().is_relative_to((profiles_dir() / "policies").resolve()):
-        raise FieldError(
-            "runtime",
-            asked.runtime,
-            f"with trust; loading {policy.folder / TORCH_FILE} can execute code of its author",
-        )
-
-
 def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
     """Return the latency that a companion by itself flies with.
 
@@ -118,6 +105,29 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
         asked.workload,
         policy_sha256=None if on_this_computer else policy.sha256,
         macs=policy.macs,
+    )
+
+
+def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed: int) -> Policy:
+    """Return the policy, ready to decide as asked.
+
+    Args:
+        asked: Runtime, threads, ablation, trust.
+        policy: What is known of it.
+        hold_s: How long each of its actions is held [s].
+        seed: Of its random actions.
+
+    Raises:
+        UsageError: It cannot be run as asked.
+    """
+    return load_policy(
+        policy,
+        hold_s,
+        runtime=asked.runtime,
+        threads=asked.threads,
+        rng=action_generator(seed),
+        ablate=asked.ablate,
+        trust=asked.trust,
     )
 
 

@@ -20,7 +20,6 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import (
     NATIVE_T2_US,
     check_quota,
-    check_trust,
     decide_piloting,
 )
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -39,7 +38,6 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.ports, any_camera=False)
     policy = find_policy(scenario.policy)
-    check_trust(scenario, policy)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle = load_vehicle(scenario.vehicle)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):

@@ -19,12 +19,12 @@ from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.policy.registry import PolicyInfo, load_policy
+from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import FirmwareName, PilotSettings, Scenario, WatchdogSettings
-from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator
+from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator, load_asked_policy
 
 ARRIVAL_SHARE = 0.8
 """The companion flies to this share of the goal radius: it knows its position only by estimate,
@@ -183,14 +183,7 @@ class ResolvedScenario:
 
     def _load_policy(self) -> Policy:
         scenario = self.scenario
-        return load_policy(
-            self.policy,
-            self.pilot.hold_s,
-            runtime=scenario.runtime,
-            threads=scenario.threads,
-            rng=action_generator(scenario.seed),
-            ablate=scenario.ablate,
-        )
+        return load_asked_policy(scenario, self.policy, self.pilot.hold_s, scenario.seed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""

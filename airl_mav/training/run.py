@@ -111,7 +111,7 @@ def fit(
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
-    callback = _BetweenRollouts(config, folder, progress or _NoProgress(), env)
+    callback = _BetweenRollouts(config, folder, progress or TrainingProgress(), env)
     meta = load_latest(folder.checkpoints, model)
     if meta is not None:
         callback.restore(meta)

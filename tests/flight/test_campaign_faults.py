@@ -270,7 +270,7 @@ def test_killed_while_a_flight_is_saved(tmp_path: Path) -> None:
 FORKS = """
 import json, os, sys
 from airl_mav.cli import evaluate_task, main, report
-from airl_mav.rehearsal import chunks
+from airl_mav.rehearsal import episode_saver
 from airl_mav.report import run_page
 
 chunks.EVERY_S, chunks.PAUSE, run_page.MAX_PICTURED = 0.02, 0.0, 1
@@ -322,7 +322,7 @@ def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
 def test_two_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     # Two: the first run must outlast the start of the second, on a slow machine too.
     campaign = Campaign(tmp_path, episodes=2)
-    impatient = "from airl_mav.rehearsal import lock\nlock.PATIENCE_S = 0.2"
+    impatient = "from airl_mav.rehearsal import lock\nlock.WAIT_S = 0.2"
     with campaign.flying() as first:
         first.find_children("firmware", "companion")
         with campaign.flying(impatient) as second:

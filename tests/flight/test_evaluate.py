@@ -39,7 +39,7 @@ from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal import chunks, run_folder
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import run_page
 from airl_mav.report.run_report import write_report
@@ -426,7 +426,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
 
 SCRIPT = """
 import sys
-from airl_mav.rehearsal import chunks
+from airl_mav.rehearsal import episode_saver
 from airl_mav.report import run_report
 chunks.EVERY_S, chunks.MOST = 60.0, 5
 # The table is printed; the page takes longer than the flights.

@@ -29,8 +29,7 @@ from airl_mav.core.machine import MachineState
 from airl_mav.latency.clock_offset import Exchanges
 from airl_mav.latency.stages import STAGES
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.computer_file import existing_profile, write_profile
+from airl_mav.profiles.computer import existing_profile, load_computer, write_profile
 from airl_mav.profiles.loading import list_profiles
 from airl_mav.scenario.model import Ports
 from companion.mission import MissionResult

@@ -260,7 +260,7 @@ def test_airl_evaluate_and_the_campaigns_over_it_go_on(stage: Stage, tmp_path: P
 def test_a_folder_is_kept_to_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     folder = tmp_path / "new" / "run"
-    monkeypatch.setattr(lock, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(lock, "WAIT_S", 0.1)
     with lock.locked(folder, told.append):
         assert told == []
         with pytest.raises(UsageError, match="another run flies into it"):

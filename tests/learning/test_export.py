@@ -340,7 +340,10 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
     words = ("--algorithm", "SAC", "--actions", "velocity", "--with-torch")
     assert airl(monkeypatch, "export", zips / "sac.zip", "--out", tmp_path / "v", *words) == 0
     assert (tmp_path / "v" / "policy.pt2").is_file()
-    assert load_learned(tmp_path / "v", runtime="torch").act_batch(noise(4)).shape == (4, 2)
+    assert load_learned(tmp_path / "v", runtime="torch", trust=True).act_batch(noise(4)).shape == (
+        4,
+        2,
+    )
     paper = ObservationSpec(
         layout="paper", height_px=34, width_px=32, horizontal_fov_deg=90.0, range_m=20.0
     )

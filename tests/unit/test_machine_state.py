@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+
+import psutil
+import pytest
 
 from airl_mav.core.machine import NOT_OFFERED, machine_state, pi_throttling
 
@@ -18,23 +22,27 @@ def write(root: Path, files: dict[str, str]) -> Path:
 CPU = "sys/devices/system/cpu"
 
 
-def test_raspberry_pi(tmp_path: Path) -> None:
+def sensors(
+    monkeypatch: pytest.MonkeyPatch, mhz: list[tuple[float, float]], celsius: dict[str, list[float]]
+) -> None:
+    """Let psutil tell what it tells on another machine."""
+    cores = [SimpleNamespace(current=now, max=limit) for now, limit in mhz]
+    found = {name: [SimpleNamespace(current=c) for c in each] for name, each in celsius.items()}
+    monkeypatch.setattr(psutil, "cpu_freq", lambda percpu: cores)
+    monkeypatch.setattr(psutil, "sensors_temperatures", lambda: found)
+    monkeypatch.setattr(psutil, "getloadavg", lambda: (0.52, 0.58, 0.59))
+
+
+def test_raspberry_pi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write(
         tmp_path,
         {
             f"{CPU}/cpu0/cpufreq/scaling_governor": "ondemand",
-            f"{CPU}/cpu0/cpufreq/scaling_cur_freq": "600000",
-            f"{CPU}/cpu0/cpufreq/scaling_max_freq": "1500000",
             f"{CPU}/cpu1/cpufreq/scaling_governor": "ondemand",
-            f"{CPU}/cpu1/cpufreq/scaling_cur_freq": "1500000",
-            f"{CPU}/cpu1/cpufreq/scaling_max_freq": "1500000",
-            "sys/class/thermal/thermal_zone0/type": "cpu-thermal",
-            "sys/class/thermal/thermal_zone0/temp": "61835",
-            "sys/class/thermal/thermal_zone1/type": "battery",
-            "sys/class/thermal/thermal_zone1/temp": "90000",
-            "proc/loadavg": "0.52 0.58 0.59 1/389 1234",
         },
     )
+    temperatures = {"cpu_thermal": [61.835], "battery": [90.0]}
+    sensors(monkeypatch, [(600.0, 1500.0), (1500.0, 1500.0)], temperatures)
     state = machine_state(root, lambda: "throttled=0x50005")
     assert dict(state.rows()) == {
         "governor": "ondemand",
@@ -52,21 +60,23 @@ def test_sysfs_is_asked_before_the_program(tmp_path: Path) -> None:
     assert machine_state(root, lambda: "throttled=0x1").throttling == "none"
 
 
-def test_x86_counts_throttling(tmp_path: Path) -> None:
+def test_x86_counts_throttling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = {
         f"{CPU}/cpu0/thermal_throttle/core_throttle_count": "0",
         f"{CPU}/cpu1/thermal_throttle/core_throttle_count": "3",
-        "proc/cpuinfo": "processor : 0\ncpu MHz\t\t: 2596.100\ncpu MHz : 3000.5",
-        "sys/class/hwmon/hwmon0/name": "k10temp",
-        "sys/class/hwmon/hwmon0/temp1_input": "45000",
     }
+    sensors(monkeypatch, [(2596.1, 0.0), (3000.5, 0.0)], {"k10temp": [45.0, 44.0]})
     state = machine_state(write(tmp_path, files), lambda: None)
     assert state.throttling == "3 times since the start of the system"
     assert state.frequency_mhz == (2596.1, 3000.5)
+    assert state.frequency_limit_mhz is None
     assert state.temperature_c == 45.0
 
 
-def test_what_is_not_offered_is_said_to_be_so(tmp_path: Path) -> None:
+def test_what_is_not_offered_is_said_to_be_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensors(monkeypatch, [], {})
     rows = dict(machine_state(tmp_path, lambda: None).rows())
     for name in ("governor", "frequency", "temperature", "throttling"):
         assert rows[name] == NOT_OFFERED

@@ -24,7 +24,7 @@ from airl_mav.cli import companion, companion_command, sitl, sitl_command
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy import registry
+from airl_mav.policy import learned, registry
 from airl_mav.policy.action_sets import ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card, write_card
 from airl_mav.policy.layouts import ObservationSpec, encode_layout
@@ -61,6 +61,7 @@ def folder(exported: Path, tmp_path: Path) -> Path:
 def edit(folder: Path, **changes: Any) -> None:
     """Change the card."""
     plain = json.loads((folder / CARD_FILE).read_text())
+    plain.pop("crc32", None)
     (folder / CARD_FILE).write_text(json.dumps(plain | changes))
 
 
@@ -95,7 +96,7 @@ class Answers:
 def test_torch_and_onnx_give_the_same(exported: Path, name: str) -> None:
     seen = noise(100)
     by_onnx = load_learned(exported / name).act_batch(seen)
-    by_torch = load_learned(exported / name, runtime="torch").act_batch(seen)
+    by_torch = load_learned(exported / name, runtime="torch", trust=True).act_batch(seen)
     assert len(np.unique(by_onnx, axis=0)) > 2
     np.testing.assert_allclose(by_torch, by_onnx, atol=1e-5)
 
@@ -105,6 +106,21 @@ def test_threads_do_not_change_what_comes_out(exported: Path) -> None:
     one = load_learned(exported / "continuous", threads=1).act_batch(seen)
     two = load_learned(exported / "continuous", threads=2).act_batch(seen)
     np.testing.assert_allclose(one, two, atol=1e-6)
+
+
+def test_a_torch_program_runs_only_when_its_maker_is_trusted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_policy(str(folder), 0.5, runtime="torch")
+    assert str(caught.value).startswith(f"{folder}: its policy.pt2 can run any code")
+    assert "--trust" in str(caught.value)
+    assert isinstance(load_policy(str(folder), 0.5, runtime="torch", trust=True), LearnedPolicy)
+    # A policy that is shipped with the package.
+    (folder.parent / "policies").mkdir()
+    shipped = folder.rename(folder.parent / "policies" / folder.name)
+    monkeypatch.setattr(learned, "profiles_dir", lambda: shipped.parents[1])
+    assert load_learned(shipped, runtime="torch").card.name
 
 
 def test_torch_without_its_program_is_refused(folder: Path) -> None:
@@ -414,7 +430,7 @@ def test_a_policy_that_cannot_be_flown_is_refused(
     assert "no such policy; known: greedy" in refuse(entry, "--policy", "nowhere/to/be/found")
     assert "card.json: No such file" in refuse(entry, "--policy", str(folder.parent))
     edit(folder, hold_s=99.0)
-    assert "hold_s = 99.0: accepted: 0 <= value <= 10 s" in refuse(entry, "--policy", str(folder))
+    assert "hold_s = 99: accepted: 0 <= value <= 10 s" in refuse(entry, "--policy", str(folder))
     edit(folder, hold_s=3.0)
     assert "--decision-timeout-s 2: accepted: more than" in refuse(entry, "--policy", str(folder))
     edit(folder, hold_s=0.5, torch_sha256=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import socket
 import subprocess
@@ -10,11 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from airl_mav.cli.common import run_command
 
 from airl_mav.cli import companion, firmware, main, sitl
 from airl_mav.profiles.loading import list_profiles, profiles_dir
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
+from tests.support.run_demo import write_demo_run
 
 Entry = Callable[[], None]
 Run = Callable[..., str]
@@ -223,6 +226,32 @@ def test_used_folder_is_refused_and_left_alone(refuse: Run, tmp_path: Path) -> N
 
 def test_report_of_nothing(refuse: Run, tmp_path: Path) -> None:
     assert "no run here" in refuse(main.main, "report", str(tmp_path))
+
+
+@pytest.mark.parametrize("damage", ["flipped", "empty", "nested"])
+def test_report_of_a_damaged_run(refuse: Run, tmp_path: Path, damage: str) -> None:
+    folder, _ = write_demo_run(tmp_path / "run", episodes=2)
+    latency, info = folder.path / "latency.npz", folder.path / "run.json"
+    if damage == "flipped":
+        data = bytearray(latency.read_bytes())
+        data[len(data) // 3] ^= 1
+        latency.write_bytes(data)
+    elif damage == "empty":
+        latency.write_bytes(b"")
+    else:
+        info.write_text('{"schema": 1, "config": ' + "[" * 100_000, encoding="utf-8")
+    line = refuse(main.main, "report", str(folder.path))
+    assert str(info if damage == "nested" else latency) in line
+
+
+def test_a_full_disk_is_the_machines_failure(capsys: pytest.CaptureFixture[str]) -> None:
+    def command() -> int:
+        raise OSError(errno.ENOSPC, "No space left on device", "run/latency.npz")
+
+    with pytest.raises(SystemExit) as end:
+        run_command(command)
+    assert end.value.code == 1
+    assert capsys.readouterr().err == "error: run/latency.npz: No space left on device\n"
 
 
 @pytest.mark.parametrize("command", ["sitl", "firmware", "companion"])

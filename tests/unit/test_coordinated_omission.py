@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from airl_mav.latency.autocorrelation import autocorrelation, integrated_time
-from airl_mav.latency.omission import CommandAges, ages_in_closed_loop, command_ages, corrected
+from airl_mav.latency.coordinated_omission import (
+    CommandAges,
+    ages_in_closed_loop,
+    command_ages,
+    corrected,
+)
 
 MS = 1_000
 

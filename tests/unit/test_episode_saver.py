@@ -1,4 +1,4 @@
-"""Episodes saved some at a time."""
+"""Episodes saved in batches."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.rehearsal import chunks
-from airl_mav.rehearsal.chunks import Saver
+from airl_mav.rehearsal import episode_saver
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, FlownEpisode, RunFolder, load
 from tests.support.processes import wait_until
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
@@ -25,7 +25,7 @@ def episode() -> Make:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> RunFolder:
-    return RunFolder.create(tmp_path / "run", "chunks", {}, setup=demo_setup())
+    return RunFolder.create(tmp_path / "run", "saver", {}, setup=demo_setup())
 
 
 class Watched(RunFolder):
@@ -44,7 +44,7 @@ class Watched(RunFolder):
 
 
 def test_at_the_end_all_are_saved(folder: RunFolder, episode: Make) -> None:
-    with Saver(folder) as saver:
+    with EpisodeSaver(folder) as saver:
         for index in (2, 0, 1):
             saver.add(episode(index))
     run = load(folder.path)
@@ -53,7 +53,7 @@ def test_at_the_end_all_are_saved(folder: RunFolder, episode: Make) -> None:
 
 
 def test_nothing_to_save_leaves_nothing(folder: RunFolder) -> None:
-    with Saver(folder):
+    with EpisodeSaver(folder):
         pass
     assert [path.name for path in folder.path.iterdir()] == ["run.json"]
 
@@ -61,8 +61,8 @@ def test_nothing_to_save_leaves_nothing(folder: RunFolder) -> None:
 def test_after_a_while_they_are_saved_though_more_will_come(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks, "EVERY_S", 0.01)
-    with Saver(folder) as saver:
+    monkeypatch.setattr(episode_saver, "INTERVAL_S", 0.01)
+    with EpisodeSaver(folder) as saver:
         for index in range(2):
             saver.add(episode(index))
             wait_until(lambda: (folder.path / EPISODES_FILE).exists(), "the first line")
@@ -75,10 +75,10 @@ def test_after_a_while_they_are_saved_though_more_will_come(
 def test_no_more_than_so_many_wait(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks, "EVERY_S", 3600.0)
-    monkeypatch.setattr(chunks, "MOST", 2)
+    monkeypatch.setattr(episode_saver, "INTERVAL_S", 3600.0)
+    monkeypatch.setattr(episode_saver, "MAX_WAITING", 2)
     watched = Watched(folder.path)
-    with Saver(watched) as saver:
+    with EpisodeSaver(watched) as saver:
         for index in range(5):
             saver.add(episode(index))
     assert watched.sizes == [2, 2, 1]
@@ -89,7 +89,7 @@ def test_saving_that_takes_long_is_done_less_often(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pauses = []
-    real = Saver._collect
+    real = EpisodeSaver._collect
 
     class Slow:
         """A second passes with each look."""
@@ -97,33 +97,36 @@ def test_saving_that_takes_long_is_done_less_often(
         def time_us(self) -> int:
             return 1_000_000
 
-    def collect(saver: Saver, pause_s: float) -> tuple[bool, list[FlownEpisode]]:
+    def collect(saver: EpisodeSaver, pause_s: float) -> tuple[bool, list[FlownEpisode]]:
         pauses.append(pause_s)
         return real(saver, pause_s)
 
-    monkeypatch.setattr(Saver, "_collect", collect)
-    monkeypatch.setattr(chunks, "WallClock", Slow)
-    monkeypatch.setattr(chunks, "MOST", 1)
-    with Saver(folder) as saver:
+    monkeypatch.setattr(EpisodeSaver, "_collect", collect)
+    monkeypatch.setattr(episode_saver, "WallClock", Slow)
+    monkeypatch.setattr(episode_saver, "MAX_WAITING", 1)
+    with EpisodeSaver(folder) as saver:
         for index in range(3):
             saver.add(episode(index))
-    assert pauses[:2] == [chunks.EVERY_S, chunks.PAUSE]
+    assert pauses[:2] == [episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE]
 
 
 @pytest.mark.parametrize("when", ["while flying", "at the end"])
 def test_what_goes_wrong_is_raised_where_the_episodes_come_from(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
-    monkeypatch.setattr(chunks, "EVERY_S", 3600.0)
-    monkeypatch.setattr(chunks, "MOST", 2)
+    monkeypatch.setattr(episode_saver, "INTERVAL_S", 3600.0)
+    monkeypatch.setattr(episode_saver, "MAX_WAITING", 2)
     watched = Watched(folder.path, fail_at=2)
-    with pytest.raises(OSError, match="disk full"), Saver(watched) as saver:
+    with pytest.raises(OSError, match="disk full"), EpisodeSaver(watched) as saver:
         for index in range(9 if when == "while flying" else 3):
             saver.add(episode(index))
     assert [e.index for e in load(folder.path).episodes] == [0, 1]
 
 
 def test_it_does_not_hide_why_the_flights_ended(folder: RunFolder, episode: Make) -> None:
-    with pytest.raises(KeyError, match="the flights"), Saver(Watched(folder.path, 1)) as saver:
+    with (
+        pytest.raises(KeyError, match="the flights"),
+        EpisodeSaver(Watched(folder.path, 1)) as saver,
+    ):
         saver.add(episode(0))
         raise KeyError("the flights")

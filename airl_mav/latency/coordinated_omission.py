@@ -76,7 +76,7 @@ class CommandAges:
         None with fewer commands than a percentile of decisions needs.
 
         Raises:
-            KeyError: p is none of 50, 90, 99, 99.9.
+            KeyError: p is not 50, 90, 99 or 99.9.
         """
         if self.youngest_us.size < MIN_SAMPLES[p] or not self.time_us:
             return None
