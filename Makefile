@@ -11,8 +11,9 @@ WORKERS := $(shell expr $$(nproc) + 1)
 
 comma := ,
 
-# pybullet has wheels for CPython 3.10 and 3.11 only.
-PYTHON := $(shell scripts/find-python)
+# pybullet has wheels for CPython 3.10 and 3.11 only. PYTHON=python3.10, given to make or in the
+# environment, says which of them.
+INTERPRETER := $(shell PYTHON='$(PYTHON)' scripts/find-python)
 
 .DEFAULT_GOAL := help
 
@@ -21,8 +22,8 @@ help:  ## Show the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
 
 define install
-	@test -n "$(PYTHON)" || { scripts/find-python --explain; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@test -n "$(INTERPRETER)" || { PYTHON='$(PYTHON)' scripts/find-python --explain; exit 1; }
+	@test -x $(BIN)/python || $(INTERPRETER) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 	    --constraint constraints.txt --editable '.[$(1)]'
 	@touch $@
@@ -53,6 +54,10 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 test: lint  ## Everything CI checks
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
+.PHONY: docs
+docs: $(ALL)  ## Build the documentation site into site/ (no network needed)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
 .PHONY: bench
 bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")
 	$(BIN)/python benchmarks/bench_depth.py
@@ -63,5 +68,5 @@ bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-pyt
 
 .PHONY: clean
 clean:  ## Remove the environment and everything generated
-	rm -rf $(VENV) build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

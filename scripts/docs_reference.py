@@ -1,0 +1,157 @@
+"""Writes the generated parts of the documentation site; mkdocs runs it as a hook.
+
+A page asks for them with a comment on a line of its own:
+
+- `<!-- fields: MODULE:MODEL -->` becomes a table of the fields of a pydantic model and of the
+  models inside it: name, meaning, unit and range, default.
+- `<!-- help: COMMAND -->` becomes what `COMMAND --help` prints.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import sys
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from unittest import mock
+
+ROOT = Path(__file__).resolve().parent.parent
+if str(ROOT) not in sys.path:
+    # So that `mkdocs build` documents this checkout, whatever is installed.
+    sys.path.insert(0, str(ROOT))
+
+from pydantic import BaseModel  # noqa: E402 (from here on the checkout is found)
+from pydantic.fields import FieldInfo  # noqa: E402
+
+from airl_mav.profiles.fields import range_of, unit_of  # noqa: E402
+
+HELP_COLUMNS = "100"
+"""Width that help texts are wrapped at."""
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Replace the comments of a page (mkdocs calls this for every page)."""
+    return re.sub(r"^<!-- (fields|help): (.+?) -->$", _generated, markdown, flags=re.MULTILINE)
+
+
+def _generated(match: re.Match[str]) -> str:
+    kind, what = match.groups()
+    return field_tables(what) if kind == "fields" else help_text(what)
+
+
+def field_tables(where: str) -> str:
+    """Return the tables of a model, "MODULE:NAME": its own fields, then each model inside it."""
+    module, name = where.split(":")
+    model = getattr(importlib.import_module(module), name)
+    tables = []
+    for path, part in _models(model, ""):
+        title = f"### `{path}`\n\n{_summary(part)}\n\n" if path else ""
+        tables.append(title + _table(part))
+    return "\n\n".join(tables)
+
+
+def _models(model: type[BaseModel], path: str) -> Iterator[tuple[str, type[BaseModel]]]:
+    """Yield a model and those inside it, each with the dotted path of its table."""
+    yield path, model
+    for name, field in model.model_fields.items():
+        inner, suffix = _inner(field.annotation)
+        if inner is not None:
+            yield from _models(inner, f"{path}.{name}".lstrip(".") + suffix)
+
+
+def _inner(annotation: Any) -> tuple[type[BaseModel] | None, str]:
+    """Return the model that a field holds, with what its path in TOML gets appended."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation, ""
+    origin = get_origin(annotation)
+    if origin is None or origin is Literal:
+        return None, ""
+    suffix = {dict: ".NAME", tuple: "[]", list: "[]"}.get(origin, "")
+    for argument in get_args(annotation):
+        inner, below = _inner(argument)
+        if inner is not None:
+            return inner, suffix + below
+    return None, ""
+
+
+def _summary(model: type[BaseModel]) -> str:
+    return (model.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
+
+
+def _table(model: type[BaseModel]) -> str:
+    rows = ["| field | meaning | accepted | default |", "|---|---|---|---|"]
+    for name, field in model.model_fields.items():
+        inner, _ = _inner(field.annotation)
+        meaning = field.description or (_summary(inner) if inner is not None else "")
+        cells = (f"`{field.alias or name}`", meaning, _accepted(field))
+        rows.append("| " + " | ".join(map(_cell, (*cells, _default(field)))) + " |")
+    return "\n".join(rows)
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _accepted(field: FieldInfo) -> str:
+    """Return the range of a field with its unit, else its choices, else its type."""
+    if _inner(field.annotation)[0] is not None:
+        return "table, below"
+    unit = unit_of(field)
+    unit = f" {unit}" if unit and unit != "1" else ""
+    return range_of(field) or _type(field.annotation) + unit
+
+
+def _type(annotation: Any) -> str:
+    """Return a type in a reader's words."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in arguments)
+    if origin is Annotated:
+        return _type(arguments[0])
+    if origin in (Union, types.UnionType):
+        return " or ".join(_type(part) for part in arguments if part is not type(None))
+    if origin in (tuple, list):
+        parts = [_type(part) for part in arguments if part is not Ellipsis]
+        return f"list of {parts[0]}" if Ellipsis in arguments or origin is list else f"{parts}"
+    if origin is dict:
+        return f"table of {_type(arguments[1])}"
+    names = {str: "text", int: "integer", float: "number", bool: "`true`, `false`", Path: "path"}
+    return names.get(annotation, getattr(annotation, "__name__", str(annotation)))
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    if field.default_factory is not None or field.default is None:
+        return "–"
+    value = field.default
+    if isinstance(value, BaseModel):
+        return "–"
+    return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def help_text(command: str) -> str:
+    """Return what a command prints for `--help`, as a block of text."""
+    program, *rest = command.split()
+    entry: Callable[[], Any] = getattr(
+        importlib.import_module("airl_mav.cli.entry"), program.removeprefix("airl-")
+    )
+    printed = io.StringIO()
+    plain = {"COLUMNS": HELP_COLUMNS, "NO_COLOR": "1", "TERM": "dumb"}
+    with (
+        mock.patch.dict(os.environ, plain),
+        mock.patch.object(sys, "argv", [program, *rest, "--help"]),
+        contextlib.redirect_stdout(printed),
+        contextlib.suppress(SystemExit),
+    ):
+        entry()
+    text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).strip("\n")
+    if not text:
+        raise RuntimeError(f"{command} --help printed nothing")
+    return f"```text\n{text}\n```"

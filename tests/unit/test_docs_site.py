@@ -1,0 +1,121 @@
+"""The documentation: the site builds without a network, and what it names exists."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+COMMAND = re.compile(r"^(?:\$ )?((?:airl-(?:sitl|firmware|companion)|airl [a-z]+)\b.*)$", re.M)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as `make docs` builds it."""
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        timeout=150,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+class Assets(HTMLParser):
+    """Collects what a browser would load to show a page: everything but links to follow."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        if tag in ("script", "img", "iframe", "source", "audio", "video"):
+            self.found.append(values.get("src") or "")
+        if tag == "link" and values.get("rel") not in ("canonical", "next", "prev", "edit"):
+            self.found.append(values.get("href") or "")
+
+
+def test_pages_load_nothing_from_the_network(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > len(PAGES)
+    for page in pages:
+        assets = Assets()
+        assets.feed(page.read_text(encoding="utf-8"))
+        assert assets.found
+        outside = [url for url in assets.found if re.match(r"(https?:)?//", url)]
+        assert not outside, f"{page.name}: {outside}"
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8"))
+
+
+def test_reference_shows_every_field_of_a_vehicle(site: Path) -> None:
+    text = (site / "reference" / "profiles.html").read_text(encoding="utf-8")
+    for name in ("mass_kg", "thrust_curve", "gps", "motors", "workloads.NAME.latency"):
+        assert name in text
+
+
+def test_files_that_the_sources_name_exist() -> None:
+    """Docstrings, messages and pages name pages as docs/NAME.md."""
+    places = ("airl_mav", "companion", "firmware_sim", "scripts", "examples", "tests")
+    sources = [path for place in places for path in (ROOT / place).rglob("*.py")]
+    for path in [*sources, *TEXTS, ROOT / "Makefile", ROOT / "mkdocs.yml"]:
+        for name in re.findall(r"\bdocs/[\w/-]+\.md\b", path.read_text(encoding="utf-8")):
+            assert (ROOT / name).is_file(), f"{path.relative_to(ROOT)} names {name}"
+
+
+def test_readme_links_lead_somewhere() -> None:
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"):
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
+            assert (ROOT / target).exists(), f"{path.name} links to {target}"
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_options_in_the_pages_exist(path: Path) -> None:
+    """Every option of a command line in a block of shell, by the command's own --help."""
+    blocks = re.findall(r"^```sh\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S)
+    for block in blocks:
+        for line in COMMAND.findall(block.replace("\\\n", " ")):
+            line = line.split("#")[0]
+            words = line.split()
+            command = words[0] if words[0] != "airl" else " ".join(words[:2])
+            for option in re.findall(r"(?<=\s)--[a-z][\w.-]*", line):
+                assert re.search(rf"{re.escape(option)}\b", options_of(command)), line
+
+
+@pytest.mark.parametrize("path", TEXTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_python_in_the_pages_compiles(path: Path) -> None:
+    for block in re.findall(
+        r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.M | re.S
+    ):
+        if "--8<--" not in block:
+            compile(block, path.name, "exec")
+
+
+@cache
+def options_of(command: str) -> str:
+    return reference().help_text(command)
+
+
+@cache
+def reference() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("reference", ROOT / "scripts/docs_reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
