@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -320,28 +319,6 @@ def test_a_hanging_companion_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
     with Stage() as stage, pytest.raises(LockstepError, match="the companion hangs"):
         stage.run(setup, lambda: time.sleep(3.0))
-
-
-# --- in words
-
-
-def test_the_example_in_the_docs_flies() -> None:
-    text = Path("docs/lockstep.md").read_text(encoding="utf-8")
-    found = re.search(r"## Your own program.*?```python\n(.*?)```", text, re.DOTALL)
-    assert found is not None
-    done = subprocess.run(
-        [sys.executable, "-c", found[1]],
-        env={**os.environ, "PYTHONPATH": str(Path.cwd())},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    north, east, down = (float(word) for word in done.stdout.strip("[] \n").split())
-    assert 8.0 < north < 12.0, "2 m/s for 5 s, and stopped"
-    assert abs(east) < 1.0
-    assert abs(down) < 0.2, "landed"
 
 
 # --- what reaches the flight controller
