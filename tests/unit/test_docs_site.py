@@ -78,6 +78,16 @@ def test_files_that_the_sources_name_exist() -> None:
             assert (ROOT / name).is_file(), f"{path.relative_to(ROOT)} names {name}"
 
 
+ROOMS = "airl_mav|companion|firmware_sim|profiles|scripts|examples|benchmarks|tests"
+
+
+def test_paths_in_the_pages_exist() -> None:
+    """A path between backticks, `airl_mav/core/clock.py`, names a file or folder."""
+    for path in TEXTS:
+        for name in re.findall(rf"`((?:{ROOMS})/[\w./-]*)`", path.read_text(encoding="utf-8")):
+            assert (ROOT / name).exists() or name == "airl_mav/_profiles", f"{path.name}: {name}"
+
+
 def test_readme_links_lead_somewhere() -> None:
     for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"):
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8")):
