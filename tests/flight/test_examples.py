@@ -1,0 +1,105 @@
+"""Every program in examples/ runs as it stands and says what it should."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.support.ports import LOOPBACK, choose_ports
+from tests.support.processes import ROOT, running
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("examples"), pytest.mark.timeout(300)]
+
+EXAMPLES = ROOT / "examples"
+
+
+def output_of(name: str, folder: Path, *arguments: str) -> str:
+    """Return what an example prints, run in an empty folder."""
+    with running([str(EXAMPLES / name), *arguments], folder) as program:
+        assert program.wait() == 0, program.text()
+        return program.text()
+
+
+def numbers_after(pattern: str, text: str) -> list[float]:
+    """Return the numbers in the groups of every match."""
+    return [float(group) for match in re.finditer(pattern, text) for group in match.groups()]
+
+
+def test_every_example_is_flown() -> None:
+    """lockstep_client.py is flown by test_lockstep_tokens.py."""
+    here = Path(__file__).read_text(encoding="utf-8")
+    named = set(re.findall(r"\w+\.py", here))
+    assert {path.name for path in EXAMPLES.glob("*.py")} <= named
+
+
+def test_rehearse(tmp_path: Path) -> None:
+    text = output_of("rehearse.py", tmp_path)
+    assert text.count("success") + text.count("collision") == 2
+    (t2_ms,) = numbers_after(r"t2: (\d+) ms", text)
+    assert 380 < t2_ms < 412, "the paper's Raspberry Pi: 396 ms"
+    assert re.search(r"digest of all flights: [0-9a-f]{64}\n", text)
+    page = re.search(r"report: (\S+)", text)
+    assert page is not None
+    assert (tmp_path / page[1]).is_file()
+
+
+def test_own_policy(tmp_path: Path) -> None:
+    text = output_of("own_policy.py", tmp_path)
+    assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
+
+
+def test_own_arena(tmp_path: Path) -> None:
+    text = output_of("own_arena.py", tmp_path)
+    (trunks,) = numbers_after(r"seed 7: (\d+) trunks", text)
+    assert 20 <= trunks <= 30
+    assert (tmp_path / "forest.png").read_bytes().startswith(b"\x89PNG")
+    assert len(re.findall(r"^seed [78]: (success|collision|timeout), ", text, re.M)) == 2
+
+
+def test_own_reward(tmp_path: Path) -> None:
+    text = output_of("own_reward.py", tmp_path)
+    assert (tmp_path / "short-and-cheap" / "card.json").is_file()
+    assert re.search(r"^(success|collision|timeout): ", text, re.M)
+
+
+def test_latency_curve_rises(tmp_path: Path) -> None:
+    text = output_of("latency_curve.py", tmp_path)
+    times = numbers_after(r"%\s+([\d.]+) s", text)
+    assert times == sorted(times)
+    assert len(times) == 3
+
+
+def test_compare_runs(tmp_path: Path) -> None:
+    text = output_of("compare_runs.py", tmp_path)
+    assert re.search(r"[123] pairs: the wind costs [+-]\d+\.\d% of flight time", text)
+
+
+def test_gymnasium_loop(tmp_path: Path) -> None:
+    text = output_of("gymnasium_loop.py", tmp_path)
+    assert len(re.findall(r"^seed [123]: \w+ after", text, re.M)) == 3
+    assert output_of("gymnasium_loop.py", tmp_path) == text, "the same episodes every time"
+
+
+def test_conducted_program_flies_the_same_every_time(tmp_path: Path) -> None:
+    text = output_of("conducted_program.py", tmp_path)
+    north, east, down = (float(word) for word in text.strip("[] \n").split())
+    assert 8.0 < north < 12.0, "2 m/s for 5 s, and stopped"
+    assert abs(east) < 1.0
+    assert abs(down) < 0.2, "landed"
+    assert output_of("conducted_program.py", tmp_path) == text
+
+
+def test_mavsdk_client_flies_a_square(tmp_path: Path) -> None:
+    ports = choose_ports()
+    firmware_words = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", *ports.options()]
+    with running([*firmware_words, "--speed", "3"], tmp_path):
+        text = output_of("mavsdk_client.py", tmp_path, f"udpin://{LOOPBACK}:{ports.api}")
+    assert "landed" in text
+    corners = numbers_after(r"corner at (-?[\d.]+) m north, (-?[\d.]+) m east", text)
+    assert len(corners) == 8
+    # Sides of 2 m/s, for 3 s of wall time at three times real time.
+    assert math.dist(corners[0:2], corners[4:6]) > 8.0
+    assert math.hypot(*corners[6:8]) < 12.0, "back near the start"
