@@ -7,7 +7,6 @@ Simulated time stands still while the program computes and moves only while it s
 from airl_mav.lockstep.stage import Stage
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.link import BodyVelocity
-from firmware_sim.plant.wind import WindSettings
 from firmware_sim.simulation import EpisodeSetup
 
 with Stage() as stage:
@@ -21,5 +20,5 @@ with Stage() as stage:
         stage.clock.sleep_until(stage.clock.time_us() + 5_000_000)
         stage.link.land(60.0)
 
-    simulation = stage.run(EpisodeSetup(load_vehicle("quad"), None, 1, WindSettings()), program)
+    simulation = stage.run(EpisodeSetup(load_vehicle("quad"), arena=None, seed=1), program)
     print(simulation.truth.position)  # north, east, down [m]

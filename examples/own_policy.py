@@ -5,7 +5,6 @@
 or run this file, which flies it in lockstep.
 """
 
-from airl_mav import Scenario, rehearse
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 
@@ -27,6 +26,9 @@ class Follow:
 
 
 if __name__ == "__main__":
+    # Here, because the companion that flies this class needs no simulator.
+    from airl_mav import Scenario, rehearse
+
     run = rehearse(Scenario(policy=f"{__file__}:Follow", level="lockstep", episodes=2))
     for episode in run.episodes:
         print(f"seed {episode.seed}: {episode.outcome.value}, {episode.reason}")

@@ -29,7 +29,7 @@ if str(ROOT) not in sys.path:
 from pydantic import BaseModel  # noqa: E402 (from here on the checkout is found)
 from pydantic.fields import FieldInfo  # noqa: E402
 
-from airl_mav.profiles.fields import range_of, unit_of  # noqa: E402
+from airl_mav.core.fields import range_of, unit_of  # noqa: E402
 
 HELP_COLUMNS = "100"
 """Width that help texts are wrapped at."""

@@ -1,4 +1,4 @@
-"""Policies by name: built in, shipped with a card, or any folder with one."""
+"""Policies by name: built in, shipped with a card, any folder with one, or a class in a file."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
+from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, digest, load_card
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
+from airl_mav.policy.python_policy import names_python, python_class, python_file
 from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
 
@@ -36,10 +37,14 @@ class PolicyInfo:
     """None: not a learned one."""
     folder: Path | None = None
     """Where a learned one lies."""
+    program: str | None = None
+    """FILE.py:CLASS of one that is written in Python."""
 
     @property
     def sha256(self) -> str | None:
-        """Digest of the policy's file."""
+        """Digest of the policy's file; None for a built-in one."""
+        if self.program is not None:
+            return digest(python_file(self.program).read_bytes())
         return None if self.card is None else self.card.sha256
 
     @property
@@ -54,11 +59,14 @@ def policy_names() -> list[str]:
 
 
 def find_policy(name: str) -> PolicyInfo:
-    """Return what is known of a policy, by name or by the path of its folder.
+    """Return what is known of a policy, by name, by the path of its folder, or by FILE.py:CLASS.
 
     Raises:
         UsageError: There is no such policy (lists those that exist), or its card does not fit it.
     """
+    if names_python(name):
+        summary = (python_class(name).__doc__ or "").strip().partition("\n")[0]
+        return PolicyInfo(name.rpartition(":")[2], summary, program=name)
     folder = _folder(name)
     if folder is None:
         return PolicyInfo(name, POLICIES[name][0])
@@ -111,6 +119,8 @@ def load_policy(
     for field, value in (("runtime", None if runtime == "onnx" else runtime), ("ablate", ablate)):
         if value is not None:
             raise FieldError(field, value, f"for a learned policy; {known.name} is none")
+    if known.program is not None:
+        return python_class(known.program)()
     return POLICIES[known.name][1](hold_s)
 
 
@@ -130,5 +140,5 @@ def _folder(name: str) -> Path | None:
         return path
     raise UsageError(
         f"--policy {name!r}: no such policy; known: {', '.join(policy_names())} "
-        f"(or a path to a folder with {ONNX_FILE} and {CARD_FILE})"
+        f"(or a path to a folder with {ONNX_FILE} and {CARD_FILE}, or FILE.py:CLASS)"
     )

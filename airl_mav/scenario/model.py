@@ -366,8 +366,8 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
 
     policy: str = Field(
         default=DEFAULT_POLICY,
-        description="policy that decides: a name, or a path to a folder with policy.onnx and"
-        " card.json",
+        description="policy that decides: a name, a path to a folder with policy.onnx and"
+        " card.json, or a Python class as FILE.py:CLASS",
     )
     arena: str = Field(
         default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
