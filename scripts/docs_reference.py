@@ -95,7 +95,7 @@ def _table(model: type[BaseModel]) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return re.sub(r"[ \n]+", " ", text.strip()).replace("|", "\\|")
 
 
 def _accepted(field: FieldInfo) -> str:
@@ -104,7 +104,9 @@ def _accepted(field: FieldInfo) -> str:
         return "table, below"
     unit = unit_of(field)
     unit = f" {unit}" if unit and unit != "1" else ""
-    return range_of(field) or _type(field.annotation) + unit
+    limits = range_of(field).replace("<=", "≤")
+    # In one line: the spaces do not break.
+    return limits.replace(" ", "\u00a0") or _type(field.annotation) + unit
 
 
 def _type(annotation: Any) -> str:
@@ -133,6 +135,8 @@ def _default(field: FieldInfo) -> str:
     value = field.default
     if isinstance(value, BaseModel):
         return "–"
+    if isinstance(value, bool):
+        return f"`{str(value).lower()}`"
     return f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
 
