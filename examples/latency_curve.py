@@ -1,14 +1,20 @@
 """The latency curve of a policy: the same seeds at growing latencies, in the batch twin."""
 
-from airl_mav import Scenario, rehearse
+from airl_mav import Scenario, degrade
 
-EPISODES = 20
+curve = degrade(Scenario(level="gym", episodes=50), latencies=("native", "200ms", "400ms"))
 
 print("latency   success   flight time   distance")
-for latency in "1ms", "200ms", "400ms":
-    run = rehearse(Scenario(level="gym", episodes=EPISODES, latency=latency))
+for run in curve.comparison.runs:
     quality = run.quality
     print(
-        f"{latency:>7}   {quality.success_rate.value:7.0%}   "
+        f"{run.label:>7}   {quality.success_rate.value:7.0%}   "
         f"{quality.flight_time_s.value:9.2f} s   {quality.distance_m.value:6.2f} m"
     )
+for contrast in curve.comparison.contrasts:
+    change = contrast.paired.flight_time_s.difference
+    print(
+        f"{contrast.entry.title}: {change.value:+.1f} % of flight time "
+        f"[{change.low:+.1f}, {change.high:+.1f}] over {change.n} pairs"
+    )
+print(f"report: {curve.page}")
