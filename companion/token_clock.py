@@ -1,7 +1,7 @@
 """The companion's end of the turns when whoever conducts is another process.
 
 The turn comes as a MAVLink STATUSTEXT behind all telemetry, and goes back as one behind all
-setpoints: both travel through MAVSDK in order. See docs/lockstep.md, "In two processes".
+setpoints: both travel through MAVSDK in order. See docs/reference/lockstep-protocol.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The words by which two processes pass the turn: texts of MAVLink STATUSTEXTs.
 
-See docs/lockstep.md, "In two processes". At most 50 characters each.
+See docs/reference/lockstep-protocol.md. At most 50 characters each.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Simulated time stands still while the program computes and moves only while it s
 
 from airl_mav.lockstep.stage import Stage
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.mavsdk_link import BodyVelocity
+from companion.interfaces import BodyVelocity
 from firmware_sim.simulation import EpisodeSetup
 
 with Stage() as stage:

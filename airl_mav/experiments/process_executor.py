@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -18,6 +19,7 @@ from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import ModuleType
 from typing import Any, ClassVar, Generic
 
 from airl_mav.experiments.executors import (
@@ -168,6 +170,7 @@ def _spawn(start: Start[Any, Any]) -> tuple[Connection, BaseProcess]:
         stack.enter_context(theirs)
         stack.enter_context(_environment(ONE_THREAD))
         stack.enter_context(_interrupts_blocked())
+        stack.enter_context(_program_hidden())
         process.start()
     return ours, process
 
@@ -198,6 +201,20 @@ def _interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _program_hidden() -> Iterator[None]:
+    """Hide the user's program for a while: a process started meanwhile does not run it once more.
+
+    "spawn" would, for functions that live there; ours live in this package.
+    """
+    program = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = program
 
 
 def _cause(exitcode: int | None) -> str:

@@ -2,7 +2,7 @@
 
 The vehicle sends its telemetry, and behind it a STATUSTEXT that gives the turn; the companion sends
 what it has to command, and behind it one that gives the turn back. Until then simulated time
-stands. See docs/lockstep.md, "In two processes".
+stands. See docs/reference/lockstep-protocol.md.
 """
 
 from __future__ import annotations

@@ -151,7 +151,7 @@ class Saved(_Line):
     path: str
     """Of the arrays."""
     sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, the fingerprint of the flight by lane; see docs/lockstep.md."""
+    """In lockstep, the fingerprint of the flight by lane; see docs/explanation/lockstep.md."""
 
 
 class Progress(_Line):
@@ -173,7 +173,7 @@ class Ended(_Line):
     path: str
     """Of the decision log."""
     sha256: dict[str, str] = Field(default_factory=dict)
-    """In lockstep, the fingerprint of what the policy saw; see docs/lockstep.md."""
+    """In lockstep, the fingerprint of what the policy saw; see docs/explanation/lockstep.md."""
 
 
 class Failed(_Line):

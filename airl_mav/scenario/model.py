@@ -190,7 +190,7 @@ class Aircraft(ProfileModel):
     firmware: FirmwareName = Field(
         default="builtin",
         description="flight controller: the built-in one, or real firmware on this vehicle and its"
-        " sensors; see docs/real-firmware.md",
+        " sensors; see docs/how-to/real-firmware.md",
     )
     real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
     ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")

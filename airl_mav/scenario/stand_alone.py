@@ -74,7 +74,8 @@ class StandAloneVehicle(Aircraft):
     lockstep: bool = Field(
         default=False,
         description="simulated time waits for one companion that passes turns (airl-companion"
-        " --lockstep, or any program that keeps to docs/lockstep.md): the same flight every time,"
+        " --lockstep, or any program that keeps to"
+        " docs/reference/lockstep-protocol.md): the same flight every time,"
         " bit by bit; there is no ground station then, and the companion's end ends the flight",
     )
     transport_ms: float = quantity(
@@ -131,8 +132,8 @@ class StandAloneCompanion(Lateness, Decisions):
 
     policy: str = Field(
         default=DEFAULT_POLICY,
-        description="policy that decides: a name, or a path to a folder with policy.onnx and"
-        " card.json",
+        description="policy that decides: a name, a path to a folder with policy.onnx and"
+        " card.json, or a Python class as FILE.py:CLASS",
     )
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"

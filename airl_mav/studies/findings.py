@@ -11,7 +11,7 @@ from airl_mav.core.files import write_json
 from airl_mav.report.document import Document, write_document
 
 SCHEMA = 1
-"""Version of `study.json`; docs/studies.md describes it."""
+"""Version of `study.json`; docs/how-to/studies.md describes it."""
 
 DATA_FILE = "study.json"
 

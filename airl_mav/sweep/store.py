@@ -27,7 +27,7 @@ from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.trial import Trial, TrialResult, trials
 
 SCHEMA = 1
-"""Version of `sweep.json` and of `result.json`; docs/sweep.md describes them."""
+"""Version of `sweep.json` and of `result.json`; docs/how-to/sweep.md describes them."""
 
 SWEEP_FILE = "sweep.json"
 RESULT_FILE = "result.json"
