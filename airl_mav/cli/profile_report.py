@@ -88,7 +88,7 @@ def print_measured(
     say(
         console,
         "The loop is closed: a decision begins when the last one has ended, so a slow one keeps "
-        "others from being counted. The second table puts the time back: see docs/how-to/profile.md.",
+        "others from being counted. The second table puts the time back: see docs/profile.md.",
     )
     say(console, correlation_line(stages["t2"]))
     for remark in measured.remarks:
