@@ -1,1 +1,1 @@
-"""Everything that would be copied to the drone: link, camera, pilot, watchdog."""
+"""Everything that runs on the drone: link, camera, pilot, watchdog."""

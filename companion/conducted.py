@@ -1,6 +1,6 @@
-"""The companion's clock where somebody conducts: to sleep is to give the turn back.
+"""The companion's clock in lockstep: sleeping gives the turn back to the scheduler.
 
-In lockstep simulated time stands while the companion works, and runs only while it sleeps.
+Simulated time stands still while the companion works, and advances only while it sleeps.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ turn, which may come earlier."""
 
 
 class Abandoned(BaseException):
-    """Raised in the companion when nobody conducts it any more; the message, if any, says why.
+    """Raised in the companion when the scheduler is gone; the message, if any, says why.
 
-    Not an Exception: what handles the failures of a flight must not handle this.
+    Not an Exception: code that handles the failures of a flight must not handle this.
     """
 
 
 class ConductedClock:
-    """Simulated time as a companion sees it that is conducted. Implements `clock.Clock`.
+    """Simulated time of a companion in lockstep. Implements `clock.Clock`.
 
-    It is the watchdog's guard, too (`guard.Guard`): in lockstep nothing takes simulated time but
-    sleeping, so deadlines can only pass there.
+    It is also the watchdog's guard (`guard.Guard`): in lockstep only sleeping takes simulated time,
+    so deadlines can only pass there.
     """
 
     def __init__(self, clock: Clock, sleep: Sleep) -> None:
-        """Take the simulated time, which somebody else moves, and what gives the turn back."""
+        """Take the simulated time, which the scheduler advances, and what gives the turn back."""
         self._clock = clock
         self._sleep = sleep
         self._watchdog: Watchdog | None = None
@@ -53,7 +53,7 @@ class ConductedClock:
                 watchdog.look()
 
     def start(self, watchdog: Watchdog) -> None:
-        """Look after a watchdog's deadlines from now on."""
+        """Check a watchdog's deadlines from now on."""
         self._watchdog = watchdog
 
     def stop(self) -> None:

@@ -1,6 +1,6 @@
-"""How flight controllers differ behind MAVSDK: all else in the companion knows one kind only.
+"""How flight controllers differ behind MAVSDK; the rest of the companion knows one kind only.
 
-Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7. What MAVSDK itself levels out is not here:
+Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7. What MAVSDK itself hides is not here:
 take-off and offboard fly in ArduCopter's GUIDED mode, leaving offboard is its BRAKE mode, and the
 altitude of a take-off travels with the command.
 """
@@ -18,26 +18,26 @@ RATE_HZ = 50.0
 """Rate asked for position, velocity and attitude [Hz]."""
 
 _STATUS_HZ = 5.0
-"""Rate asked for health and landed state, where they do not come unasked [Hz]; as PX4's."""
+"""Rate of health and landed state where they must be requested [Hz]; as PX4's."""
 
 _KINEMATICS = (("position_velocity_ned", RATE_HZ), ("attitude_quaternion", RATE_HZ))
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """What one kind of flight controller needs."""
+    """What is particular to one kind of flight controller."""
 
     name: str
     streams: tuple[tuple[str, float], ...]
-    """What must be asked for: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
+    """Streams to request: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
     health: tuple[str, ...]
-    """Flags of MAVSDK's health that say that it may be armed, and then flown by position."""
+    """Flags of MAVSDK's health that must be set for arming and flight by position."""
     arm_timeout_s: float
     """Longest time from the beginning of a mission, with the flight controller just powered up, to
     its arming [s]."""
 
     def requests(self, telemetry: Any) -> list[Callable[[], Any]]:
-        """Return what asks MAVSDK's telemetry for the streams, one after the other."""
+        """Return the calls of MAVSDK's telemetry that request the streams, in order."""
         return [partial(getattr(telemetry, f"set_rate_{name}"), hz) for name, hz in self.streams]
 
     def ready(self, telemetry: Any) -> bool:
@@ -65,7 +65,7 @@ PX4 = Dialect(
 
 ARDUPILOT = Dialect(
     "ArduPilot",
-    # Nothing but heartbeats comes unasked (SRn_ parameters are 0), and health is made of several.
+    # Only heartbeats are sent unasked (SRn_ parameters are 0), and health needs several streams.
     (
         *_KINEMATICS,
         ("position", _STATUS_HZ),
@@ -83,5 +83,5 @@ ARDUPILOT = Dialect(
 
 
 def dialect_of(autopilot: Autopilot) -> Dialect:
-    """Return the dialect of MAVSDK's kind of autopilot; any unknown one is taken for PX4."""
+    """Return the dialect of MAVSDK's kind of autopilot; unknown kinds are treated as PX4."""
     return ARDUPILOT if autopilot == Autopilot.ARDUPILOT else PX4

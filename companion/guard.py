@@ -1,4 +1,4 @@
-"""Who looks after the watchdog's deadlines: a thread of its own, on the real aircraft."""
+"""Checks the watchdog's deadlines; on the real aircraft from a thread of its own."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from airl_mav.core.clock import Clock
 from companion.watchdog import Watchdog
 
 POLL_US = 10_000
-"""How often deadlines are looked at [µs]."""
+"""Interval at which deadlines are checked [µs]."""
 
-LOOKS = 25
-"""So many looks, then the timer that ends a starved process is wound up again."""
+CHECKS_PER_RESTART = 25
+"""Checks between two restarts of the timer that ends a starved process."""
 
 STDERR = 2
-"""File descriptor for the last words of a process that is ended."""
+"""File descriptor for the traceback of a process that is ended."""
 
 STARVED_S = 5.0
-"""When the thread has not run for so long, the process ends [s of wall time]."""
+"""The process ends when the thread has not run for this long [wall s]."""
 
 
 class Guard(Protocol):
@@ -35,7 +35,7 @@ class Guard(Protocol):
 
 
 class ThreadGuard:
-    """Looks from a thread, and ends the process when that thread is starved."""
+    """Checks from a thread, and ends the process when that thread is starved."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -60,7 +60,7 @@ class ThreadGuard:
         try:
             while not self._done.is_set():
                 faulthandler.dump_traceback_later(STARVED_S, exit=True, file=STDERR)
-                for _ in range(LOOKS):
+                for _ in range(CHECKS_PER_RESTART):
                     if self._done.is_set():
                         return
                     watchdog.look()

@@ -22,7 +22,7 @@ SLICE_S = 0.5
 """Longest single wait for a flight controller [wall s]."""
 
 RAW_CHUNK = 65_536
-"""Bytes that are fed at a time; MAVSDK's parser puts a divided frame together again."""
+"""Bytes passed at a time; MAVSDK's parser reassembles a divided frame."""
 
 
 def open_connection(url: str, kind: ComponentType) -> Mavsdk:
@@ -30,12 +30,12 @@ def open_connection(url: str, kind: ComponentType) -> Mavsdk:
 
     Args:
         url: `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`.
-        kind: What it shows itself as.
+        kind: Component type in its heartbeat.
 
     Raises:
         UsageError: The URL is invalid or its port is taken.
     """
-    # MAVSDK's own log goes to standard output; its findings reach us as results.
+    # MAVSDK would log to standard output; errors are returned as results.
     log_subscribe(lambda *_: True)
     mavsdk = Mavsdk(Configuration.create_with_component_type(kind))
     result = mavsdk.add_any_connection(url)
@@ -46,7 +46,7 @@ def open_connection(url: str, kind: ComponentType) -> Mavsdk:
 
 
 def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | None = None) -> Any:
-    """Return the first flight controller that is heard; None when none is in time [wall s].
+    """Return the first flight controller that is found; None when none is in time [wall s].
 
     Raises LinkError when `stop`, set from outside, breaks off the wait.
     """
@@ -54,7 +54,7 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
     while (left_s := timeout_s - stopwatch.time_us() / US_PER_S) > 0.0:
         if stop is not None and stop.is_set():
             raise LinkError("stopped")
-        # In slices: a signal is only noticed between two calls into MAVSDK.
+        # In slices: a signal is handled only between two calls into MAVSDK.
         system = mavsdk.first_autopilot(min(left_s, SLICE_S))
         if system is not None:
             return system
@@ -89,7 +89,7 @@ def exchange_raw_bytes(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callabl
 
 
 def set_timeout(mavsdk: Mavsdk, seconds: float) -> None:
-    """Let MAVSDK repeat what has not been answered after so long [wall s]."""
+    """Set the time after which MAVSDK repeats an unanswered request [wall s]."""
     call = mavsdk._lib.mavsdk_set_timeout_s
     call.argtypes = [ctypes.c_void_p, ctypes.c_double]
     call(mavsdk._handle, seconds)

@@ -32,13 +32,13 @@ from companion.mavsdk_connection import (
 )
 
 POLL_S = 0.1
-"""How often a condition is looked at while waiting for it [s]."""
+"""Interval at which a condition is checked while waiting for it [s]."""
 
 HEALTH_SETTLE_S = 0.5
-"""Good health must last so long before arming: more than two of PX4's 5 Hz reports [s]."""
+"""Time that health must be good before arming: more than two of PX4's 5 Hz reports [s]."""
 
 TAKEOFF_REACHED_M = 0.2
-"""Closer than this to the take-off altitude, the climb is over: PX4's last decimetres take seconds,
+"""The climb is over this close to the take-off altitude [m]: PX4's last decimetres take seconds, as
 its approach halves the rest in 1.4 s."""
 
 OFFBOARD_SETTLE_S = 0.1
@@ -49,7 +49,7 @@ ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
 STREAM_TIMEOUT_S = 10.0
-"""One that is heard, but still boots, may take so long to grant its streams [wall s]."""
+"""Longest time until a flight controller that still boots grants its streams [wall s]."""
 
 STREAM_RETRY_S = 0.2
 """Time between two requests for a stream [wall s]."""
@@ -58,8 +58,8 @@ RAW_URL = "raw://"
 """Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
 
 RAW_TIMEOUT_S = 3600.0
-"""MAVSDK's time-out of a command on a raw connection [wall s]. Its answer is certain, but not when
-by the wall clock: a stopped process must not repeat commands when it goes on."""
+"""MAVSDK's time-out of a command on a raw connection [wall s]. The answer is certain, but not its
+wall time: a process that was stopped must not repeat commands when it resumes."""
 
 
 class MavsdkLink:
@@ -78,9 +78,9 @@ class MavsdkLink:
             url: MAVSDK connection, `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or
                 `raw://`.
             clock: For time-outs.
-            abandon: Set from another thread to break off whatever is being waited for.
-            heard: Whether the flight controller is heard, where the wall clock does not tell;
-                None = MAVSDK's word.
+            abandon: Set from another thread to end any wait.
+            heard: Whether the flight controller is received, where wall time cannot tell;
+                None = MAVSDK decides.
 
         Raises:
             UsageError: The URL is invalid or its port is taken.
@@ -176,7 +176,7 @@ class MavsdkLink:
         return exchange_raw_bytes(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
-        """Let MAVSDK repeat what has not been answered after so long [wall s], not after 0.5 s."""
+        """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
         set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
@@ -210,7 +210,7 @@ class MavsdkLink:
 
     @property
     def dialect(self) -> Dialect:
-        """What kind of flight controller is flown; PX4's before `connect`."""
+        """Dialect of the flight controller; PX4's before `connect`."""
         return self._dialect
 
     @property
@@ -249,9 +249,9 @@ class MavsdkLink:
     def arm(self, timeout_s: float, stop: threading.Event) -> None:
         """Wait until the flight controller reports good health, then arm.
 
-        Its health is told a few times a second: right after a reboot, old news may still be good
-        news. So it must have been good for a while, and a refused request is repeated. `stop`, set
-        from outside, breaks off the wait.
+        Health is reported a few times a second, so right after a reboot the last report may be out
+        of date: it must have been good for a while, and a refused request is repeated. `stop`, set
+        from outside, ends the wait.
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us = self._clock.time_us()
@@ -271,7 +271,7 @@ class MavsdkLink:
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
         """Take off and return when the altitude above the start is reached.
 
-        `stop`, set from outside, breaks off the climb.
+        `stop`, set from outside, ends the climb early.
         """
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
@@ -286,7 +286,7 @@ class MavsdkLink:
             self._pause()
 
     def enter_offboard(self) -> None:
-        """Send a standing setpoint and switch to offboard; return when setpoints count."""
+        """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
         self.set_velocity_body(STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)

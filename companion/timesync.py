@@ -1,4 +1,4 @@
-"""TIMESYNC exchanges with the flight controller: what its clock says, and how long asking takes.
+"""TIMESYNC exchanges with the flight controller: the offset of its clock, and the round trip.
 
 MAVSDK's own TIMESYNC keeps its result to itself, so the messages go through `mavlink_direct`.
 """
@@ -25,16 +25,16 @@ AUTOPILOT_COMPONENT = 1
 """MAV_COMP_ID_AUTOPILOT1: other components of the vehicle may answer too, by other clocks."""
 
 LAST_ANSWER_S = 0.2
-"""How long the last answer of a row is waited for [s]."""
+"""Wait for the last answer of a series [s]."""
 
 
 class TimesyncLink(MavsdkLink):
-    """A link that also asks the flight controller for its time."""
+    """A link that also exchanges TIMESYNC with the flight controller."""
 
     _direct: Any = None
     _system_id: int
     _pending: set[int]
-    """When questions without an answer were asked [µs]."""
+    """Times at which the unanswered requests were sent [µs]."""
     _answered: list[tuple[int, int, int]]
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
@@ -52,11 +52,11 @@ class TimesyncLink(MavsdkLink):
         super().close()
 
     def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
-        """Ask so often, and wait for the answers; `connect` comes first.
+        """Send requests, and wait for the answers; `connect` comes first.
 
         Args:
-            count: How often.
-            interval_s: From one question to the next [s].
+            count: Number of requests.
+            interval_s: Time from one request to the next [s].
             stop: Set from outside to end early.
         """
         asked_us = self._clock.time_us()
@@ -70,7 +70,7 @@ class TimesyncLink(MavsdkLink):
 
     @contextmanager
     def exchanging(self, interval_s: float) -> Iterator[None]:
-        """Ask every so often [s] from a thread of its own, for as long as the context lasts."""
+        """Send requests at an interval [s] from a thread, for as long as the context lasts."""
         ended = threading.Event()
 
         def ask_on() -> None:
@@ -90,8 +90,8 @@ class TimesyncLink(MavsdkLink):
             thread.join()
 
     def take_exchanges(self) -> Exchanges:
-        """Return the answered questions since the last call, in the order of the answers."""
-        # Another one may be heard meanwhile: it stays.
+        """Return the answered requests since the last call, in the order of the answers."""
+        # Another answer may arrive meanwhile: it stays.
         taken = self._answered[:]
         del self._answered[: len(taken)]
         columns = np.array(taken, np.int64).reshape(-1, 3)
@@ -104,7 +104,7 @@ class TimesyncLink(MavsdkLink):
         try:
             self._direct.send_message(MavlinkMessage(MESSAGE, fields_json=json.dumps(fields)))
         except MavlinkDirectError:
-            # As good as lost on the way.
+            # Treated as lost.
             self._pending.discard(sent_us)
 
     def _hear(self, message: Any, _: object) -> None:
@@ -115,7 +115,7 @@ class TimesyncLink(MavsdkLink):
             return
         fields = json.loads(message.fields_json)
         remote_ns, sent_us = fields["tc1"], fields["ts1"] // NS_PER_US
-        # Questions of the flight controller's own have no tc1; a second answer tells nothing new.
+        # Requests of the flight controller have no tc1; a second answer is of no use.
         if remote_ns == 0 or sent_us not in self._pending:
             return
         self._pending.discard(sent_us)

@@ -1,7 +1,7 @@
-"""The camera when the companion is conducted by another process.
+"""The camera in lockstep with another process.
 
-Frames come over ZeroMQ as always, by the wall clock. What the companion sees of them is decided by
-its turn, which names the newest one that has reached it.
+Frames arrive over ZeroMQ as always, by the wall clock. Which of them the companion sees is decided
+by its turn, which names the newest one that has reached it in simulated time.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from companion.tokens import NO_FRAME
 
 
 class TokenFrameSource:
-    """Shows the frame that the turn names. Implements `camera.FrameSource`."""
+    """Returns the frame that the turn names. Implements `camera.FrameSource`."""
 
     def __init__(self, frames: FrameSource, turns: TokenTurns, clock: Clock) -> None:
-        """Take where the frames come from, who names them, and the companion's clock."""
+        """Take the source of the frames, the turns that name them, and the companion's clock."""
         self._frames = frames
         self._turns = turns
         self._clock = clock
@@ -57,7 +57,7 @@ class TokenFrameSource:
         received, patience_s = self._frames.latest(), self._turns.patience_s
         waited_s = 0
         while received is None or received.frame.sequence != wanted:
-            # It is sent again as long as the turn has not been given back.
+            # It is sent again until the turn has been given back.
             seen = NO_FRAME if received is None else received.frame.sequence
             newer = self._frames.wait(newer_than_sequence=seen, timeout_s=1.0)
             if newer is None:

@@ -1,7 +1,8 @@
-"""The companion's end of the turns when whoever conducts is another process.
+"""The companion's end of the turns when the scheduler is another process.
 
-The turn comes as a MAVLink STATUSTEXT behind all telemetry, and goes back as one behind all
-setpoints: both travel through MAVSDK in order. See docs/reference/lockstep-protocol.md.
+A turn is granted by a MAVLink STATUSTEXT behind all telemetry, and given back by one behind all
+setpoints: both travel through MAVSDK in order. See
+docs/reference/lockstep-protocol.md.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from companion.conducted import Abandoned
 from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
 
 FAREWELL_S = 3
-"""After its end the companion stays so long, in case that the word of it is lost [s, as above]."""
+"""Time that the companion waits at its end, in case its last text is lost [s of waiting]."""
 
 
 class TextLink(Protocol):
-    """What carries the words; `link.MavsdkLink` is one."""
+    """What carries the texts; `mavsdk_link.MavsdkLink` is one."""
 
     setpoints_sent: int
 
@@ -54,8 +55,8 @@ class TokenTurns:
         self._link: TextLink | None = None
         self._send: Callable[[str], None] = lambda _: None
         self._number = 0
-        self._said: list[str] = []
-        """All words of this turn, to be said again should they be lost."""
+        self._sent: list[str] = []
+        """All texts of this turn, to be sent again should they be lost."""
 
     @property
     def clock(self) -> Clock:
@@ -64,7 +65,7 @@ class TokenTurns:
 
     @contextmanager
     def taken(self, link: TextLink) -> Iterator[None]:
-        """Take turns on a connected link for a while; what goes wrong in it ends them, too.
+        """Take turns on a connected link for as long as the context lasts, however it ends.
 
         Raises Abandoned when none comes.
         """
@@ -93,7 +94,7 @@ class TokenTurns:
 
     def tell(self, phase: str) -> None:
         """Say that the mission enters a phase."""
-        self._say(Phase(self._number, phase).text())
+        self._send_text(Phase(self._number, phase).text())
 
     def _end(self) -> None:
         """Give the turn back for good."""
@@ -103,7 +104,7 @@ class TokenTurns:
             if given is not None and given.order == "end":
                 return
             if given is not None:
-                self._say_again()
+                self._resend()
 
     def _name_of(self, interrupt: threading.Event | None) -> Event:
         if interrupt is None:
@@ -114,7 +115,7 @@ class TokenTurns:
             return "stop"
         raise ValueError("a sleep in lockstep can be ended by an order or by a frame only")
 
-    # --- words
+    # --- texts
 
     def _hear(self, text: str) -> None:
         """Take a text of the flight controller, on MAVSDK's thread."""
@@ -124,15 +125,15 @@ class TokenTurns:
 
     def _give_back(self, back: TurnBack) -> None:
         while self._next_given(0.0) is not None:
-            pass  # said again meanwhile, because this turn took long
-        self._say(back.text())
+            pass  # sent again meanwhile, because this turn took long
+        self._send_text(back.text())
 
-    def _say(self, text: str) -> None:
-        self._said.append(text)
+    def _send_text(self, text: str) -> None:
+        self._sent.append(text)
         self._send(text)
 
-    def _say_again(self) -> None:
-        for text in self._said:
+    def _resend(self) -> None:
+        for text in self._sent:
             self._send(text)
 
     def _next_given(self, timeout_s: float) -> TurnGiven | None:
@@ -144,8 +145,8 @@ class TokenTurns:
     def _await_turn(self) -> None:
         waited_s = 0
         while waited_s < self.patience_s:
-            # Counted in short waits, not read off a clock: a process that was stopped has not
-            # waited.
+            # Counted in short waits, not by a clock: time in which the process was stopped does not
+            # count.
             given = self._next_given(1.0)
             if given is None:
                 waited_s += 1
@@ -153,14 +154,14 @@ class TokenTurns:
                 self._take(given)
                 return
             else:
-                self._say_again()
+                self._resend()
         raise Abandoned(f"the flight controller gave no turn in {self.patience_s:g} s")
 
     def _take(self, given: TurnGiven) -> None:
         if given.order == "end":
             raise Abandoned("the flight controller has ended the flight")
         self._number = given.number
-        self._said.clear()
+        self._sent.clear()
         self._clock.sleep_until(given.time_us)
         if given.order == "abandon":
             self._abandon.set()

@@ -1,4 +1,4 @@
-"""The words by which two processes pass the turn: texts of MAVLink STATUSTEXTs.
+"""The protocol by which two processes pass the turn: texts of MAVLink STATUSTEXTs.
 
 See docs/reference/lockstep-protocol.md. At most 50 characters each.
 """
@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Literal, cast
 
 Order = Literal["", "land", "abandon", "end"]
-"""What the companion is told: nothing; stop and land; there is nothing left to land; nobody
-conducts any more."""
+"""Order to the companion: none; stop and land; abandon the flight without landing; the scheduler
+has ended."""
 
 Event = Literal["", "frame", "stop"]
-"""What wakes the companion early: nothing; the next frame of the camera; an order."""
+"""Event that wakes the companion early: none; the next frame of the camera; an order."""
 
 NO_FRAME = -1
 
@@ -30,18 +30,18 @@ class TurnGiven:
     number: int
     """Counts up by one."""
     time_us: int
-    """Simulated time; it stands until the turn is given back [µs]."""
+    """Simulated time; it stands still until the turn is given back [µs]."""
     frame: int = NO_FRAME
     """Sequence of the newest frame that has reached the companion."""
     order: Order = ""
 
     def text(self) -> str:
-        """Return it as sent."""
+        """Return the text."""
         return f"F{self.number} {self.time_us} {self.frame} {self.order}".rstrip()
 
     @classmethod
     def parse(cls, text: str) -> TurnGiven | None:
-        """Read a text; None for any other."""
+        """Parse a text; return None if it is another one."""
         match = _GIVEN.fullmatch(text)
         if match is None:
             return None
@@ -56,23 +56,23 @@ class TurnBack:
     number: int
     """As given."""
     wake_us: int | None = None
-    """When it wants the next turn [µs]; None: it does not say."""
+    """When it wants the next turn [µs]; None: not stated."""
     setpoints_sent: int | None = None
-    """How many setpoints it has sent so far, repetitions not counted; None: it does not say."""
+    """Setpoints that it has sent so far, without repetitions; None: not stated."""
     event: Event = ""
     ended: bool = False
     """There is no next turn."""
 
     def text(self) -> str:
-        """Return it as sent."""
+        """Return the text."""
         if self.ended:
             return f"D{self.number} end"
-        words = (self.wake_us, self.setpoints_sent, self.event or None)
-        return " ".join([f"D{self.number}", *(str(word) for word in words if word is not None)])
+        fields = (self.wake_us, self.setpoints_sent, self.event or None)
+        return " ".join([f"D{self.number}", *(str(field) for field in fields if field is not None)])
 
     @classmethod
     def parse(cls, text: str) -> TurnBack | None:
-        """Read a text; None for any other."""
+        """Parse a text; return None if it is another one."""
         match = _BACK.fullmatch(text)
         if match is None:
             return None
@@ -95,11 +95,11 @@ class Phase:
     name: str
 
     def text(self) -> str:
-        """Return it as sent."""
+        """Return the text."""
         return f"P{self.number} {self.name}"
 
     @classmethod
     def parse(cls, text: str) -> Phase | None:
-        """Read a text; None for any other."""
+        """Parse a text; return None if it is another one."""
         match = _PHASE.fullmatch(text)
         return None if match is None else cls(int(match[1]), match[2])

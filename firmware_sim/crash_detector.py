@@ -9,13 +9,14 @@ from firmware_sim.plant.world import FLOOR
 from firmware_sim.simulation import Simulation
 
 TOUCHDOWN_M_S = 2.0
-"""A slower touch of the floor is a landing: PX4 comes down with 0.7 to 1.5 m/s [m/s]."""
+"""A slower touch of the floor is a landing: PX4 lands at 0.7 to 1.5 m/s [m/s]."""
 
 
 def is_crash(hit: Collision, flight: Flight) -> bool:
-    """Return whether a contact ends a flight: all do but what happens on the ground.
+    """Return whether a contact ends a flight.
 
-    On the way up and down that includes a gentle touch of the floor, in the modes that fly there.
+    All contacts do, except with the floor while the vehicle stands, and except a gentle touch of
+    the floor in the modes that take off and land.
     """
     if hit.what != FLOOR:
         return True
@@ -24,15 +25,15 @@ def is_crash(hit: Collision, flight: Flight) -> bool:
 
 
 class CrashDetector:
-    """Remembers the first thing that was hit in flight. Looks once a tick, for the flight then."""
+    """Remembers the first thing that was hit in flight; to be asked once a tick."""
 
     def __init__(self) -> None:
         self.hit: str | None = None
-        """What was hit; None so far."""
+        """What was hit; None while nothing was."""
         self._seen = 0
 
     def look(self, simulation: Simulation) -> bool:
-        """Take this tick's contacts; True when one of them is the first that ends the flight."""
+        """Check the contacts of this tick; return whether the first crash is among them."""
         hits = simulation.plant.collisions
         if len(hits) == self._seen:
             return False

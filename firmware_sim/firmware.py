@@ -21,7 +21,7 @@ from firmware_sim.pacing import Pacing
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 IDLE_S = 0.02
-"""How often requests are looked for while no episode stands [s]."""
+"""How often requests are checked while no episode is loaded [s]."""
 
 
 class FrameServer(Protocol):
@@ -40,10 +40,10 @@ class FrameServer(Protocol):
 
 
 class FlightStack(Protocol):
-    """What is aboard beside sensors and motors: a flight controller and its MAVLink links.
+    """A flight controller and its MAVLink links: all that is aboard besides sensors and motors.
 
-    The links stay; the flight controller is booted anew for each episode. Nothing here raises
-    while flying, but for `boot`.
+    The links stay open; the flight controller is booted anew for each episode. Only `boot` and
+    `connect` raise.
     """
 
     def boot(self, setup: EpisodeSetup) -> FlightController:
@@ -51,19 +51,20 @@ class FlightStack(Protocol):
 
         Raises:
             UsageError: The vehicle's parameters are wrong, or there is no such firmware.
-            FirmwareLostError: Real firmware died on the way.
+            FirmwareLostError: External firmware died while it booted.
         """
         ...
 
     def connect(self, tick: Callable[[], int]) -> None:
-        """Let it talk: it has had its first tick.
+        """Open its MAVLink, after its first tick.
 
         Args:
-            tick: Flies one more and returns its simulated time [µs], for what takes its time.
+            tick: Flies one more tick and returns its simulated time [µs], for firmware that needs
+                simulated time to get ready.
 
         Raises:
-            UsageError: Real firmware is silent, or is set up for another vehicle.
-            FirmwareLostError: Real firmware died.
+            UsageError: External firmware is silent, or is set up for another vehicle.
+            FirmwareLostError: External firmware died.
         """
         ...
 
@@ -110,7 +111,7 @@ class BuiltinFlightStack:
         return self._autopilot
 
     def connect(self, tick: Callable[[], int]) -> None:
-        """Let it talk."""
+        """Attach the autopilot to the MAVLink server."""
         del tick
         if self._autopilot is not None:
             self._server.attach(self._autopilot)
@@ -130,7 +131,7 @@ class Loaded:
 
 
 class Firmware:
-    """Flies one episode after the other; its links and its camera stay."""
+    """Flies one episode after the other; its links and its camera stay open."""
 
     def __init__(
         self,
@@ -186,7 +187,7 @@ class Firmware:
 
         Raises:
             UsageError: The episode cannot be flown, or there is no such firmware.
-            FirmwareLostError: Real firmware died on the way.
+            FirmwareLostError: External firmware died while it booted.
         """
         self.discard()
         autopilot = self.flight_stack.boot(setup)
@@ -208,7 +209,7 @@ class Firmware:
         powered_us = simulation.time_us
         self.flight_stack.connect(self._tick_on_the_ground)
         if simulation.time_us > powered_us:
-            # The time that real firmware took to boot is no part of the episode.
+            # The time that external firmware took to boot is no part of the episode.
             simulation.begin()
             start_us = simulation.start_us
         self._sockets = self.flight_stack.filenos()
@@ -216,8 +217,8 @@ class Firmware:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
             self.flight_stack.log_to(self._tlog)
         if self.epoch_ns is not None:
-            # What lives for the whole episode need not be searched by the garbage collector: a
-            # full collection would stall the 250 Hz loop by tens of milliseconds.
+            # Objects that live for the whole episode are exempt from garbage collection: a full
+            # collection would stall the 250 Hz loop for tens of milliseconds.
             gc.collect()
             gc.freeze()
         # All this took wall time, which is no part of the episode: it starts now.
@@ -232,9 +233,9 @@ class Firmware:
         return simulation.time_us
 
     def step(self) -> None:
-        """Wait for the next tick's wall time, then run it.
+        """Wait until the next tick is due, then run it.
 
-        Raises FirmwareLostError when real firmware does not answer.
+        Raises FirmwareLostError when external firmware does not answer.
         """
         simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:

@@ -1,4 +1,4 @@
-"""A flight controller under test: the built-in one, or a bridge to real firmware."""
+"""A flight controller as a simulation flies it: the built-in one, or external firmware."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING, Protocol
 from airl_mav.core.errors import UsageError
 from firmware_sim.interfaces import Autopilot, Truth
 
-if TYPE_CHECKING:  # Who only looks for a program need not load an estimator.
+if TYPE_CHECKING:  # Checking the options of external firmware must not load an estimator.
     from firmware_sim.autopilot.autopilot_state import Message, Setpoint
     from firmware_sim.autopilot.commander import Flight
     from firmware_sim.autopilot.estimator import Estimator
 
 
 class FirmwareLostError(Exception):
-    """Real firmware died, hangs, or talks nonsense: the flight is no test of anything."""
+    """External firmware died, hangs, or sends invalid data: the flight proves nothing."""
 
 
 class FirmwareMissingError(UsageError):
-    """Real firmware cannot be started, or never connected."""
+    """External firmware cannot be started, or never connected."""
 
 
 class Internals(Protocol):
-    """What can be seen of a flight controller whose inside is open."""
+    """What the recorder reads of a flight controller that shows its internals."""
 
     on_setpoint: Callable[[Setpoint, int], None] | None
     """Called with every accepted setpoint and its time of receipt [µs], if set."""
@@ -35,14 +35,14 @@ class Internals(Protocol):
 
     @property
     def estimator(self) -> Estimator:
-        """What it believes."""
+        """Its estimator."""
         ...
 
 
 class FlightController(Autopilot, Protocol):
-    """An autopilot, and what a rehearsal must know of it. One for each episode.
+    """An autopilot, and what a rehearsal must know of it; a new one for each episode.
 
-    `step` of a bridge may raise `FirmwareLostError`.
+    `step` of external firmware may raise `FirmwareLostError`.
     """
 
     on_message: Callable[[Message], None] | None
@@ -50,7 +50,7 @@ class FlightController(Autopilot, Protocol):
 
     @property
     def rate_hz(self) -> int:
-        """How many sensor samples a second of simulated time it wants."""
+        """Sensor samples that it needs per second of simulated time."""
         ...
 
     @property
@@ -60,11 +60,14 @@ class FlightController(Autopilot, Protocol):
 
     @property
     def internals(self) -> Internals | None:
-        """Its inside; None where nobody can look into it: real firmware."""
+        """Its internals; None for external firmware, which does not show them."""
         ...
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Take what tells the true state: real firmware's simulators send it beside the sensors."""
+        """Accept a source of the true state.
+
+        Simulator interfaces of external firmware send it along with the sensors.
+        """
         ...
 
     def close(self) -> None:

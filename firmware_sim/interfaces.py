@@ -3,7 +3,8 @@
 A plant turns motor commands into sensor samples; an autopilot turns sensor samples into motor
 commands. Real firmware sits behind the same two messages (HIL_SENSOR / HIL_ACTUATOR_CONTROLS).
 
-All are named tuples: at 250 Hz and a hundred times real time, making a dataclass shows.
+All are named tuples, which are faster to create than dataclasses: that counts at 250 Hz and a
+hundred times real time.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class ActuatorControls(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """What really is; never shown to the autopilot."""
+    """The true state; never shown to the autopilot."""
 
     time_us: int
     position: Vector  # (3,) NED [m]

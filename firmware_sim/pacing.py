@@ -1,4 +1,4 @@
-"""How simulated time relates to the wall clock: level with it, or as fast as it goes."""
+"""How simulated time relates to the wall clock: paced by it, or as fast as possible."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Protocol
 from airl_mav.core.clock import Clock, SimClock, WallClock
 
 MAX_LAG_US = 200_000
-"""Further behind than this, simulated time gives up the difference instead of racing through it:
-a burst of ticks would outrun the companion [µs]."""
+"""A greater lag is given up instead of caught up: a burst of ticks would outrun the companion
+[µs]."""
 
 SPIN_US = 150
-"""The last stretch before a tick is polled: select() overshoots by about this much [µs]."""
+"""The time before a tick that is polled instead of slept: select() overshoots by about this much
+[µs]."""
 
 
 class Pacing(Protocol):
@@ -24,28 +25,28 @@ class Pacing(Protocol):
 
     @property
     def clock(self) -> Clock:
-        """Simulated time, between ticks too where it is tied to the wall clock."""
+        """Simulated time; between ticks it advances only where it is paced by the wall clock."""
         ...
 
     @property
     def epoch_ns(self) -> int | None:
-        """Host monotonic time of simulated time 0 [ns]; None when the two are not tied."""
+        """Host monotonic time of simulated time 0 [ns]; None when it is not paced."""
         ...
 
     def restart(self, tick_us: int) -> None:
-        """Say that simulated `tick_us` is now: what came before took time of no episode."""
+        """Declare that it is simulated `tick_us` now: time before that belongs to no episode."""
         ...
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until simulated `tick_us` is due and return the time then [µs].
 
-        When a socket talks before, `readable` is called with the time of that.
+        When a socket becomes readable before, `readable` is called with the time of that.
         """
         ...
 
 
 class WallPacing:
-    """Every tick at its wall time."""
+    """Runs every tick at its wall time."""
 
     def __init__(self, speed: float) -> None:
         """Take the speed: simulated seconds per wall second, > 0."""
@@ -59,9 +60,9 @@ class WallPacing:
         return self.clock.epoch_ns
 
     def restart(self, tick_us: int) -> None:
-        """Say that simulated `tick_us` is now: what came before may have run slower, or faster.
+        """Declare that it is simulated `tick_us` now, whatever the wall clock says.
 
-        Real firmware boots as fast as it goes, far ahead of the wall clock.
+        External firmware boots as fast as possible, far ahead of the wall clock.
         """
         self.clock.slip(self.clock.time_us() - tick_us)
         self._stamp_us = 0
@@ -99,7 +100,7 @@ class WallPacing:
 
 
 class Unpaced:
-    """No waiting: simulated time runs as fast as the ticks are computed."""
+    """No pacing: simulated time runs as fast as the ticks are computed."""
 
     epoch_ns = None
     slipped_us = 0

@@ -1,4 +1,4 @@
-"""What is kept of a flight for whoever reads the run: only where somebody collects it."""
+"""What is recorded of a flight; only where somebody collects the record."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ MEMORY_SIZE = 43
 
 
 class Demand(NamedTuple):
-    """What to fly; NaN = not commanded."""
+    """The setpoint of the cascade; NaN = not commanded."""
 
     position: Vec
     """NED [m]."""
@@ -60,7 +60,7 @@ class Demand(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What the cascade decided."""
+    """Output of the cascade."""
 
     motors: Motors
     thrust: float
@@ -97,10 +97,7 @@ def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
 
 @kernel
 def reset_integrals(memory: Memory) -> None:
-    """Forget what the integrators learned: on the ground they wind up against the floor.
-
-    The loops forget their setpoints and begin anew.
-    """
+    """Reset the integrators, which wind up on the ground, and the setpoints of all loops."""
     for i in range(3):
         memory[_VEL_INT + i] = 0.0
         memory[_RATE_INT + i] = 0.0
@@ -172,7 +169,7 @@ def cascade_tick(
     first = memory[_PRIMED] == 0.0
     if first:
         _prime(velocity, omega, memory, weights)
-    # What an outer loop publishes at this tick is for the next one, but for the very first.
+    # Setpoints published by an outer loop take effect at the next tick, except at the very first.
     q_sp, yaw_rate, thrust_sp = _attitude_sp(memory)
     if memory[_WAIT] == 0.0:
         _position_loop(position, velocity, q, demand, memory, gains, weights, dt)
@@ -209,7 +206,7 @@ def settle_gyro_filter(memory: Memory, gyro: Biquad) -> None:
 
 @kernel
 def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
-    """Begin: the filters have long seen the first sample, the position loop is due."""
+    """Start: the filters are settled at the first sample, the position loop is due."""
     memory[_PRIMED] = 1.0
     memory[_WAIT] = 0.0
     for i in range(3):

@@ -1,7 +1,7 @@
 """The cascade of one vehicle that is flown from Python, tick by tick.
 
-Taking forty gains into compiled code one by one costs more than the control law: only arrays and
-flat tuples cross over.
+Passing forty gains to compiled code one by one costs more than the control law: only arrays and
+flat tuples are passed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SIZE = 11
 
 
 class ControlSetpoints(NamedTuple):
-    """What the loops of the cascade are told."""
+    """The setpoints of the cascade's loops."""
 
     attitude: Row
     """(4,) body -> NED."""
@@ -96,7 +96,7 @@ class Controller:
         self.rest()
 
     def set_gains(self, gains: Gains) -> None:
-        """Fly on with other gains."""
+        """Change the gains in flight."""
         cutoff_hz = gains.gyro_cutoff_hz
         if cutoff_hz != self._gyro_cutoff_hz:
             # The delay elements are scaled by the cut-off: left as they are, a much higher one
@@ -128,7 +128,7 @@ class Controller:
         return motors
 
     def rest(self) -> None:
-        """The motors stand still: nothing may wind up against the floor; there is no output."""
+        """Reset while the motors are stopped: no integrator may wind up, and there is no output."""
         reset_integrals(self._memory)
         self._output[:] = 0.0
         self._output[_ATTITUDE] = 1.0
@@ -149,7 +149,7 @@ class Controller:
         return self._output.item(_VELOCITY + 2) > 0.0
 
     def setpoints(self) -> ControlSetpoints:
-        """Return a copy of what the newest tick decided."""
+        """Return a copy of the setpoints of the newest tick."""
         row = self._output.copy()
         return ControlSetpoints(
             row[_ATTITUDE:_RATES], row[_RATES:_VELOCITY], row[_VELOCITY:_THRUST], row.item(_THRUST)

@@ -122,7 +122,7 @@ missing: no motor command would turn such a vehicle about that axis."""
 
 
 def _allocation(forward: float, right: float) -> tuple[float, float]:
-    """Return what a motor gets of a roll and of a pitch torque, for arms in any one unit.
+    """Return the share of a roll and of a pitch torque in each motor's command.
 
     The pseudo-inverse of a quad X, normalised as PX4's ControlAllocationPseudoInverse does it: one
     scale for both axes, so that the weaker one moves a motor by sin 45 deg.
@@ -137,7 +137,7 @@ _COUNT = len(Gains._fields)
 
 
 def pack(gains: Gains) -> NDArray[np.float64]:
-    """Return the gains as a row of floats: numba takes an array at once, a tuple by its fields."""
+    """Return the gains as a row of floats, which numba passes faster than a tuple."""
     return np.array(gains, np.float64)
 
 

@@ -80,7 +80,7 @@ def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
     m = _add(_add(level, rolling, torque[0]), pitching, torque[1])
     turning = _add(m, YAW, torque[2])
     if _in_range(m) and _in_range(turning):
-        return turning, (0.0, 0.0, 0.0)  # nothing is saturated, which is the rule
+        return turning, (0.0, 0.0, 0.0)  # nothing is saturated, the usual case
     m = _desaturate(m, THRUST, 1.0, True)
     m = _desaturate(m, rolling, 1.0, False)
     m = _desaturate(m, pitching, 1.0, False)
@@ -102,5 +102,5 @@ def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
 
 @kernel
 def _dead(value: float) -> float:
-    """Return 0 for rounding noise: a saturated axis is short of more than that."""
+    """Return 0 for rounding noise: the deficit of a saturated axis is greater."""
     return value if abs(value) > 1e-6 else 0.0

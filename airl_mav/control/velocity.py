@@ -25,7 +25,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
     """Return the velocity to fly NED [m/s]: position error x gain + feed-forward, limited.
 
     A NaN axis of `position_sp` has no position loop; a NaN axis of `velocity_ff` adds nothing.
-    Where neither says anything of the horizontal, nor does the result: NaN, not controlled.
+    Where neither commands a horizontal axis, the horizontal result is NaN: not controlled.
     The horizontal limit gives the position correction priority over the feed-forward.
     """
     px = 0.0 if math.isnan(position_sp[0]) else gains.pos_p_xy * (position_sp[0] - position[0])
@@ -97,7 +97,7 @@ def velocity_control(
     ax = gains.vel_p_xy * ex + integral[0] - gains.vel_d_xy * velocity_dot[0]
     ay = gains.vel_p_xy * ey + integral[1] - gains.vel_d_xy * velocity_dot[1]
     if math.isnan(velocity_sp[0]):
-        # Not controlled: level. What was learned against the drag would accelerate it for ever.
+        # Not controlled: level. The integral against drag would accelerate it for ever.
         ax, ay, ex, ey = 0.0, 0.0, 0.0, 0.0
         integral = (0.0, 0.0, integral[2])
     az = gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]

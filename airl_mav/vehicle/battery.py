@@ -13,7 +13,7 @@ COULOMB_PER_MAH = 3.6
 def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float) -> float:
     """Return the voltage under a constant-power load [W]: V = E - R P / V, upper root.
 
-    Beyond the greatest power that the pack can give, E²/4R, the voltage of that power: E/2.
+    Above the greatest power that the pack can deliver, E²/4R, the voltage at that power: E/2.
     """
     discriminant = open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power
     return 0.5 * (open_circuit_v + math.sqrt(max(0.0, discriminant)))

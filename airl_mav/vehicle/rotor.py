@@ -30,13 +30,13 @@ def steady_speed(command: float, thrust_curve: float) -> float:
 
 @kernel
 def lag(airframe: Airframe, dt: float) -> float:
-    """Return the share of a speed error that is left after dt [s]: a first-order lag, exact."""
+    """Return the share of a speed error that remains after dt [s]: exact for a first-order lag."""
     return math.exp(-dt / airframe.rotor_time_constant)
 
 
 @kernel
 def settle(speed: float, command: float, airframe: Airframe, left: float) -> float:
-    """Return the speed fraction after the time in which the share `left` of an error is left."""
+    """Return the speed fraction after a step that leaves the share `left` of the error."""
     target = steady_speed(command, airframe.thrust_curve)
     return target + (speed - target) * left
 

@@ -1,4 +1,4 @@
-"""The built-in autopilot: sensors in, motor commands out, PX4's manners towards its clients."""
+"""The built-in autopilot: sensors in, motor commands out, PX4's behaviour towards its clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from firmware_sim.autopilot.autopilot_state import (
 from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
-from firmware_sim.autopilot.failsafe import Watch
+from firmware_sim.autopilot.failsafe import FailsafeTimers
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
@@ -65,7 +65,7 @@ class BuiltinAutopilot:
         self._estimator = Estimator(value, new_filter)
         self._state = self._estimator.state
         self._guidance = Guidance(value)
-        self._watch = Watch(value)
+        self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
         parameters.on_change(self._read_gains)
@@ -73,7 +73,7 @@ class BuiltinAutopilot:
         self._status = _status(self._flight)
         self._messages: list[Message] = []
         self._demand: Demand | None = None
-        """What is flown; None = the motors stand still."""
+        """What is being flown; None = the motors are stopped."""
         self._motors = _STILL
         self._sample: SensorSample | None = None
         self._mag = np.zeros(3)
@@ -105,7 +105,9 @@ class BuiltinAutopilot:
         if readiness is not None:
             self._handle(readiness)
         idle = self._demand is None
-        for due in self._watch.events(self._flight, time_us, sample.battery.remaining, idle=idle):
+        for due in self._failsafe.events(
+            self._flight, time_us, sample.battery.remaining, idle=idle
+        ):
             if isinstance(due, Message):
                 self._say(due)
             else:
@@ -146,7 +148,7 @@ class BuiltinAutopilot:
         if step.flight.mode is not before.mode:
             self._guidance.enter(step.flight.mode, self._state)
         if before.phase < _GROUND <= step.flight.phase:
-            self._watch.armed()
+            self._failsafe.armed()
             self._set_home()
             self._guidance.enter(step.flight.mode, self._state)
         return step.result
@@ -199,11 +201,11 @@ class BuiltinAutopilot:
 
     @property
     def internals(self) -> BuiltinAutopilot:
-        """Itself: everything can be looked at."""
+        """Itself: it shows everything."""
         return self
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Do nothing: it never sees the truth."""
+        """Ignore the true state: it flies by its estimate alone."""
 
     def close(self) -> None:
         """Do nothing: it holds nothing."""
@@ -215,7 +217,9 @@ class BuiltinAutopilot:
 
     def arm(self, *, force: bool) -> Result:
         """Ask to arm. Force skips the offboard check, never the estimator's health."""
-        blind = self._flight.mode is Mode.OFFBOARD and not self._watch.setpoint_fresh(self._now_us)
+        blind = self._flight.mode is Mode.OFFBOARD and not self._failsafe.setpoint_fresh(
+            self._now_us
+        )
         return self._handle(Event.ARM_BLIND if blind and not force else Event.ARM)
 
     def disarm(self, *, force: bool) -> Result:
@@ -234,7 +238,7 @@ class BuiltinAutopilot:
     def set_mode(self, mode: Mode) -> Result:
         """Ask for a mode."""
         if mode is Mode.OFFBOARD:
-            fresh = self._watch.setpoint_fresh(self._now_us)
+            fresh = self._failsafe.setpoint_fresh(self._now_us)
             return self._handle(Event.OFFBOARD if fresh else Event.OFFBOARD_BLIND)
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
@@ -250,13 +254,13 @@ class BuiltinAutopilot:
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
         self._guidance.offer(setpoint)
-        self._watch.setpoint(time_us)
+        self._failsafe.setpoint(time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint, time_us)
 
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""
-        self._watch.gcs_heartbeat(time_us)
+        self._failsafe.gcs_heartbeat(time_us)
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""

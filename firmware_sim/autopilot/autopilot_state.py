@@ -1,6 +1,6 @@
 """What the autopilot knows and reports: plain data for MAVLink, the recorder and tests.
 
-What is made for every snapshot is a named tuple: quicker made than a dataclass.
+Whatever is created for every snapshot is a named tuple, which is faster than a dataclass.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Mode(IntEnum):
     LAND = 3
     RETURN = 4
     POSITION = 5
-    """Position Control: only as the offboard-loss fallback. Without a pilot's sticks PX4 was
+    """Position Control: only as the offboard-loss fallback. Without a pilot's input PX4 was
     measured to brake and to descend to the ground."""
 
 
@@ -117,11 +117,11 @@ class Estimate(NamedTuple):
 
 
 class CommanderStatus(NamedTuple):
-    """The commander's public face."""
+    """What the commander reports."""
 
     arming: Arming
     mode: Mode
-    """What flies now; a failsafe may differ from what the user asked."""
+    """What flies now; in a failsafe it may differ from what the user asked for."""
     intended_mode: Mode
     landed: Landed
     failsafe: bool

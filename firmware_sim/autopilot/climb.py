@@ -1,4 +1,4 @@
-"""How fast the automatic modes climb and sink towards a height.
+"""Vertical trajectories of the automatic modes: how fast they climb and descend to a height.
 
 Source: PX4 1.16, `PositionSmoothing` on the vertical axis and `computeMaxSpeedFromDistance`
 (lib/motion_planning, TrajMath.hpp). The jerk limit of the speed itself is left out: it delays a
@@ -14,7 +14,7 @@ from airl_mav.core.constants import US_PER_S
 
 
 class ClimbLimits(NamedTuple):
-    """What bounds a vertical movement."""
+    """Limits of a vertical movement."""
 
     speed_m_s: float
     acceleration_m_s2: float
@@ -33,13 +33,13 @@ class Climb:
 
     def __init__(self) -> None:
         self.height_m = 0.0
-        """Where it is."""
+        """Present height [m]."""
         self.speed_m_s = 0.0
-        """Upwards."""
+        """Present vertical speed, upwards positive [m/s]."""
         self._time_us: int | None = None
 
     def restart(self, speed_m_s: float) -> None:
-        """Go on from a speed."""
+        """Continue from a vertical speed [m/s]."""
         self.speed_m_s, self._time_us = speed_m_s, None
 
     def towards(self, height_m: float, limits: ClimbLimits, time_us: int) -> None:

@@ -1,6 +1,6 @@
 """The commander: an explicit table of (phase, event) -> what happens. Pure, no time, no I/O.
 
-Who may arm, which mode follows which, what is refused and with which words: as PX4 does it
+Who may arm, which mode follows which, what is refused and with which text: as PX4 does it
 (measured on PX4 1.16 with MAVSDK 4.1). Timers and measurements that produce events live in
 `failsafe.py`; what a mode flies lives in `guidance.py`.
 """
@@ -14,7 +14,7 @@ from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severi
 
 
 class Phase(IntEnum):
-    """Where in its life a flight is."""
+    """Phase of a flight."""
 
     BOOT = 0
     """Estimator not converged."""
@@ -32,7 +32,7 @@ class Event(Enum):
     READY = auto()
     """The estimator has converged."""
     NOT_READY = auto()
-    """The estimator has lost it."""
+    """The estimator is no longer converged."""
     ARM = auto()
     ARM_BLIND = auto()
     """Arm requested in offboard mode without a fresh setpoint."""
@@ -55,11 +55,11 @@ class Event(Enum):
     TAKEOFF_DONE = auto()
     """Take-off altitude reached."""
     DISARM_TIMEOUT = auto()
-    """Stood on the ground, armed, for too long."""
+    """Armed on the ground for COM_DISARM_PRFLT."""
     LANDED_TIMEOUT = auto()
     """Landed for COM_DISARM_LAND."""
     SETPOINT_LOST_POSITION = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 0 (or 1, 2: no pilot's sticks here)."""
+    """Offboard loss with COM_OBL_RC_ACT = 0 (or 1, 2: there is no pilot's input here)."""
     SETPOINT_LOST_RETURN = auto()
     """Offboard loss with COM_OBL_RC_ACT = 3."""
     SETPOINT_LOST_LAND = auto()
@@ -84,11 +84,11 @@ class Flight:
     mode: Mode = Mode.HOLD
     """What flies."""
     intended: Mode = Mode.HOLD
-    """What the user asked for last."""
+    """The mode that the user asked for last."""
     after_disarm: Mode = Mode.HOLD
-    """The last asked mode that is neither take-off nor landing: what disarming returns to."""
+    """The last requested mode but take-off, landing and return: disarming restores it."""
     failsafe: bool = False
-    """A failsafe chose the mode."""
+    """Whether a failsafe chose the mode."""
 
 
 class Choice(Enum):
@@ -159,7 +159,7 @@ _LOW_LAND = Row(
     choice=Choice.FORCE, mode=Mode.LAND, text=_critical("Critical battery, landing now")
 )
 
-# Every pair (event, phase) stands here; a test walks all of them.
+# Complete: a test checks every pair (event, phase).
 TABLE: dict[Event, dict[Phase, Row]] = {
     Event.READY: {_B: Row(phase=_S), _S: _IGNORE, _G: _IGNORE, _A: _IGNORE},
     # In the air there is no way back to the ground state: the estimate is flown as it is.
@@ -258,13 +258,16 @@ TABLE: dict[Event, dict[Phase, Row]] = {
 }
 
 
-def _heeded(event: Event, phase: Phase) -> Event | None:
+def _unless_ignored(event: Event, phase: Phase) -> Event | None:
     return None if TABLE[event][phase] is _IGNORE else event
 
 
-READINESS = tuple((_heeded(Event.NOT_READY, phase), _heeded(Event.READY, phase)) for phase in Phase)
-"""[phase][whether the estimator is healthy]: the event that this is, None where the table ignores
-it. Asked at every tick."""
+READINESS = tuple(
+    (_unless_ignored(Event.NOT_READY, phase), _unless_ignored(Event.READY, phase))
+    for phase in Phase
+)
+"""[phase][whether the estimator is healthy]: the event to handle, None where the table ignores it.
+Looked up at every tick."""
 
 _PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN}
 

@@ -1,4 +1,4 @@
-"""What the estimator's filters share: the states, how they move, what the sensors say of them.
+"""What the estimator's filters share: the states, their propagation, the measurement models.
 
 The nominal state is a row of `ROW_SIZE` floats, so that compiled code takes it as it is. The error
 that a filter estimates has 16 states, in this order: position (3) [m], velocity (3) [m/s],
@@ -51,7 +51,7 @@ _READY_SIGMA = (1.5,) * 3 + (0.3,) * 3 + (math.radians(2.0),) * 2 + (math.radian
 """Converged when position, velocity, tilt and heading are known better than this."""
 
 _STEEPEST = math.sin(math.radians(80.0))
-"""Sine of the pitch beyond which there is no telling a heading."""
+"""Sine of the pitch beyond which the heading is not observable."""
 
 
 def new_state() -> Vector:
@@ -62,7 +62,7 @@ def new_state() -> Vector:
     return row
 
 
-# --- how the states move
+# --- propagation
 
 
 @kernel
@@ -125,7 +125,7 @@ def inject(row: Vector, error: Vector) -> None:
     row[BARO_OFFSET] += error[BARO]
 
 
-# --- what the sensors say
+# --- measurements
 
 
 @kernel
@@ -144,7 +144,7 @@ def true_heading(field: Vector, q: Quat, declination: float) -> float:
 def observe_heading(
     row: Vector, field: Vector, declination: float, by_turn: Vector, innovation: Vector, h: Vector
 ) -> bool:
-    """Write the heading's innovation (1,) and its Jacobian (1, 16); False = there is no telling.
+    """Write the heading's innovation (1,) and its Jacobian (1, 16); False = not observable.
 
     Args:
         row: Nominal state.
@@ -165,7 +165,7 @@ def observe_heading(
 
 @kernel
 def gate_ratio(innovation: Vector, variance: Vector) -> float:
-    """Return how far a measurement is from what was expected; 1 = at the gate, NaN = no number.
+    """Return the test ratio of a measurement: 1 = at the gate, NaN = an innovation is not finite.
 
     Args:
         innovation: (m,).
@@ -179,12 +179,12 @@ def gate_ratio(innovation: Vector, variance: Vector) -> float:
     return worst / GATE
 
 
-# --- how good it is
+# --- convergence
 
 
 @kernel
 def converged(row: Vector, covariance: Vector) -> bool:
-    """Write the standard deviations; return whether they are small enough to fly on."""
+    """Write the standard deviations; return whether they are small enough to fly."""
     good = True
     for i in range(N_STATES):
         sigma = math.sqrt(covariance[i, i])

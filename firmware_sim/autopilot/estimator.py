@@ -1,8 +1,8 @@
 """The estimator: an error-state extended Kalman filter.
 
 What the states and the sensors are is in `error_state`; how the error's covariance is carried is a
-filter's business: `filter_kernel` flies, `filter_filterpy` is its reference. This module is the
-order of events: wait at rest, align, then predict and fuse whatever has been measured.
+filter's business: `filter_kernel` is the default, `filter_filterpy` its reference. This module is
+the order of events: wait at rest, align, then predict and fuse whatever has been measured.
 """
 
 from __future__ import annotations
@@ -74,14 +74,14 @@ NewFilter = Callable[[Vector, Vector], ErrorFilter]
 
 
 class Measurement:
-    """Room for one measurement: what a sensor says, less what was expected."""
+    """Buffers of one kind of measurement: innovation, its variance and Jacobian."""
 
     def __init__(self, name: str, ratio: int, h: Vector) -> None:
-        """Make room.
+        """Allocate them.
 
         Args:
-            name: Under which it is reported.
-            ratio: Which of the four test ratios of the estimate it is.
+            name: Name that it is reported by.
+            ratio: Index of its test ratio among the four of the estimate.
             h: Jacobian (m, 16).
         """
         self.name = name
@@ -96,7 +96,7 @@ def _selecting(*errors: int) -> Vector:
 
 
 class Estimator:
-    """Noisy sensors in, position, velocity, attitude and biases out. Never sees truth."""
+    """Turns noisy sensors into position, velocity, attitude and biases; never sees the truth."""
 
     def __init__(self, value: Callable[[str], float], new_filter: NewFilter = KernelFilter) -> None:
         """Start unaligned.
@@ -144,7 +144,7 @@ class Estimator:
         self.healthy = converged and self.origin is not None
 
     def estimate(self) -> Estimate:
-        """Return a copy of what is known after the newest tick."""
+        """Return a copy of the estimate after the newest tick."""
         if self._estimate is None:
             row = self.state.copy()
             self._estimate = Estimate(
@@ -225,9 +225,9 @@ class Estimator:
 
     def _fuse_heading(self, field: Vector) -> None:
         m = self._heading
-        told = es.observe_heading(
+        observable = es.observe_heading(
             self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
         )
-        if told:
+        if observable:
             m.variance[0] = self._value("EKF2_HEAD_NOISE") ** 2
             self._fuse(m)

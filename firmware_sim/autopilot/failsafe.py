@@ -1,4 +1,4 @@
-"""Timers that watch a flight and turn into commander events. All in simulated time."""
+"""Timers that watch a flight and raise commander events, all in simulated time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from firmware_sim.autopilot.commander import Event, Flight, Phase
 # Bound once: looking up a member of an enumeration takes as long as a whole timer.
 _GROUND, _AIR, _OFFBOARD = Phase.GROUND, Phase.AIR, Mode.OFFBOARD
 
-# COM_OBL_RC_ACT -> event. 1 and 2 (altitude, manual) need a pilot's sticks as 0 does; 6 is
+# COM_OBL_RC_ACT -> event. 1 and 2 (altitude, manual) need a pilot's input as 0 does; 6 is
 # flight termination.
 OFFBOARD_LOSS = {
     0: Event.SETPOINT_LOST_POSITION,
@@ -40,8 +40,8 @@ BATTERY_ACTION = {
 """By level and COM_LOW_BAT_ACT."""
 
 
-class Watch:
-    """Setpoint age, time on the ground, battery, ground station."""
+class FailsafeTimers:
+    """Watches the age of setpoints, the time on the ground, the battery, the ground station."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         """Take a lookup of PX4 parameter names."""
@@ -58,7 +58,7 @@ class Watch:
     def armed(self) -> None:
         """A flight begins: time on the ground before it does not count."""
         self._standing_since_us = None
-        # A flight that begins with a low battery is told so by its deeds as well.
+        # A flight that begins with a low battery triggers its action anew.
         self._battery_acted = 0
 
     def setpoint(self, time_us: int) -> None:
@@ -77,14 +77,14 @@ class Watch:
     def events(
         self, flight: Flight, time_us: int, battery: float, *, idle: bool
     ) -> list[Event | Message]:
-        """Return what has become due, in the order in which it is to be carried out.
+        """Return the events and texts that are due, in the order in which they take effect.
 
         Args:
             flight: The commander's state.
             time_us: Now.
             battery: State of charge 0..1.
-            idle: Whether the motors stand still: on the ground, time of a take-off's spool-up and
-                ramp is no time of standing.
+            idle: Whether the motors are stopped: the spool-up and the ramp of a take-off do not
+                count as time on the ground.
         """
         due: list[Event | Message] = []
         self._offboard(flight, time_us, due)
@@ -132,7 +132,7 @@ class Watch:
         self._battery_acted = level
         event = BATTERY_ACTION.get((level, int(value("COM_LOW_BAT_ACT"))))
         if event is not None:
-            # The battery now says where to: setpoints that come back must not take it over.
+            # The battery failsafe takes precedence: setpoints that come back must not end it.
             self._offboard_lost = False
             due.append(event)
 

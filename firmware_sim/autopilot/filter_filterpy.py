@@ -1,6 +1,6 @@
-"""The filter of the estimator's error on filterpy: the reference of the fast one.
+"""The filter of the estimator's error on filterpy: the reference of `filter_kernel`.
 
-Many times slower than `filter_kernel`, and as plain as the textbook.
+It is many times slower, and follows the textbook.
 """
 
 from __future__ import annotations

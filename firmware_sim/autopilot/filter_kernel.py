@@ -1,4 +1,4 @@
-"""The filter of the estimator's error as compiled code: what flies.
+"""The filter of the estimator's error as compiled code: the default.
 
 The same filter as `filter_filterpy` up to rounding, with what is known of its matrices: most rows
 of the transition matrix are the identity's, and the noises of a measurement's components are

@@ -19,14 +19,14 @@ NAN = math.nan
 _FREE = (NAN, NAN, NAN)
 
 FALLBACK_DESCENT_M_S = 0.75
-"""Descent in Position mode without a pilot's sticks (measured on PX4 1.16). It stays level: drag
-alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
+"""Descent in Position mode without a pilot's input (measured on PX4 1.16). The vehicle stays
+level: drag alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
 
 RETURN_HEIGHT_REACHED_M = 0.2
-"""Closer than this to the height of return, its climb is done."""
+"""The climb of a return ends this close to its height [m]."""
 
 SETTLED_M = 0.01
-"""Closer than this to the take-off altitude, it is held like any other."""
+"""From this close to it, the take-off altitude is held like any other [m]."""
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _TAKEOFF, _OFFBOARD, _LAND = Mode.TAKEOFF, Mode.OFFBOARD, Mode.LAND
@@ -46,7 +46,7 @@ def _or_zero(value: float) -> float:
 
 @dataclass
 class Anchor:
-    """Where a mode began: what hold, take-off, landing and return refer to."""
+    """Where a mode began: the reference of hold, take-off, landing and return."""
 
     position: Vec
     """NED [m]."""
@@ -54,7 +54,7 @@ class Anchor:
 
 
 class Guidance:
-    """Turns the mode into a demand. Told of mode changes by `enter`.
+    """Turns the mode into a demand; `enter` notifies it of mode changes.
 
     Every `state` is the estimator's newest nominal state (`error_state`).
     """
@@ -68,7 +68,7 @@ class Guidance:
         self._return_leg = 0
         self._climb = Climb()
         self._settling = False
-        """Take-off is done, its altitude not yet reached."""
+        """Whether hold still climbs to the altitude of a take-off that has ended."""
         self._spool_since_us: int | None = None
         self._now_us = 0
         self._home: Vec = (0.0, 0.0, 0.0)
@@ -77,7 +77,7 @@ class Guidance:
         """Height above home that a take-off climbs to [m]."""
 
     def enter(self, mode: Mode, state: Vector) -> None:
-        """A new mode begins here and now."""
+        """Begin a new mode at the present state."""
         if mode is _HOLD and self.takeoff_done(state):
             # Hold goes on to the altitude, above the place where take-off began.
             north, east, _ = self._anchor.position
@@ -91,12 +91,12 @@ class Guidance:
         self._return_leg = 0
 
     def at_home(self, state: Vector) -> None:
-        """Home (the ground under the vehicle at arming) is here."""
+        """Make the present position home: the ground under the vehicle at arming."""
         self._home = _triple(state, P)
         self._spool_since_us = None
 
     def offer(self, setpoint: Setpoint) -> None:
-        """From now on this is what offboard flies; an axis that it leaves open stands still."""
+        """Set what offboard flies from now on; an axis that is not commanded gets zero velocity."""
         north, east, down = _triple(setpoint.velocity, 0)
         velocity = _or_zero(north), _or_zero(east), _or_zero(down)
         self._offboard = Demand(
@@ -115,7 +115,7 @@ class Guidance:
         return self._height(state) > altitude - near
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> Demand | None:
-        """Return what to fly now; None = the motors stand still."""
+        """Return what to fly now; None = the motors are stopped."""
         self._now_us = time_us
         if phase is _AIR:
             self._spool_since_us = None
@@ -135,7 +135,7 @@ class Guidance:
         return False
 
     def _ramped(self, demand: Demand, time_us: int) -> Demand:
-        """Return a demand of a vehicle that stands, its climb rate limited by the take-off ramp.
+        """Return a demand for a vehicle on the ground, its climb rate limited by the take-off ramp.
 
         PX4's Takeoff: after COM_SPOOLUP_TIME the vertical speed limit rises in MPC_TKO_RAMP_T
         from the value that commands zero thrust to the take-off speed. A height becomes that rate.
@@ -158,7 +158,7 @@ class Guidance:
         )
 
     def _flown(self, state: Vector) -> Demand:
-        """Return what the mode flies."""
+        """Return the demand of the present mode."""
         mode = self._mode
         if mode is _OFFBOARD and self._offboard is not None:
             return self._offboard
@@ -206,7 +206,7 @@ class Guidance:
         return self._above_anchor(-self._climb.speed_m_s)
 
     def _settle(self) -> Demand:
-        """Hold's way from the end of a take-off to its altitude."""
+        """Return the demand of hold between the end of a take-off and its altitude."""
         climb = self._climb
         self._climb_on()
         north, east, _ = self._anchor.position
@@ -219,13 +219,13 @@ class Guidance:
         )
 
     def _climb_on(self) -> None:
-        """Move the trajectory on towards the take-off altitude."""
+        """Advance the trajectory towards the take-off altitude."""
         climb, target = self._climb, self.takeoff_altitude_m
         limits = self._limits(climb.height_m, up=target > climb.height_m)
         climb.towards(target, limits, self._now_us)
 
     def _limits(self, height: float, *, up: bool) -> ClimbLimits:
-        """Return what bounds a climb: PX4's FlightTaskAuto, gentle where a take-off begins."""
+        """Return the limits of a climb as PX4's FlightTaskAuto has them, gentle near the ground."""
         value, jerk = self._value, self._value("MPC_JERK_AUTO")
         if not up:
             return ClimbLimits(value("MPC_Z_V_AUTO_DN"), value("MPC_ACC_DOWN_MAX"), jerk)

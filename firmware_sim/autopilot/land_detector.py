@@ -18,7 +18,7 @@ LIFT_SPEED_M_S = 0.15
 
 
 class LandDetector:
-    """Stateful: landed needs LNDMC_TRIG_TIME of stillness at low thrust."""
+    """Detects a landing after LNDMC_TRIG_TIME without motion at low thrust."""
 
     def __init__(self, value: Callable[[str], float]) -> None:
         """Take a lookup of PX4 parameter names."""

@@ -23,8 +23,8 @@ class Parameters:
         self._values = list(values.values())
         self._floats = {name: float(value) for name, value in values.items()}
         self.value: Callable[[str], float] = self._floats.__getitem__
-        """Returns a value for the flight code, which asks at every tick. Raises KeyError for an
-        unknown name."""
+        """Returns a value; fast enough for flight code that asks at every tick. Raises KeyError if
+        the name is unknown."""
         self._listeners: list[Callable[[], None]] = []
 
     def on_change(self, listener: Callable[[], None]) -> None:

@@ -1,4 +1,4 @@
-"""The autopilot as the MAVLink services see it."""
+"""The interface through which the MAVLink services use the autopilot."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What real firmware takes its vehicle for, against what the vehicle is: found out on the ground.
+"""Checks on the ground that external firmware is configured for the vehicle that it flies.
 
-A wrong order of motors flips a vehicle the moment it lifts off, and the log then shows nothing but
-a controller that fights.
+A wrong motor order flips a vehicle as it lifts off, and its log then shows only saturated
+controllers.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from firmware_sim.flight_controller import FirmwareMissingError
 MOTORS = range(4)
 
 SITL_OUTPUT, HITL_OUTPUT = "PWM_MAIN_FUNC{}", "HIL_ACT_FUNC{}"
-"""PX4's parameter that says what hangs on output {}."""
+"""PX4's parameter of the function of output {}."""
 
 GROUND_LOSS = "NAV_DLL_ACT"
-"""PX4's parameter of what the loss of the ground station does; 0 = nothing."""
+"""PX4's parameter of the action on ground station loss; 0 = none."""
 
 _PX4_MOTOR_1 = 101
 """PX4's output function of motor 1 (docs: Actuator Configuration)."""
@@ -42,10 +42,10 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 
 
 class Airframe(Protocol):
-    """What one kind of firmware must be set to."""
+    """What one kind of firmware must be configured to."""
 
     firmware: str
-    """What the firmware is called in messages: PX4."""
+    """Name of the firmware in messages: PX4."""
 
     @property
     def motors(self) -> Sequence[Corner]:
@@ -54,20 +54,20 @@ class Airframe(Protocol):
 
     @property
     def frame(self) -> Mapping[str, Value]:
-        """What makes the firmware fly such a frame, motors on their outputs: never set by us."""
+        """Parameters that select the frame and the motors' outputs: only checked, never set."""
         ...
 
     @property
     def settings(self) -> Mapping[str, Value]:
-        """Parameters and what they must be: set where we may, checked otherwise."""
+        """Parameters and their required values: set where that is allowed, checked otherwise."""
         ...
 
     def names(self) -> list[str]:
-        """Return all parameters that must be known."""
+        """Return the names of all parameters that must be known."""
         ...
 
     def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the frame that the firmware flies, in words."""
+        """Return what is wrong with the configured frame; None = nothing."""
         ...
 
 
@@ -81,7 +81,7 @@ class Px4Airframe:
 
         Args:
             vehicle: Its rotors.
-            px4: What is said of PX4.
+            px4: The profile's section on PX4.
             output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
         """
         self.motors = px4.motors
@@ -100,11 +100,11 @@ class Px4Airframe:
         }
 
     def names(self) -> list[str]:
-        """Return all parameters that must be known."""
+        """Return the names of all parameters that must be known."""
         return [GROUND_LOSS, *self.frame, *self.settings]
 
     def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the frame that PX4 flies, in words."""
+        """Return what is wrong with the frame that PX4 is configured for; None = nothing."""
         if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
             return (
                 f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
@@ -149,11 +149,11 @@ class ArduPilotAirframe:
         self.settings: dict[str, Value] = {**self._kind, **ardupilot.parameters}
 
     def names(self) -> list[str]:
-        """Return all parameters that must be known."""
+        """Return the names of all parameters that must be known."""
         return [*self.frame, *self.settings]
 
     def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the frame that ArduCopter flies, in words."""
+        """Return what is wrong with the frame that ArduCopter is configured for; None = nothing."""
         for name, expected in self._kind.items():
             if held[name] != expected:
                 return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
@@ -170,25 +170,25 @@ class ArduPilotAirframe:
 
 
 def px4_airframe(vehicle: VehicleProfile, output: str) -> Px4Airframe:
-    """Return what PX4 must be set to. Raises UsageError when the profile does not say it."""
+    """Return PX4's airframe. Raises UsageError if the profile has no section on PX4."""
     if vehicle.px4 is None:
         raise FirmwareMissingError(
-            "--vehicle: its profile has no table [px4]: accepted: one as quad's"
+            "--vehicle: its profile has no table [px4]: accepted: one like that of quad"
         )
     return Px4Airframe(vehicle, vehicle.px4, output)
 
 
 def ardupilot_airframe(vehicle: VehicleProfile) -> ArduPilotAirframe:
-    """Return what ArduPilot must be set to. Raises UsageError when the profile does not say it."""
+    """Return ArduPilot's airframe. Raises UsageError if the profile has no section on ArduPilot."""
     if vehicle.ardupilot is None:
         raise FirmwareMissingError(
-            "--vehicle: its profile has no table [ardupilot]: accepted: one as quad's"
+            "--vehicle: its profile has no table [ardupilot]: accepted: one like that of quad"
         )
     return ArduPilotAirframe(vehicle.ardupilot)
 
 
 def differences(held: Mapping[str, Value], wanted: Mapping[str, Value]) -> list[str]:
-    """Return what is set otherwise than wanted, in words, one each."""
+    """Return a description of each parameter that differs from the wanted value."""
     return [
         f"{name} = {held[name]:g} (vehicle: {value:g})"
         for name, value in wanted.items()

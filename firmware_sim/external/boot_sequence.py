@@ -1,4 +1,4 @@
-"""Real firmware aboard: booted, its frame checked, watched; for one episode after the other."""
+"""The boot sequence of external firmware: started, frame checked, parameters set, ready to arm."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
 
 ASK_EVERY_S = 0.25
-"""Parameters that have not come are asked for again so often [wall s]."""
+"""Interval at which missing parameters are requested again [wall s]."""
 
 FAREWELL_S = 1.5
-"""Firmware that is told to end is simulated on for so long: PX4 takes 0.4 s [simulated s]."""
+"""Time that firmware is simulated on after it is told to end: PX4 takes 0.4 s [simulated s]."""
 
 SHOWN = 4
-"""So many parameters are named in a message."""
+"""Most parameters that a message names."""
 
 READY_LIMIT_S = 120.0
-"""Longest time from power-up until it may be armed [simulated s]: ArduPilot's EKF takes 40."""
+"""Longest time from power-up until it may be armed: ArduPilot's EKF takes 40 [simulated s]."""
 
 
 class Launcher(Protocol):
-    """How one kind of firmware gets going."""
+    """Starts one kind of firmware, or waits for it."""
 
     airframe: Airframe
-    """What it must be set to."""
+    """The airframe that it must be configured for."""
     may_set: bool
-    """Whether its parameters are ours to set: it was started by us, for this flight alone."""
+    """Whether its parameters may be changed: it was started here, for this flight alone."""
     reboots: bool
-    """Whether it starts anew by itself when told to; else it can only be told to shut down."""
+    """Whether it reboots when told to; otherwise it can only be told to shut down."""
 
     def launch(self) -> Bridge:
         """Start it, or wait for it, and return the bridge, connected.
 
         Raises:
             FirmwareMissingError: It cannot be started, or never connects.
-            FirmwareLostError: It died on the way.
+            FirmwareLostError: It died while it started.
         """
         ...
 
@@ -62,12 +62,12 @@ class Launcher(Protocol):
 
 
 class ExternalFlightController:
-    """Real firmware behind a bridge. Implements `FlightController`."""
+    """External firmware behind a bridge. Implements `FlightController`."""
 
     internals = None
 
     def __init__(self, bridge: Bridge, observer: Observer, launcher: Launcher) -> None:
-        """Take the bridge, what listens to its MAVLink, and how it got going."""
+        """Take the bridge, the observer of its MAVLink, and what started it."""
         self._bridge = bridge
         self._observer = observer
         self._launcher = launcher
@@ -87,7 +87,7 @@ class ExternalFlightController:
 
     @property
     def flight(self) -> Flight:
-        """Phase and mode, as its heartbeat says them; the bridge knows sooner if it is armed."""
+        """Phase and mode by its heartbeat; the bridge knows sooner whether it is armed."""
         return self._observer.flight(armed=self._bridge.armed)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
@@ -99,14 +99,14 @@ class ExternalFlightController:
         return controls._replace(motors=(m[a], m[b], m[c], m[d]))
 
     def close(self) -> None:
-        """Leave it: what we started is ended, what the user started is told to end or reboot."""
+        """End it if it was started here; otherwise tell it to reboot or shut down."""
         if not self._launcher.may_set:
-            self._tell_to_end()
+            self._send_shutdown()
         self._bridge.close()
         self._launcher.stop()
 
-    def _tell_to_end(self) -> None:
-        """The word, and the simulated time that it takes to be heard and obeyed."""
+    def _send_shutdown(self) -> None:
+        """Send the command, and simulate on until it has taken effect."""
         sample, self._sample = self._sample, None
         if sample is None:
             return
@@ -119,21 +119,21 @@ class ExternalFlightController:
 
 
 class ExternalFlightStack:
-    """Implements `firmware_sim.firmware.FlightStack` with real firmware."""
+    """External firmware and its observer. Implements `firmware_sim.firmware.FlightStack`."""
 
     def __init__(self, launcher: Launcher, observer: Observer, timeout_s: float) -> None:
-        """Put it together; nothing is started yet.
+        """Compose it; nothing is started yet.
 
         Args:
-            launcher: How the firmware gets going.
+            launcher: Starts the firmware.
             observer: Listens to its MAVLink.
-            timeout_s: Longest wait for any of its answers before it flies [wall s].
+            timeout_s: Longest wait for each of its answers during the boot sequence [wall s].
         """
         self._launcher = launcher
         self._observer = observer
         self._timeout_s = timeout_s
         self._missing: list[str] = []
-        """Parameters that are being waited for."""
+        """Parameters that are still missing."""
         self.filenos = observer.filenos
         self.receive = observer.receive
         self.send = observer.send
@@ -147,13 +147,13 @@ class ExternalFlightStack:
         return ExternalFlightController(self._launcher.launch(), self._observer, self._launcher)
 
     def connect(self, tick: Callable[[], int]) -> None:
-        """Fly ticks on the ground until its frame is known to be right and it may be armed.
+        """Run the boot sequence on the ground until the frame is checked and it may be armed.
 
         Args:
             tick: Flies a tick and returns its simulated time [µs].
 
         Raises:
-            FirmwareMissingError: It is silent, its frame is another one, or it never gets ready.
+            FirmwareMissingError: It is silent, has another frame, or never gets ready to arm.
             FirmwareLostError: It died.
         """
         airframe, observer = self._launcher.airframe, self._observer
@@ -170,8 +170,8 @@ class ExternalFlightStack:
             wanted = airframe.settings
             self._until(tick, self._asking(lambda: parameters.set(wanted)), "set parameters")
         elif different := differences(parameters.values, airframe.settings):
-            self._say(f"{airframe.firmware} is set otherwise than the vehicle: {_some(different)}")
-        self._until(tick, lambda: observer.ready, "its word that it may be armed")
+            self._say(f"{airframe.firmware} is not configured as the vehicle: {_some(different)}")
+        self._until(tick, lambda: observer.ready, "its report that it may be armed")
 
     def close(self) -> None:
         """End the firmware, if we started it, and stop listening."""
@@ -179,7 +179,7 @@ class ExternalFlightStack:
         self._observer.close()
 
     def _asking(self, ask: Callable[[], Iterable[str]]) -> Callable[[], bool]:
-        """Return what asks every so often, and says whether nothing is missing any more."""
+        """Return a function that asks at intervals, and returns whether nothing is missing."""
         clock, due_us = WallClock(), 0
 
         def asked() -> bool:
@@ -206,7 +206,7 @@ class ExternalFlightStack:
                 left = f" ({_some(self._missing)})" if self._missing else ""
                 spent_s = (now_us - start_us) / US_PER_S
                 raise FirmwareMissingError(
-                    f"{self._launcher.airframe.firmware} runs, but {what}{left} did not come in "
+                    f"{self._launcher.airframe.firmware} runs, but {what}{left} did not arrive in "
                     f"{clock.time_us() / US_PER_S:.0f} s ({spent_s:.0f} s simulated); it said: "
                     f"{observer.last_text or 'nothing'}"
                 )
@@ -216,7 +216,7 @@ class ExternalFlightStack:
             self._observer.on_message(Message(Severity.WARNING, text))
 
 
-def _some(words: Sequence[str]) -> str:
-    """Return words for a message: a handful, and how many more there are."""
-    more = f" and {len(words) - SHOWN} more" if len(words) > SHOWN else ""
-    return ", ".join(words[:SHOWN]) + more
+def _some(items: Sequence[str]) -> str:
+    """Return the first few items for a message, and how many more there are."""
+    more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
+    return ", ".join(items[:SHOWN]) + more

@@ -1,4 +1,4 @@
-"""The simulator link to real firmware: sensors out, motor commands in, and nothing else."""
+"""The simulator interface of external firmware: sensors out, motor commands in."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 
 def no_process() -> None:
-    """Do nothing: for firmware whose process is not ours, nobody can tell whether it lives."""
+    """Check nothing: firmware that the user started has no process of ours."""
 
 
 class Bridge(Protocol):
     """One simulator interface, for one flight of one firmware.
 
-    The firmware's MAVLink (mode, texts, parameters) is none of its business.
+    It does not handle the firmware's MAVLink (mode, texts, parameters).
     """
 
     rate_hz: int
-    """How many sensor samples a second of simulated time the firmware wants."""
+    """Sensor samples that the firmware needs per second of simulated time."""
     armed: bool
-    """The simulator link's newest word of it; False before the first."""
+    """Whether the simulator interface last reported it armed; False before the first report."""
     time_us: int
     """The firmware's own time of the newest exchange [µs]; 0 before the first."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
-        """Wait until the firmware is there.
+        """Wait until the firmware has connected.
 
         Args:
             timeout_s: Longest wait [wall s].
@@ -34,22 +34,22 @@ class Bridge(Protocol):
                 the firmware's process has died.
 
         Raises:
-            FirmwareMissingError: Nobody came.
+            FirmwareMissingError: It did not connect in time.
             FirmwareLostError: From `alive`.
         """
         ...
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Hand over a tick's sensors; return the motor commands until the next.
+        """Send a tick's sensors; return the motor commands until the next tick.
 
         Raises:
-            FirmwareLostError: The firmware died, hangs, or talks nonsense.
-            FirmwareMissingError: It is there, but cannot be flown with.
+            FirmwareLostError: The firmware died, hangs, or sends invalid data.
+            FirmwareMissingError: It is connected, but cannot be flown.
         """
         ...
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Take what tells the true state."""
+        """Accept a source of the true state."""
         ...
 
     def close(self) -> None:

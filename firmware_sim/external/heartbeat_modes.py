@@ -1,4 +1,4 @@
-"""What the heartbeat of real firmware says, in the words of the built-in commander."""
+"""Flight modes of external firmware, from its heartbeat to the built-in commander's modes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Listens to real firmware on a MAVLink link of its own: what it does, says, and is set to.
+"""Observes external firmware on a MAVLink link of its own: its state, texts and parameters.
 
-In flight it commands nothing: companion and ground station talk to the firmware directly.
+It sends no commands in flight: companion and ground station talk to the firmware directly.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ INTERVALS_US: Mapping[str, int] = {
     "GLOBAL_POSITION_INT": 200_000,
     "GPS_RAW_INT": 200_000,
 }
-"""What it asks for, and how often [µs]: little, the link may be a slow one."""
+"""Messages that it requests, and their intervals [µs]: few, as the link may be slow."""
 
 ASK_EVERY_US = 1_000_000
-"""What has not come is asked for again so often [µs]."""
+"""Interval at which messages that have not arrived are requested again [µs]."""
 
 BEAT_EVERY_US = 1_000_000
-"""Its heartbeat [µs]."""
+"""Interval of its heartbeat [µs]."""
 
 FORCE = 21196
 """Second parameter of COMPONENT_ARM_DISARM that disarms in any state (MAVLink, common.xml)."""
@@ -45,14 +45,14 @@ _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
 class Observer:
-    """One link to real firmware. Nothing blocks, nothing that arrives raises."""
+    """One link to external firmware. Nothing blocks, and no received message raises."""
 
     def __init__(self, endpoint: Endpoint, name: str) -> None:
         """Take the link.
 
         Args:
-            endpoint: Where the firmware is heard.
-            name: What the link is called in the list of links.
+            endpoint: Where the firmware is received.
+            name: Name of the link in the traffic counters.
         """
         self._endpoint = endpoint
         self._name = name
@@ -65,7 +65,7 @@ class Observer:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the firmware: another one is about to be heard."""
+        """Forget the firmware: another one is about to start."""
         self._now_us = 0
         self._heard: WireMessage | None = None
         self._landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
@@ -74,15 +74,15 @@ class Observer:
         self._came: set[str] = set()
         self._text = ""
         self.last_text = ""
-        """What it said last."""
+        """The last text received."""
         self._beat_us = -BEAT_EVERY_US
         self.acts_as_ground_station = True
-        """Whether it shows itself as a ground station: PX4 sends texts to nobody else."""
+        """Whether it sends the heartbeat of a ground station: PX4 sends texts only to such."""
         self.parameters = ParameterClient(self._send)
 
     @property
     def heard(self) -> bool:
-        """Whether a heartbeat has been heard."""
+        """Whether a heartbeat was received."""
         return self._heard is not None
 
     @property
@@ -92,9 +92,9 @@ class Observer:
 
     @property
     def ready(self) -> bool:
-        """Whether it says that it may be armed, and knows where it is.
+        """Whether it reports that it may be armed, and sends its position.
 
-        ArduPilot may be armed before that, but not flown by setpoints; it tells no position yet.
+        ArduPilot may be armed before it knows its position, but not flown by setpoints.
         """
         return self._ready and "LOCAL_POSITION_NED" in self._came
 
@@ -129,7 +129,7 @@ class Observer:
         return counted
 
     def send(self, now_us: int) -> None:
-        """Ask for what has not come yet, and be there; once a tick, simulated `now_us` [µs]."""
+        """Send the heartbeat and pending requests; once a tick, at simulated `now_us` [µs]."""
         self._now_us = now_us
         if self._heard is None:
             return
@@ -148,7 +148,7 @@ class Observer:
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us)
 
     def end(self, *, reboot: bool) -> None:
-        """Tell the firmware to stop its motors, then to start anew or to shut down."""
+        """Command the firmware to stop its motors, then to reboot or to shut down."""
         self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0, FORCE)
         self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, REBOOT if reboot else SHUT_DOWN)
 
@@ -197,12 +197,12 @@ class Observer:
         return True
 
     def _say(self, message: WireMessage) -> None:
-        """Pass on a text; one that comes in pieces (`id` not 0) when its last has come."""
-        number, piece = getattr(message, "id", 0), getattr(message, "chunk_seq", 0)
+        """Pass on a text; one sent in chunks (`id` not 0) once its last chunk has arrived."""
+        number, chunk = getattr(message, "id", 0), getattr(message, "chunk_seq", 0)
         text = str(message.text)
-        # A piece that fills its field is followed by another one.
+        # A chunk that fills its field is followed by another one.
         whole = number == 0 or len(text) < TEXT_LENGTH
-        self._text = text if number == 0 or piece == 0 else self._text + text
+        self._text = text if number == 0 or chunk == 0 else self._text + text
         if not whole:
             return
         self.last_text = self._text
@@ -210,7 +210,7 @@ class Observer:
             self.on_message(Message(Severity(min(int(message.severity), 7)), self._text))
 
     def _command(self, number: int, *parameters: float) -> None:
-        """Send a COMMAND_LONG to whom was heard, if anybody was."""
+        """Send a COMMAND_LONG to the firmware, if its heartbeat was received."""
         beat = self._heard
         if beat is None:
             return

@@ -1,4 +1,4 @@
-"""Reads and sets parameters of real firmware over MAVLink."""
+"""Reads and sets parameters of external firmware over MAVLink."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from firmware_sim.mavlink.codec import WireMessage, dialect, payload
 
 BURST = 10
-"""Requests under way at once: the link may be a slow one."""
+"""Most requests sent at once: the link may be slow."""
 
 Value = int | float
 
@@ -20,17 +20,17 @@ _INTEGERS = {
     dialect.MAV_PARAM_TYPE_INT32: "<i",
     dialect.MAV_PARAM_TYPE_UINT32: "<I",
 }
-"""How an integer's bytes lie in the field of a value (bytewise encoding)."""
+"""Struct formats of integers in the value field (bytewise encoding)."""
 
 _FLOAT = struct.Struct("<f")
 _VALUE_BYTES = 4
 
 
 class ParameterClient:
-    """What is known of a vehicle's parameters. Asks when told to; the caller keeps the time."""
+    """The known parameters of a vehicle. The caller decides when requests are repeated."""
 
     def __init__(self, send: Callable[[WireMessage], None]) -> None:
-        """Take what sends a message."""
+        """Take the function that sends a message."""
         self._send = send
         self._target: tuple[int, int] | None = None
         self._bytewise = True
@@ -39,11 +39,11 @@ class ParameterClient:
 
     @property
     def values(self) -> Mapping[str, Value]:
-        """What has been heard so far."""
+        """The values received so far."""
         return self._values
 
     def address(self, system: int, component: int, autopilot: int) -> None:
-        """Say whom to ask. PX4 sends integers bytewise, ArduPilot casts them to a float."""
+        """Set the target. PX4 encodes integers bytewise, ArduPilot casts them to a float."""
         self._target = system, component
         self._bytewise = autopilot != dialect.MAV_AUTOPILOT_ARDUPILOTMEGA
 
@@ -60,7 +60,7 @@ class ParameterClient:
             self._values[name] = int(message.param_value)
 
     def ask(self, names: Iterable[str]) -> list[str]:
-        """Ask for those not heard yet, a burst of them; return all that are missing."""
+        """Request a burst of the unknown ones; return the names of all that are unknown."""
         missing = [name for name in names if name not in self._values]
         if self._target is not None:
             for name in missing[:BURST]:
@@ -72,9 +72,9 @@ class ParameterClient:
         return missing
 
     def set(self, wanted: Mapping[str, Value]) -> list[str]:
-        """Set those that differ, a burst of them; return all that still do.
+        """Set a burst of those that differ; return the names of all that differ.
 
-        Each must have been heard before: its type tells how its value is sent.
+        Each must be known already: its type determines the encoding of its value.
         """
         differing = [name for name in wanted if not same(self._values[name], wanted[name])]
         if self._target is not None:

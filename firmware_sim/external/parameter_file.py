@@ -1,4 +1,4 @@
-"""Parameters of real firmware as files that its users' tools read."""
+"""Parameters of external firmware as files for the tools of its users."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """The MAVLink 2 codec: the only module that touches pymavlink.
 
 Of pymavlink only the generated `common` dialect is used: message classes, constants and the
-decoder of one whole frame. Framing is done here. Received: because pymavlink's own parser throws
-away everything that a damaged header claims as its payload, and waits for it to arrive. Streamed:
-because making and packing a message object costs several times as much as `Layout` and
-`Encoder.frame`, which read from pymavlink's classes what a message looks like.
+decoder of one whole frame. Framing is done here. When receiving, because pymavlink's own parser
+discards everything that a damaged header claims as its payload, and waits for it to arrive. When
+streaming, because creating and packing a message object costs several times as much as `Layout`
+and `Encoder.frame`, which take the layout of a message from pymavlink's classes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def message_id(name: str) -> int:
 
 
 def payload(message: WireMessage) -> bytes:
-    """Return the payload of a received message as it came: trailing zeros are cut (MAVLink 2)."""
+    """Return the payload of a received message as sent: without trailing zeros (MAVLink 2)."""
     frame: bytearray = message.get_msgbuf()
     start = _HEADER_V2 if frame[0] == _MARKER_V2 else _HEADER_V1
     return bytes(frame[start : start + frame[1]])
@@ -113,7 +113,7 @@ def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> Wir
 
 
 class Layout:
-    """How one message lies on the wire, read from pymavlink's class of it."""
+    """The wire layout of one message, taken from pymavlink's class."""
 
     def __init__(self, kind: type[WireMessage]) -> None:
         self.id_bytes: bytes = kind.id.to_bytes(3, "little")

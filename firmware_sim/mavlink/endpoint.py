@@ -1,4 +1,4 @@
-"""Where frames come from and go to: UDP as PX4 does it, or memory."""
+"""Endpoints of MAVLink links: UDP as PX4 uses it, or queues in memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_DATAGRAM = 4096
 """Longest datagram read; MAVLink frames are at most 280 bytes, some senders join several."""
 
 MAX_DATAGRAMS_PER_CALL = 256
-"""Datagrams read per `receive`: a flood must not hold up the flight controller."""
+"""Datagrams read per `receive`: a flood must not delay the flight controller."""
 
 _MARKERS = (0xFD, 0xFE)
 
@@ -83,7 +83,7 @@ class MemoryEndpoint:
     def take(self) -> list[bytes]:
         """Return and forget all frames sent so far, oldest first; `b"".join` makes them one chunk.
 
-        Who has to tell answers from telemetry overrides `send` and `send_streams`.
+        A subclass that tells answers from telemetry overrides `send` and `send_streams`.
         """
         frames = list(self.outbox)
         self.outbox.clear()
@@ -99,9 +99,9 @@ class MemoryEndpoint:
 class UdpEndpoint:
     """A bound UDP socket with a preset remote, like a PX4 SITL link.
 
-    Frames go to the preset remote from the first tick, without anybody having been heard. A peer
-    that talks from another address gets everything too: the newest such peer, until another one
-    talks. So an onboard program on the usual port and one more client can share the link.
+    Frames are sent to the preset remote from the first tick, before anything was received. A peer
+    that sends from another address gets all frames, too: the newest such peer. So an onboard
+    program on the usual port and one more client can share the link.
     """
 
     datagrams = True
@@ -119,7 +119,7 @@ class UdpEndpoint:
 
         Args:
             local: Address to bind; port 0 = any free one.
-            remote: Where to send unasked; None = only to peers that talk.
+            remote: Where to send from the first tick; None = only to peers that sent something.
             local_option: The command line option that moves the local port, for messages.
             remote_option: The command line option that moves the remote, for messages.
             insecure: Allow addresses that other machines can reach.
@@ -145,11 +145,11 @@ class UdpEndpoint:
 
     @property
     def peer(self) -> Address | None:
-        """The newest talker that is not the preset remote, None before any."""
+        """The newest sender that is not the preset remote, None before any."""
         return self._peer
 
     def receive(self) -> list[bytes]:
-        """Return the datagrams that have arrived, oldest first, and learn who talks."""
+        """Return the datagrams that have arrived, oldest first, and note their sender."""
         chunks: list[bytes] = []
         for _ in range(MAX_DATAGRAMS_PER_CALL):
             try:
@@ -189,7 +189,7 @@ class UdpEndpoint:
 
 
 def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) -> Address:
-    """Return the address with its host name resolved. Raises UsageError when it will not do."""
+    """Return the address with its host name resolved. Raises UsageError if it cannot be used."""
     host, port = address
     if not lowest_port <= port <= 65_535:
         raise UsageError(f"{option}: port {port}: must be in {lowest_port}..65535")

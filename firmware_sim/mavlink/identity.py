@@ -1,4 +1,4 @@
-"""AUTOPILOT_VERSION: who we say we are, and what we really can do."""
+"""AUTOPILOT_VERSION: the identity and the true capabilities of the built-in autopilot."""
 
 from __future__ import annotations
 

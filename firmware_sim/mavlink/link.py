@@ -14,8 +14,8 @@ from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
 
 Payloads = dict[Builder, "bytes | None"]
-"""What has been built and packed in one tick, for all links together: None = nothing to say, empty
-= the values do not fit."""
+"""What has been built and packed in one tick, for all links together: None = nothing to send,
+empty = the values do not fit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +28,8 @@ class LinkConfig:
     """Default rate per stream [Hz]; streams not named are off."""
     separate_replies: bool = False
     """Whether answers to requests count their own sequence numbers, so that the bytes of the
-    telemetry do not depend on when somebody asked for something. Only for a link whose other end
-    does not take a jump in the sequence for lost messages."""
+    telemetry do not depend on when a client sent a request. Only for a link whose other end does
+    not take a jump in the sequence for lost messages."""
 
 
 def onboard_link(endpoint: Endpoint, *, separate_replies: bool = False) -> LinkConfig:
@@ -53,8 +53,8 @@ class LinkCounters:
     malformed: int
     """Runs of received bytes that are no valid frame."""
     ignored: int
-    """Received frames that were valid and changed nothing: unknown message, other addressee,
-    nobody handles it."""
+    """Received frames that were valid and had no effect: unknown message, other addressee, no
+    handler."""
     send_errors: int
     """Messages that could not be packed or sent."""
 
@@ -62,9 +62,9 @@ class LinkCounters:
 class Link:
     """Receives and sends the messages of one endpoint.
 
-    Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) goes one lane, answers
-    to requests (`send`, `send_stream`) go the other. Both share one sequence, in the order of
-    sending, unless `LinkConfig.separate_replies` parts them.
+    Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) and answers to requests
+    (`send`, `send_stream`) share one sequence, in the order of sending, unless
+    `LinkConfig.separate_replies` is set.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Link:
         Args:
             config: What it is made of.
             builders: What can be streamed.
-            replies: Builds the same messages when they are asked for; None = the same builders.
+            replies: Builds the same messages on request; None = the same builders.
         """
         self.name = config.name
         self.builders = builders
@@ -87,7 +87,7 @@ class Link:
             names, {name: interval_us(hz) for name, hz in config.rates_hz.items()}
         )
         self.tap: Callable[[bytes], None] | None = None
-        """Is given every frame of both directions."""
+        """Called with every frame of both directions, if set."""
         self.ignored = 0
         self._endpoint = config.endpoint
         self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
@@ -135,7 +135,7 @@ class Link:
             self._reply(frame)
 
     def send_stream(self, name: str, state: AutopilotState) -> bool:
-        """Send one of the streamed messages now; tell whether there was something to say."""
+        """Send one of the streamed messages now; return whether there was something to send."""
         payload = _payload(layout(name), self._replies[name](state))
         if payload is None:
             return False

@@ -24,7 +24,7 @@ _MAIN_SUB: dict[Mode, tuple[int, int]] = {
 
 _AUTO_MODES = {sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO}
 
-# Modes of a real PX4 that need a pilot's sticks or a mission: known by name, never available.
+# Modes of a real PX4 that need a pilot's input or a mission: known by name, never available.
 _UNAVAILABLE_MAIN = {1: "Manual", 2: "Altitude", 5: "Acro", 7: "Stabilized"}
 _UNAVAILABLE_AUTO = {
     0: "Mission",
@@ -74,7 +74,7 @@ class ModeRequest:
 
     mode: Mode | None = None
     refusal: str | None = None
-    """Why the mode cannot be flown, as PX4 words it for the operator."""
+    """Why the mode cannot be flown: PX4's text for the operator."""
 
 
 def _unavailable(name: str) -> ModeRequest:

@@ -1,4 +1,4 @@
-"""When which stream of a link is due, in integer microseconds of simulated time."""
+"""The due times of a link's streams, in integer microseconds of simulated time."""
 
 from __future__ import annotations
 

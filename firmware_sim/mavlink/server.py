@@ -1,4 +1,4 @@
-"""The vehicle's MAVLink side: links, streams and services in front of an autopilot."""
+"""The MAVLink server of an autopilot: links, streams and services."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ _STATELESS: dict[str, Handler] = {
 
 
 _DISCARD_CALLS = 4
-"""Reads per link that surely empty it: four times 256 datagrams exceed a socket's buffer."""
+"""Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
 
 
 class _Session:
-    """One link and what is remembered about it."""
+    """One link and its state."""
 
     def __init__(self, link: Link, *, separate_replies: bool) -> None:
         self.link = link
@@ -62,8 +62,8 @@ class MavlinkServer:
     """Speaks MAVLink on all links for one autopilot.
 
     Per tick: `receive`, then the autopilot's step, then `send`, all on one thread and with
-    simulated time passed in. Nothing blocks; nothing that arrives raises. Without an autopilot
-    the vehicle is off: it says nothing and hears nothing.
+    simulated time passed in. Nothing blocks, and no received message raises. Without an autopilot
+    the vehicle is off: it neither sends nor receives.
     """
 
     def __init__(
@@ -94,10 +94,10 @@ class MavlinkServer:
             self.attach(port)
 
     def attach(self, port: AutopilotPort) -> None:
-        """Exchange the autopilot, between two episodes.
+        """Replace the autopilot, between two episodes.
 
-        Rates that clients have set stay; running parameter lists and what arrived for the old
-        autopilot (stale setpoints) go. Simulated time may start anew.
+        Rates that clients have set are kept; running parameter lists and messages for the old
+        autopilot (stale setpoints) are dropped. Simulated time may start anew.
         """
         if self._port is not None:
             self._discard_received()
@@ -166,7 +166,7 @@ class MavlinkServer:
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
         """Write both directions of a link to a tlog from now on; None ends it.
 
-        The writer stays the caller's to close. Raises ValueError when there is no such link.
+        The caller closes the writer. Raises ValueError if there is no such link.
         """
         (session,) = (session for session in self._sessions if session.link.name == link)
         session.link.tap = None if tlog is None else self._tap(tlog)
@@ -187,7 +187,7 @@ class MavlinkServer:
 
     def _open(self, config: LinkConfig) -> _Session:
         builders = self._link_builders()
-        # A PING that somebody asks for must not count in those that are streamed.
+        # A requested PING must not advance the sequence of those that are streamed.
         replies = self._link_builders() if config.separate_replies else builders
         return _Session(Link(config, builders, replies), separate_replies=config.separate_replies)
 
@@ -196,7 +196,7 @@ class MavlinkServer:
 
     def _dispatch(self, session: _Session, message: WireMessage) -> bool:
         if (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, COMPONENT_ID):
-            return False  # our own words, echoed
+            return False  # an echo of our own message
         handler, context = session.handlers.get(message.get_type()), session.context
         if handler is None or context is None:
             return False
@@ -209,7 +209,7 @@ class MavlinkServer:
                 session.link.ignored += len(session.link.receive())
 
     def _send_texts(self) -> None:
-        """Send what the services have to say to the operators."""
+        """Send the texts of the services to the operators."""
         for session in self._sessions:
             for text in self._texts:
                 for chunk in session.reply_texts.encode(text):

@@ -9,8 +9,8 @@ CHUNK_BYTES = 50
 _LAST_ID = 65_535
 
 REPLY_IDS = 32_768
-"""Where the ids of answers begin that are counted apart from the autopilot's texts: two long texts
-in a row must differ in them."""
+"""First id of answers that are counted apart from the autopilot's texts: the ids of two consecutive
+long texts must differ."""
 
 
 class TextEncoder:

@@ -25,8 +25,8 @@ _FLUSH_US = US_PER_S
 class TlogWriter:
     """Writes a log under a temporary name and renames it when closed.
 
-    Whole records are written, at the latest after one second of simulated time: what a killed
-    process leaves under the temporary name is a good log of almost everything.
+    Whole records are written, at the latest after one second of simulated time: a killed process
+    leaves a valid log under the temporary name that lacks its last second at most.
     """
 
     def __init__(self, path: Path, start_unix_us: int) -> None:

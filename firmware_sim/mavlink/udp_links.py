@@ -1,4 +1,4 @@
-"""The two links of PX4 SITL: onboard API and ground station, both over UDP."""
+"""The two UDP links of PX4 SITL: onboard API and ground station."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """pybullet, imported and connected without its banner.
 
-A BulletClient looks every function up and wraps it at every call, which costs more than most of
-the functions: what runs at every tick calls `pybullet` itself with the client's number.
+A BulletClient looks up and wraps every function at every call, which costs more than most of the
+functions: code that runs at every tick calls `pybullet` itself with the client's number.
 """
 
 from __future__ import annotations
@@ -52,5 +52,5 @@ def connect() -> Any:
 
 
 def number_of(client: Any) -> int:
-    """Return what pybullet's functions call a client: their `physicsClientId`."""
+    """Return the `physicsClientId` of a client."""
     return int(client._client)

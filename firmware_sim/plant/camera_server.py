@@ -1,4 +1,4 @@
-"""The vehicle's depth camera: when a frame is due, what it shows, and who may have it."""
+"""The vehicle's depth camera: its schedule, its images, and their publication."""
 
 from __future__ import annotations
 

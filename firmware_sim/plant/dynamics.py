@@ -1,4 +1,4 @@
-"""What happens to the vehicle in one tick, before and after pybullet's step: compiled."""
+"""Forces, power and battery of the vehicle, computed around pybullet's step: compiled."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def pack_row(battery: Battery) -> tuple[float, ...]:
 def actuate(
     speeds: Speeds, motors: Speeds, row: Vector, wind: Vector, airframe: Vector, left: float
 ) -> tuple[Speeds, Vec, Vec, Vec]:
-    """Turn motor commands into what pybullet applies for one tick.
+    """Turn motor commands into the force and torque that pybullet applies for one tick.
 
     Args:
         speeds: Of the rotors.
@@ -77,7 +77,7 @@ def actuate(
 
 @kernel
 def supply(power: float, charge: float, pack: Vector) -> Supply:
-    """Return what the battery's monitor reads under a load [W] at a state of charge 0..1."""
+    """Return the battery monitor's reading under a load [W] at a state of charge 0..1."""
     voltage = terminal_voltage(open_circuit(charge, pack[0], pack[1]), pack[2], power)
     return voltage, power / voltage, (1.0 - charge) * pack[3], charge
 
@@ -99,7 +99,7 @@ def absorb(
     pack: Vector,
     tick_s: float,
 ) -> tuple[float, Supply, float]:
-    """Take in pybullet's state after a tick: the motion, what it took, what is left.
+    """Read pybullet's state after a tick: the motion, the power used, the charge left.
 
     Args:
         at: Position ENU [m].
@@ -115,10 +115,10 @@ def absorb(
         airframe: (13,) as `Airframe`.
         power: (10,) as `power_row`.
         pack: (4,) as `pack_row`.
-        tick_s: How long the tick was [s].
+        tick_s: Length of the tick [s].
 
     Returns:
-        Power over the tick [W], what the battery's monitor reads, the state of charge after it.
+        Power over the tick [W], the battery monitor's reading, the state of charge after it.
     """
     accel = (
         (linear[1] - before[3]) / tick_s,
@@ -129,8 +129,8 @@ def absorb(
     b = power
     model = (b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8])
     if standing:
-        # The model is one of flight, and an impact is no electrical load. Standing, rotors take
-        # the induced power of their thrust, P ~ T^1.5 (momentum theory).
+        # The model holds in flight only, and an impact is no electrical load. On the ground, rotors
+        # take the induced power of their thrust, P ~ T^1.5 (momentum theory).
         a = airframe_of(airframe)
         thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
         load = IDLE_POWER_W + model[8] * (thrust / (a.mass * GRAVITY_M_S2)) ** 1.5

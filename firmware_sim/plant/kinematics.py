@@ -1,4 +1,4 @@
-"""The vehicle's motion as one row of numbers: what kernels pass on and sensors feel."""
+"""The vehicle's motion as one row of numbers, for kernels and sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Moving obstacles: where they are, and their pybullet bodies where it matters."""
+"""Moving obstacles: their positions, and their pybullet bodies near the vehicle."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from airl_mav.core.kernels import kernel
 from firmware_sim.plant.bullet import pybullet
 
 MARGIN_M = 0.5
-"""A body is in its place when the vehicle is this much further away than it could touch. pybullet
-looks for contacts before it moves the vehicle, and 2 cm around it: nearly all of this is spare."""
+"""Bodies are updated within this distance beyond contact. pybullet detects contacts before it moves
+the vehicle, and 2 cm around it: nearly all of this is a margin."""
 
 Xyzw = tuple[float, float, float, float]
 """pybullet's quaternion."""
@@ -113,7 +113,7 @@ class Movers:
         return len(self._bodies)
 
     def move(self, time_us: int, vehicle: Vector, client: int) -> None:
-        """Put bodies in place, `time_us` [µs] after the start, for a vehicle at (>= 2,) NED [m]."""
+        """Update bodies near a vehicle at (>= 2,) NED [m], `time_us` [µs] after the start."""
         due, place = self._due, self._place
         count = _due(
             time_us, vehicle, self._times_s, self._points, self._leg, self._reach, place, due

@@ -1,4 +1,4 @@
-"""Sensors: truth -> what the autopilot gets, each with its own noise, bias and rate."""
+"""Sensor models: from the true state to samples, each with its own noise, bias and rate."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ PA_PER_HPA = 100.0
 GPS_SATELLITES = 12
 
 BLOCK = 128
-"""Noise is drawn for so many samples at once; how many changes no value."""
+"""Samples for which noise is drawn at once; the number does not affect the values."""
 
 
 class Rate:
-    """Says when a sensor slower than the tick is due, without drift."""
+    """Schedules a sensor that is slower than the tick, without drift."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz

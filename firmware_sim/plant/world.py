@@ -1,4 +1,4 @@
-"""The arena as pybullet bodies, and who touched whom."""
+"""The arena as pybullet bodies, with their names for collision events."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class World:
         Args:
             arena: None = an endless floor.
             vehicle_radius_m: No part of the vehicle is further from its centre than this [m].
-            tick_s: What a step of the physics is long [s].
+            tick_s: Time step of the physics [s].
         """
         self.client: Any = connect()
         self.number: int = number_of(self.client)
@@ -82,7 +82,7 @@ class World:
             baseCollisionShapeIndex=shape,
             basePosition=ned_to_enu(center),
             baseOrientation=attitude,
-            # A rigid body at rest costs nothing in a step. A multi-body, pybullet's default, goes
+            # A rigid body at rest costs nothing per step. A multi-body, pybullet's default, goes
             # through Featherstone's algorithm each time; one that is awake gets a new bounding box.
             useMaximalCoordinates=True,
         )

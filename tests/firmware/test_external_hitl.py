@@ -143,8 +143,11 @@ def test_a_board_that_does_not_come_back(router: Router, peer: HitlPeer) -> None
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ({"mute": True}, "no byte came.*powered.*SYS_USB_AUTO"),
-        ({"garbled": True}, "bytes came, no MAVLink among them: another baud rate than --baud"),
+        ({"mute": True}, "no byte was received.*powered.*SYS_USB_AUTO"),
+        (
+            {"garbled": True},
+            "bytes were received, no MAVLink among them: another baud rate than --baud",
+        ),
     ],
 )
 def test_which_step_is_missing(
@@ -179,7 +182,7 @@ def test_mavlink_without_an_autopilot(router: Router, peer: HitlPeer) -> None:
     ("beat", "words"),
     [
         ((2, 12, 29, 0, 3, 3), "not in HIL mode.*set SYS_HITL = 1.*HIL Quadcopter X"),
-        ((2, 3, 81 | 32, 0, 3, 3), "no PX4"),
+        ((2, 3, 81 | 32, 0, 3, 3), "not a PX4"),
     ],
 )
 def test_a_board_that_is_set_up_otherwise(

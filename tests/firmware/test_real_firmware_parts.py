@@ -125,7 +125,7 @@ def test_a_program_does_not_outlive_a_holder_that_is_killed(tmp_path: Path) -> N
 
 
 def test_what_is_no_program_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FirmwareMissingError, match="no program that can be run"):
+    with pytest.raises(FirmwareMissingError, match="not an executable program"):
         started(tmp_path, str(tmp_path / "px4"))
 
 

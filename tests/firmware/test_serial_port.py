@@ -29,7 +29,7 @@ def peer(tmp_path: Path) -> Iterator[HitlPeer]:
 @pytest.mark.parametrize(
     ("device", "words"),
     [
-        ("{}/nothing", ["--serial", "no such device", "there are"]),
+        ("{}/nothing", ["--serial", "no such device", "present"]),
         ("{}", ["--serial"]),
         ("/dev/null", ["--serial /dev/null", "no serial device"]),
     ],

@@ -19,22 +19,22 @@ _PACKETS = {40: (MAGIC_16, struct.Struct("<HHI16H")), 72: (MAGIC_32, struct.Stru
 
 
 class ServoPacketError(ValueError):
-    """A datagram is no servo packet; the message says why."""
+    """A datagram is not a servo packet; the message says why."""
 
 
 class ServoPacket(NamedTuple):
-    """What ArduPilot sends once a frame."""
+    """What ArduPilot sends once per frame."""
 
     frame_rate_hz: int
     """Frames a second of simulated time that it asks for (SIM_RATE_HZ)."""
     frame_count: int
-    """Answers that it has taken since it started."""
+    """State lines that it has received since it started."""
     pwm_us: tuple[int, ...]
     """Servo outputs 1..16 or 1..32 [µs]; 0 = none."""
 
 
 def parse_servos(datagram: bytes) -> ServoPacket:
-    """Read a servo packet. Raises ServoPacketError when it is none."""
+    """Parse a servo packet. Raises ServoPacketError if the datagram is not one."""
     packet = _PACKETS.get(len(datagram))
     if packet is None:
         lengths = " or ".join(str(length) for length in _PACKETS)
@@ -61,7 +61,7 @@ def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
     Args:
         time_us: Physics time on a base of the sender's own, > 0 [µs].
         sample: What the inertial sensors measure, FRD.
-        truth: Where the vehicle is: ArduPilot makes GPS, barometer and compass of it.
+        truth: The true state: ArduPilot simulates GPS, barometer and compass from it.
     """
     return (
         f'\n{{"timestamp":{time_us * AWAY_FROM_ZERO / US_PER_S!r},'
@@ -69,6 +69,6 @@ def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
         f'"position":{truth.position.tolist()},'
         f'"quaternion":{truth.quaternion.tolist()},'
         f'"velocity":{truth.velocity.tolist()},'
-        # It would hold its own pace by the wall clock otherwise; here the plant's is the pace.
+        # Otherwise it would pace itself by the wall clock; here the plant sets the pace.
         f'"no_time_sync":1}}\n'
     ).encode("ascii")

@@ -1,4 +1,4 @@
-"""ArduCopter SITL as a program: where it is, how it is started, its ports."""
+"""ArduCopter SITL as a program: its location, start command and ports."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from firmware_sim.external.process.firmware_process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
-"""Where instance 0 sends its servo packets, and how far the next one's port is (`-I`)."""
+"""Port to which instance 0 sends its servo packets, and the step to the next instance (`-I`)."""
 
 LAYOUTS = (".", "bin", "build/sitl/bin")
 """Where below a folder arducopter is looked for: the program's own, a build, a source tree."""
 
 PROGRAM = "arducopter"
 OBSERVER_PORT = 14030
-"""UDP port on which an ArduPilot that the user starts is listened to; each instance the next."""
+"""UDP port of the observer of an ArduPilot that the user starts; plus one per instance."""
 
 PARAMETERS = "vehicle.parm"
 
@@ -65,9 +65,9 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
     """Return program and arguments.
 
     Args:
-        program: How it is called.
+        program: The executable.
         instance: Its instance number, which moves the simulator's port.
-        links: Where it talks to.
+        links: Ports that it sends MAVLink to.
         defaults: File of default parameters, relative to its working directory.
     """
     home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
@@ -84,14 +84,14 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
 ) -> StartCommand:
-    """Return how it is started, its parameters in a file.
+    """Write its parameter file, and return the command that starts it.
 
     Args:
         program: The program itself.
         instance: Its instance number, which moves the simulator's port.
-        links: Where it talks to.
+        links: Ports that it sends MAVLink to.
         settings: Parameters, by name.
-        folder: Where it runs, and where the file is put.
+        folder: Its working folder, which gets the file.
     """
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
     return StartCommand(command(str(program), instance, links, PARAMETERS), {})

@@ -31,16 +31,16 @@ from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.endpoint import Address
 
 SILENCE_S = 5.0
-"""A packet may take so long [wall s]."""
+"""Longest wait for a packet [wall s]."""
 
 NEWCOMER_S = 0.5
-"""Ours is gone when another one starts while it says nothing for so long [wall s]."""
+"""When another ArduPilot starts and ours is silent for this long, ours is gone [wall s]."""
 
 MAX_GARBAGE = 100
-"""So many datagrams in a row are no slip of somebody else's, once ArduPilot was heard."""
+"""Consecutive datagrams that are not servo packets, after which a connected ArduPilot is lost."""
 
 RATES_HZ = range(50, 10_001)
-"""What a frame rate may be [Hz]: lines less than 0.1 s apart, and a clock of whole microseconds."""
+"""Accepted frame rates [Hz]: lines less than 0.1 s apart, and a clock of whole microseconds."""
 
 _SLICE_S = 0.1
 """Longest single wait [wall s]: `alive` is asked in between."""
@@ -48,7 +48,7 @@ _SLICE_S = 0.1
 _MAX_DATAGRAM = 4096
 
 MOTORS = 4
-"""Servo outputs 1 to 4 are the motors; what hangs on which is the airframe's business."""
+"""Servo outputs 1 to 4 are the motors; the airframe says which is which."""
 
 
 class ArdupilotBridge:
@@ -63,16 +63,16 @@ class ArdupilotBridge:
         rate_hz: int | None = None,
         silence_s: float = SILENCE_S,
     ) -> None:
-        """Open the port; nothing is sent before ArduPilot is heard.
+        """Open the port; nothing is sent before ArduPilot sends a packet.
 
         Args:
             port: UDP port on the loopback address, see `program.simulator_port`.
-            pwm_min_us: Pulse of a motor that stands (MOT_PWM_MIN) [µs].
+            pwm_min_us: Pulse of a stopped motor (MOT_PWM_MIN) [µs].
             pwm_max_us: Pulse of full thrust (MOT_PWM_MAX) [µs].
             rate_hz: Lines a second of simulated time; None = what ArduPilot asks for. It goes by
                 the time of the lines, whatever it asks for, but arms only with 1.8 times its loop
                 rate (SCHED_LOOP_RATE, 400 Hz) or more.
-            silence_s: How long a packet may take [wall s].
+            silence_s: Longest wait for a packet [wall s].
 
         Raises:
             UsageError: The port is taken.
@@ -82,9 +82,9 @@ class ArdupilotBridge:
         self.time_us = 0
         self.port = port
         self.garbage = 0
-        """Datagrams so far that were no servo packets."""
+        """Datagrams so far that were not servo packets."""
         self._run = 0
-        """How many of them came in a row."""
+        """How many of them were consecutive."""
         self._pwm_min_us, self._span_us = pwm_min_us, pwm_max_us - pwm_min_us
         self._silence_us = int(silence_s * US_PER_S)
         self._alive: Callable[[], None] = no_process
@@ -93,9 +93,9 @@ class ArdupilotBridge:
         self._packet: ServoPacket | None = None
         """The newest one: what the next line answers."""
         self._newcomer = False
-        """A first packet came from somebody else."""
+        """Whether another sender has sent a first packet."""
         self._veteran = False
-        """A later packet came from somebody else: its time cannot start at 0 again."""
+        """Whether another sender has sent a later packet: its time cannot start at 0 again."""
         self._base_us: int | None = None
         """Simulated time that is 0 to ArduPilot."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -115,17 +115,17 @@ class ArdupilotBridge:
 
         Args:
             timeout_s: How long [wall s].
-            alive: Called now and then, here and in `step`; raises when the process has died.
+            alive: Called at intervals, here and in `step`; raises when the process has died.
 
         Raises:
-            FirmwareMissingError: No servo packet came in time, or it asks for an impossible rate.
+            FirmwareMissingError: No servo packet arrived in time, or it asks for an invalid rate.
         """
         self._alive = alive
         stopwatch = WallClock()
         while self._packet is None:
             alive()
             if stopwatch.time_us() > timeout_s * US_PER_S:
-                raise FirmwareMissingError(self._nobody(timeout_s))
+                raise FirmwareMissingError(self._not_connected(timeout_s))
             self._packet = self._receive()
         self.rate_hz = self.rate_hz or self._packet.frame_rate_hz
         if self.rate_hz not in RATES_HZ:
@@ -135,17 +135,17 @@ class ArdupilotBridge:
             )
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Take what tells the true state: ArduPilot makes GPS, barometer and compass of it."""
+        """Accept a source of the true state, from which ArduPilot simulates its other sensors."""
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Answer the packet that waits, and return the motor commands of the next one.
+        """Answer the pending packet, and return the motor commands of the next one.
 
         The motors are outputs 1 to 4 in this order. ArduCopter's quad X (FRAME_TYPE 1) numbers
         them as PX4 does: front right, rear left, front left, rear right.
 
         Raises:
-            FirmwareLostError: ArduPilot died, is silent, started anew or sends garbage.
+            FirmwareLostError: ArduPilot died, is silent, restarted or sends garbage.
         """
         answered, truth, address = self._packet, self._truth, self._address
         if answered is None or truth is None or address is None:
@@ -167,9 +167,9 @@ class ArdupilotBridge:
         self._socket.close()
 
     def _newest(self, packet: ServoPacket) -> ServoPacket:
-        """Return the newest packet that has come while nobody asked.
+        """Return the newest of the packets that arrived since the last step.
 
-        One line for all of them: a line too many would put ArduPilot a frame ahead for good.
+        All of them get one answer: an extra line would put ArduPilot a frame ahead for good.
         """
         self._socket.settimeout(0.0)
         try:
@@ -206,7 +206,7 @@ class ArdupilotBridge:
                 self._socket.sendto(line, self._address)
 
     def _receive(self) -> ServoPacket | None:
-        """Return the next servo packet of our ArduPilot; None when none came in time.
+        """Return the next servo packet of our ArduPilot; None when none arrived in time.
 
         Raises FirmwareLostError when it sends nothing but garbage.
         """
@@ -233,7 +233,9 @@ class ArdupilotBridge:
         self.garbage += 1
         self._run += 1
         if self._run >= MAX_GARBAGE and self._address is not None:
-            raise FirmwareLostError(f"{self._run} datagrams in a row are no servo packets: {error}")
+            raise FirmwareLostError(
+                f"{self._run} consecutive datagrams are not servo packets: {error}"
+            )
 
     def _motors(self, pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
         """Return the commands 0..1 of outputs 1 to 4, in this order."""
@@ -241,21 +243,21 @@ class ArdupilotBridge:
         a, b, c, d = (min(max((pwm - low) / span, 0.0), 1.0) for pwm in pwm_us[:MOTORS])
         return a, b, c, d
 
-    def _nobody(self, timeout_s: float) -> str:
-        heard = f", only {self.garbage} datagrams of another kind" if self.garbage else ""
+    def _not_connected(self, timeout_s: float) -> str:
+        heard = f", only {self.garbage} other datagrams" if self.garbage else ""
         if self._veteran:
-            heard = ", only one that has flown before (each flight needs a new one)"
+            heard = ", only one that has flown before: restart it for each flight"
         return (
             f"no ArduPilot on UDP port {self.port} of {LOOPBACK} in {timeout_s:g} s{heard}: start "
             f"it with --model JSON:{LOOPBACK} --sim-port-out {self.port}"
         )
 
 
-_RESTARTED = "ArduPilot started anew in the middle of an episode"
+_RESTARTED = "ArduPilot restarted during an episode"
 
 
 def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
-    """Return `after`. Raises FirmwareLostError when it counts from 0 again."""
+    """Return `after`. Raises FirmwareLostError when its frame count went back."""
     if after.frame_count < before.frame_count:
         raise FirmwareLostError(_RESTARTED)
     return after

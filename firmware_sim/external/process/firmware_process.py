@@ -1,6 +1,6 @@
 """The process of external firmware, behind the parent-death guard.
 
-Neither PX4 nor ArduPilot notices by itself that nobody simulates for it any more.
+Neither PX4 nor ArduPilot ends by itself when its simulator is gone.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class FirmwareProcess(ChildProcess):
         self.name = name
         program = Path(command.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():
-            raise FirmwareMissingError(f"{name}: {program}: no program that can be run")
+            raise FirmwareMissingError(f"{name}: {program}: not an executable program")
         super().__init__(command.argv, log, guarded=True, cwd=cwd, environment=command.environment)
 
     def check(self) -> None:

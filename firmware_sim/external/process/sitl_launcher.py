@@ -1,6 +1,6 @@
-"""How SITL firmware gets going: a program that we start for each flight, or one that the user does.
+"""Starts SITL firmware for each flight, or waits for one that the user starts.
 
-What is particular to PX4 and to ArduPilot is in `px4.program` and `ardupilot.program`.
+What differs between PX4 and ArduPilot is in `px4.program` and `ardupilot.program`.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ class SitlLauncher:
         timeout_s: float,
         reboots: bool,
     ) -> None:
-        """Take what is started, and what it flies through.
+        """Take what is started, and its simulator interface.
 
         Args:
-            airframe: What it must be set to.
-            bridge: Opens the simulator's side of its interface, for one flight.
-            program: Called with an empty folder, which it may write files to: how the program is
-                started in it. None = the user starts it.
-            folders: Where it runs and logs.
+            airframe: What it must be configured to.
+            bridge: Opens the simulator interface for one flight.
+            program: Called with an empty working folder, which it may write files to; returns the
+                command that starts the program there. None = the user starts it.
+            folders: Its working folders and log.
             timeout_s: Longest wait for it to connect [wall s].
-            reboots: Whether it starts anew by itself when told to reboot.
+            reboots: Whether it comes up again when told to reboot.
         """
         self.airframe = airframe
         self.may_set = program is not None
@@ -73,6 +73,6 @@ class SitlLauncher:
             child.stop()
 
     def close(self) -> None:
-        """End it for good; its temporary folder goes."""
+        """End it for good, and remove its temporary folder."""
         self.stop()
         self._folders.close()

@@ -1,4 +1,4 @@
-"""Where a firmware process runs: a folder for each flight, and one log."""
+"""Working folders of a firmware process: one for each flight, and one log."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 
 
 class WorkingFolders:
-    """Folders for one flight after the other: parameters and flight logs of the firmware."""
+    """One working folder after the other; firmware keeps parameters and flight logs there."""
 
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
-        """Take where to be.
+        """Choose the place.
 
         Args:
-            name: What the firmware is called: px4.
-            kept: Folder that the flights' folders stay in; None = temporary ones, one at a time.
-            log: What the process prints goes here; None = a file in the flights' folder.
+            name: Name of the firmware: px4.
+            kept: Folder that keeps the working folders; None = temporary ones, one at a time.
+            log: Log of what the process prints; None = a file beside the working folders.
         """
         self._kept = kept
         self._temporary: Path | None = None
@@ -31,7 +31,7 @@ class WorkingFolders:
         self._root = root.absolute()
 
     def fresh(self) -> Path:
-        """Return a new, empty folder: nothing of an earlier flight is known in it."""
+        """Return a new, empty working folder: nothing carries over from an earlier flight."""
         if self._temporary is not None:
             shutil.rmtree(self._root / self._folder, ignore_errors=True)
         while True:

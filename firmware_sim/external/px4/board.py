@@ -1,4 +1,4 @@
-"""What a PX4 board says on its line, and what is wrong with it, in words."""
+"""The state of a PX4 board by its messages, and what is wrong with its configuration."""
 
 from __future__ import annotations
 
@@ -15,49 +15,49 @@ JUMP_US = US_PER_S
 """Its clock going back by this is a restart [µs]."""
 
 SURE_BEATS = 3
-"""So many heartbeats without the HIL flag are no matter of starting up any more."""
+"""After so many heartbeats without the HIL flag, the board is not just starting up."""
 
 _ALL_MOTORS = (1 << hil.MOTORS) - 1
 
 
 class Board:
-    """What was heard of a board since its line was opened. Nothing that it says raises."""
+    """What was received from a board since its line was opened. No message raises."""
 
     def __init__(self, clock: Clock) -> None:
-        """Nothing has been heard yet; `clock` is the wall's."""
+        """Start without any message; `clock` is the wall clock."""
         self._clock = clock
         self.system: int | None = None
         """MAVLink system id; None before its first heartbeat."""
         self.autopilot = 0
         """MAV_AUTOPILOT of its heartbeats."""
         self.beats = 0
-        """Heartbeats so far."""
+        """Heartbeats received."""
         self.hil = False
-        """Its newest heartbeat has the HIL flag."""
+        """Whether its newest heartbeat has the HIL flag."""
         self.armed = False
-        """Its newest heartbeat says so."""
+        """Whether its newest heartbeat says that it is armed."""
         self.controls: WireMessage | None = None
         """The newest HIL_ACTUATOR_CONTROLS."""
         self.controls_us = 0
-        """When that came [wall µs]."""
+        """When that was received [wall µs]."""
         self.restarted = False
-        """Its clock went back."""
+        """Whether its clock went back."""
         self.reboot_answer: int | None = None
-        """MAV_RESULT with which it answered whoever told it to reboot."""
+        """MAV_RESULT of its answer to a reboot command, whoever sent it."""
         self._boot_us = 0
 
     @property
     def ready(self) -> bool:
-        """Whether it waits for sensors."""
+        """Whether it is a PX4 in HIL mode, which waits for sensors."""
         return self.hil and self.autopilot == dialect.MAV_AUTOPILOT_PX4
 
     @property
     def rebooting(self) -> bool:
-        """Whether it has agreed to reboot."""
+        """Whether it has accepted a reboot command."""
         return bool(self.reboot_answer == dialect.MAV_RESULT_ACCEPTED)
 
     def take(self, message: WireMessage) -> None:
-        """Take a message that has come from the line."""
+        """Take a message received from the line."""
         if message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
             return  # of another component, forwarded by the board
         name = message.get_type()
@@ -84,9 +84,9 @@ class Board:
         self._boot_us = max(self._boot_us, boot_us)
 
     def setup_problem(self) -> str | None:
-        """Return what of its set-up cannot be flown, None while nothing is known to be wrong."""
+        """Return what is wrong with its configuration, None while nothing is known to be."""
         if self.beats and self.autopilot != dialect.MAV_AUTOPILOT_PX4:
-            return f"it is no PX4 (HEARTBEAT.autopilot {self.autopilot}, PX4's is 12)"
+            return f"it is not a PX4 (HEARTBEAT.autopilot {self.autopilot}, PX4's is 12)"
         if self.beats >= SURE_BEATS and not self.hil:
             return f"it is not in HIL mode (HEARTBEAT.base_mode without bit 32): {HIL_SETUP}"
         if self.controls is None:
@@ -109,24 +109,26 @@ class Board:
 
 
 class Heard(Protocol):
-    """What has come from a line; `router.Router` knows."""
+    """What was received on a line; `router.Router` counts it."""
 
     received_bytes: int
     speaks_mavlink: bool
 
 
 def silence(board: Board, line: Heard) -> str:
-    """Return how far a connection has come that did not come further."""
+    """Return why a connection was not completed: how far it got."""
     if line.received_bytes == 0:
         return (
-            "no byte came: is it powered, is this its port, does it speak MAVLink there by itself "
+            "no byte was received: is it powered, is this its port, does it send MAVLink there "
             "(USB: SYS_USB_AUTO = 2; TELEM 1: MAV_0_CONFIG = 101)?"
         )
     if not line.speaks_mavlink:
         return (
-            f"{line.received_bytes} bytes came, no MAVLink among them: another baud rate than "
-            "--baud (the board's: SER_TEL1_BAUD), or another device"
+            f"{line.received_bytes} bytes were received, no MAVLink among them: another baud rate "
+            "than --baud (the board's: SER_TEL1_BAUD), or another device"
         )
     if not board.beats:
-        return "MAVLink came, but no heartbeat of an autopilot: a radio, or another component?"
-    return f"heartbeats came without the HIL flag: {HIL_SETUP}"
+        return (
+            "MAVLink was received, but no heartbeat of an autopilot: a radio, or another component?"
+        )
+    return f"heartbeats were received without the HIL flag: {HIL_SETUP}"

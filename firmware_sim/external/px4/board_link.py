@@ -1,4 +1,4 @@
-"""The line to a PX4 board: found, rebooted, found again, told things."""
+"""The connection to a PX4 board: found, rebooted, found again, and used to send messages."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingErr
 from firmware_sim.mavlink.codec import Encoder, Layout, Values, WireMessage, dialect
 
 REBOOT_S = 10.0
-"""Longest time until it goes down when told to reboot [wall s]."""
+"""Longest time from a reboot command until the board goes down [wall s]."""
 
-QUIET_S = 1.5
-"""A board that says nothing for so long is down: its heartbeat comes every second [wall s]."""
+SILENCE_S = 1.5
+"""A board that is silent for this long is down: its heartbeat is due every second [wall s]."""
 
 FORCE = 21196.0
 """COMPONENT_ARM_DISARM in any state."""
@@ -33,25 +33,25 @@ _MAVLINK_VERSION = 3
 class BoardLink:
     """One board on one device, which may vanish and come back while it reboots.
 
-    Nothing is sent to a board before it was heard.
+    Nothing is sent to a board before something was received from it.
     """
 
     def __init__(
         self, router: Router, device: str, baud: int, *, budget_bytes_s: int, reboot_s: float
     ) -> None:
-        """Take where the board is; nothing is opened yet.
+        """Configure the connection; nothing is opened yet.
 
         Args:
-            router: Gets the line, and keeps its clients.
+            router: Gets the line; its clients stay.
             device: Serial device.
             baud: Bits a second.
-            budget_bytes_s: What clients may send to the board [bytes/s].
-            reboot_s: Longest time until it goes down when told to reboot [wall s].
+            budget_bytes_s: Most that clients may send to the board [bytes/s].
+            reboot_s: Longest time from a reboot command until it goes down [wall s].
         """
         self.device = device
         self.clock = WallClock()
         self.board = Board(self.clock)
-        """What was heard of it; a new one each time that the device is opened."""
+        """What was received from it; a new object each time that the device is opened."""
         self._router = router
         self._baud = baud
         self._budget_bytes_s = budget_bytes_s
@@ -62,22 +62,22 @@ class BoardLink:
 
     @property
     def lost(self) -> str | None:
-        """Why there is no line, None while there is one."""
+        """Why there is no connection; None while there is one."""
         return self._router.lost or (None if self._line else f"{self.device}: not connected")
 
-    # --- coming and going
+    # --- connecting
 
     def connect(self, timeout_s: float, alive: Callable[[], None], *, returning: bool) -> None:
-        """Return once a board in HIL mode is heard.
+        """Return once a board in HIL mode has sent a heartbeat.
 
         Args:
             timeout_s: How long to wait [wall s].
-            alive: Called now and then; raises to give up.
-            returning: Whether the device may be away at first: it was there before.
+            alive: Called at intervals; raises to give up.
+            returning: Whether the device may be absent at first: it was there before.
 
         Raises:
             UsageError: The device cannot be opened.
-            FirmwareMissingError: Such a board was not heard.
+            FirmwareMissingError: No such board was found.
             FirmwareLostError: The device did not come back.
         """
         self.close()
@@ -92,7 +92,7 @@ class BoardLink:
             if problem is not None:
                 raise FirmwareMissingError(f"--serial {self.device}: the board: {problem}")
             if self._router.lost is not None:
-                # Its boot loader has a USB of its own, and goes when the firmware comes.
+                # Its boot loader is a USB device of its own, gone when the firmware starts.
                 self.close()
                 returning = True
             elif self.clock.time_us() > deadline_us and not self.board.ready:
@@ -102,7 +102,7 @@ class BoardLink:
                 )
 
     def _open(self, deadline_us: int) -> None:
-        """Open the device, or wait a moment for it; it may be away until then [wall µs]; 0: not."""
+        """Open the device, or wait a moment if it is absent before the deadline [wall µs]."""
         try:
             self._line = SerialPort(self.device, self._baud)
         except UsageError as error:
@@ -130,12 +130,12 @@ class BoardLink:
             now_us = clock.time_us()
             if self._router.received_bytes != heard:
                 heard, heard_us = self._router.received_bytes, now_us
-            elif now_us - heard_us > QUIET_S * US_PER_S:
+            elif now_us - heard_us > SILENCE_S * US_PER_S:
                 break
             if not board.rebooting and now_us >= due_us and now_us - heard_us < _AGAIN_S * US_PER_S:
                 due_us = now_us + US_PER_S
                 if board.armed:
-                    self.disarm()  # or it refuses
+                    self.disarm()  # it would refuse otherwise
                 self._command(dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0)
             if now_us > deadline_us:
                 raise FirmwareLostError(
@@ -151,18 +151,18 @@ class BoardLink:
         if beat:
             self.beat()
 
-    # --- talking
+    # --- sending
 
     def send(self, layout: Layout, values: Values) -> bool:
-        """Send a message of the simulator's; False when the line did not take it."""
+        """Send a message of the simulator; False when the line did not accept it."""
         return self._router.send(self._encoder.frame(layout, layout.payload(values)))
 
     def pump(self) -> None:
-        """Take what has come, pass on what is others'."""
+        """Take the messages received, and pass on those for clients."""
         self._router.pump()
 
     def beat(self) -> None:
-        """Send a heartbeat when it is due: the board is to know that the line is used."""
+        """Send a heartbeat when it is due, so that the board keeps the line in use."""
         now_us = self.clock.time_us()
         if now_us >= self._beat_due_us and self.board.beats:
             self._beat_due_us = now_us + _BEAT_US
@@ -175,7 +175,7 @@ class BoardLink:
             )
 
     def disarm(self) -> None:
-        """Disarm a board in HIL mode, in whatever state it is."""
+        """Disarm a board in HIL mode, whatever its state."""
         if self.board.ready:
             self._command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, FORCE)
 

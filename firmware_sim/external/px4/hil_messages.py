@@ -44,7 +44,7 @@ MOTORS = 4
 STILL = (0.0, 0.0, 0.0, 0.0)
 
 TOLERANCE = 1e-3
-"""A motor command may leave 0..1 by rounding."""
+"""Motor commands may exceed 0..1 by this much, due to rounding."""
 
 COURSE_UNKNOWN = 65_535
 
@@ -64,7 +64,7 @@ _CM = 1e2
 ACCEL_LIMIT_M_S2 = 32_767 / 2048 * GRAVITY_M_S2
 GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * DEG
 """Range of the inertial sensors that PX4's drivers simulate: 16 g, 2000 deg/s in 16 bits. What lies
-beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would read as a fall."""
+beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would look like a fall."""
 
 _INT16 = (-32_768, 32_767)
 _UINT16 = (0, 65_535)
@@ -72,11 +72,11 @@ _INT32 = (-(2**31), 2**31 - 1)
 
 
 class ControlsError(ValueError):
-    """HIL_ACTUATOR_CONTROLS that no quadrotor can follow."""
+    """HIL_ACTUATOR_CONTROLS that are invalid for a quadrotor."""
 
 
 def sensor(sample: SensorSample, time_us: int) -> Values:
-    """Return HIL_SENSOR at the firmware's time [µs]: what is not in the sample is not updated."""
+    """Return HIL_SENSOR at the firmware's time [µs]; sensors without a sample are not updated."""
     ax, ay, az = _saturated(sample.accel, ACCEL_LIMIT_M_S2)
     gx, gy, gz = _saturated(sample.gyro, GYRO_LIMIT_RAD_S)
     fields = IMU_FIELDS
@@ -135,7 +135,7 @@ def state_quaternion(truth: Truth, time_us: int) -> Values:
 
 
 def armed(message: WireMessage) -> bool:
-    """Return what HIL_ACTUATOR_CONTROLS says of arming."""
+    """Return whether HIL_ACTUATOR_CONTROLS says armed."""
     return bool(message.mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
@@ -147,14 +147,14 @@ def lockstep(message: WireMessage) -> bool:
 def controls(message: WireMessage, time_us: int) -> ActuatorControls:
     """Return the motor commands of HIL_ACTUATOR_CONTROLS.
 
-    Motors stand still while disarmed, whatever is commanded: PX4 in HITL does command then.
+    Motors are stopped while disarmed, whatever is commanded: PX4 in HITL sends commands then, too.
 
     Args:
         message: HIL_ACTUATOR_CONTROLS.
         time_us: Simulated time at which they hold [µs].
 
     Raises:
-        ControlsError: While armed, a command is no number, or no motor's.
+        ControlsError: While armed, a command is not a number in 0..1.
     """
     if not armed(message):
         return ActuatorControls(time_us, STILL, armed=False)

@@ -1,7 +1,7 @@
-"""Hardware in the loop: a PX4 board that flies on our sensors over its serial or USB line.
+"""Hardware in the loop: a PX4 board that flies on simulated sensors over a serial or USB line.
 
 There is no lockstep. The board runs on its own clock; every tick's sensors are sent to it, and its
-newest motor commands are taken as they come, a transfer and a cycle of the board late.
+newest motor commands are applied, late by a transfer and a cycle of the board.
 
 Source: PX4, src/modules/mavlink: mavlink_receiver.cpp (HIL_SENSOR, HIL_GPS),
 streams/HIL_ACTUATOR_CONTROLS.hpp; Commander.cpp (reboot).
@@ -47,19 +47,20 @@ HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
 """What the simulator sends [bytes/s]."""
 
 HIL_SHARE = 2 / 3
-"""The most that may be of what a line carries: the rest is for companion and ground station."""
+"""Largest share of a line's capacity that this may take: companion and ground station need the
+rest."""
 
 USB_CLIENTS_BYTES_S = 100_000
-"""What those may send over USB [bytes/s]: a tenth of what it carries at full speed."""
+"""What those may send over USB [bytes/s]: a tenth of its capacity at full speed."""
 
 _CREEP_US = 20
 _BEHIND_US = 20_000
 
 
 class Pace:
-    """Holds ticks to 250 a second of wall time, whatever is asked: the board's clock is no sim's.
+    """Limits ticks to 250 per second of wall time: the board's clock is not simulated.
 
-    Where ticks are paced already it finds the pace of the punctual ones and waits no more.
+    Where ticks are paced already, it adapts to the pace of the punctual ones and does not wait.
     """
 
     def __init__(self, clock: WallClock) -> None:
@@ -74,7 +75,7 @@ class Pace:
             self._origin_us = now_us - time_us
         ahead_us = self._origin_us + time_us - now_us
         if ahead_us > 0:
-            # Somebody else's pace may be ahead of ours for good: give way slowly.
+            # Another pace may be ahead of ours permanently: follow it slowly.
             self._origin_us -= min(ahead_us, _CREEP_US)
             self._clock.sleep_until(self._origin_us + time_us)
         elif ahead_us < -_BEHIND_US:
@@ -84,11 +85,11 @@ class Pace:
 class HitlBridge:
     """Flies one board for one episode. Implements `Bridge`.
 
-    The flight ends (`FirmwareLostError`) when the device goes, when motor commands stay away, when
-    the board restarts or leaves HIL mode, or commands what no motor can do.
+    The flight ends (`FirmwareLostError`) when the device vanishes, when motor commands cease, when
+    the board restarts or leaves HIL mode, or when its commands are invalid.
 
-    Nothing is sent to a board before it was heard, no sensors before it says that it is in HIL
-    mode, and never HIL_STATE_QUATERNION, which a board takes for its own estimate.
+    Nothing is sent to a board before it sends something, no sensors before it reports HIL mode, and
+    never HIL_STATE_QUATERNION, which a board takes for its own estimate.
     """
 
     rate_hz = TICK_HZ
@@ -105,17 +106,17 @@ class HitlBridge:
         first_controls_s: float = FIRST_CONTROLS_S,
         reboot_s: float = REBOOT_S,
     ) -> None:
-        """Take where the board is; nothing is opened yet.
+        """Configure the connection; nothing is opened yet.
 
         Args:
-            router: Gets its line, and keeps its clients.
+            router: Gets its line; its clients stay.
             device: Serial device.
             baud: Bits a second.
-            reboot: Whether the board is rebooted once it is found: its estimator may have flown.
-            returning: Whether the device may be away at first: it was there before.
+            reboot: Whether the board is rebooted once found: its estimator may hold a flight.
+            returning: Whether the device may be absent at first: it was there before.
             silence_s: Longest time between motor commands [wall s].
             first_controls_s: Longest time until the first motor commands [wall s].
-            reboot_s: Longest time until it goes down when told to reboot [wall s].
+            reboot_s: Longest time from a reboot command until it goes down [wall s].
 
         Raises:
             UsageError: The line is too slow.
@@ -123,7 +124,7 @@ class HitlBridge:
         self.armed = False
         self.time_us = 0
         self.went_down = False
-        """The board was told to reboot by others, and did when this was closed."""
+        """Whether others told the board to reboot, and it was down when this was closed."""
         self._link = BoardLink(
             router,
             device,
@@ -140,18 +141,18 @@ class HitlBridge:
         self._began_us = 0
         """When the first sample was sent [wall µs]."""
         self._stuck_us: int | None = None
-        """Since when the line has taken none [wall µs]."""
+        """Since when the line has not accepted samples [wall µs]; None: it does."""
         self._stepped_us = 0
         """When the newest step was [wall µs]."""
         self._resumed_us = 0
-        """When we went on after a standstill of our own [wall µs]."""
+        """When this process resumed after a standstill of its own [wall µs]."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Find the board in HIL mode, reboot it, and find it again; see `Bridge`.
 
         Raises:
             UsageError: The device cannot be opened.
-            FirmwareMissingError: No board in HIL mode was heard within `timeout_s`, each time.
+            FirmwareMissingError: No board in HIL mode was found within `timeout_s`, each time.
             FirmwareLostError: It does not reboot, or does not come back.
         """
         self._link.connect(timeout_s, alive, returning=self._returning)
@@ -160,11 +161,11 @@ class HitlBridge:
             self._link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Send a tick's sensors, take the newest motor commands; none yet: motors stand still.
+        """Send a tick's sensors, return the newest motor commands; at first motors are stopped.
 
         Raises:
             FirmwareLostError: The flight is over.
-            FirmwareMissingError: What it sends first cannot be flown.
+            FirmwareMissingError: Its first messages show a configuration that cannot be flown.
         """
         self._pace.wait(sample.time_us)
         link = self._link
@@ -192,13 +193,13 @@ class HitlBridge:
         return controls
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Do nothing: a board would take the true state for its estimate."""
+        """Ignore the true state: a board would take it for its estimate."""
 
     def close(self) -> None:
         """Disarm the board and close the device; harmless when called again."""
         link = self._link
         if link.board.rebooting:
-            # Who finds it next must not take it for one that has come up.
+            # Whoever finds it next must not take it for a board that has come up.
             with suppress(FirmwareLostError):
                 link.go_down(no_process)
                 self.went_down = True
@@ -234,7 +235,7 @@ class HitlBridge:
         if problem is not None:
             raise FirmwareLostError(f"{device}: the board: {problem}")
         if self._stuck_us is not None and now_us - self._stuck_us > self._silence_us:
-            raise FirmwareLostError(f"{device}: the line takes nothing more: the board hangs")
+            raise FirmwareLostError(f"{device}: the line accepts no more data: the board hangs")
 
     def _send(self, sample: SensorSample, time_us: int, now_us: int) -> None:
         if self._link.send(hil.SENSOR, hil.sensor(sample, time_us)):
@@ -246,7 +247,7 @@ class HitlBridge:
 
 
 class HitlLauncher:
-    """Finds the same board for each episode. Implements `boot_sequence.Launcher`."""
+    """Finds and reboots the same board for each episode. Implements `boot_sequence.Launcher`."""
 
     may_set = False
     reboots = True
@@ -261,14 +262,14 @@ class HitlLauncher:
         *,
         silence_s: float = SILENCE_S,
     ) -> None:
-        """Take where the board is.
+        """Configure the connection.
 
         Args:
-            airframe: What it must be set to.
+            airframe: What it must be configured to.
             router: Where its MAVLink goes.
             device: Serial device.
             baud: Bits a second.
-            timeout_s: Longest wait for it to be heard [wall s].
+            timeout_s: Longest wait for its heartbeat [wall s].
             silence_s: Longest time between motor commands [wall s].
 
         Raises:
@@ -301,12 +302,12 @@ class HitlLauncher:
         return self._bridge
 
     def stop(self) -> None:
-        """Let go of the board."""
+        """Release the board."""
         if self._bridge is not None:
             self._bridge.close()
 
     def close(self) -> None:
-        """Let go of the board for good."""
+        """Release the board for good."""
         self.stop()
 
 

@@ -1,4 +1,4 @@
-"""PX4 SITL as a program: where it is, how it is started, its ports."""
+"""PX4 SITL as a program: its location, start command and ports."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
 """Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink)."""
 
 GREATEST_INSTANCE = 9
-"""Beyond, PX4's instances share one API port."""
+"""Instances above this one share one API port in PX4."""
 
 MODEL = "none_iris"
 """PX4_SIM_MODEL without which PX4's scripts would start a simulator of their own."""
@@ -28,14 +28,14 @@ LAYOUTS = (".", "build/px4_sitl_default", "usr", "opt/px4")
 
 @dataclass(frozen=True)
 class Px4Program:
-    """A PX4 that can be started."""
+    """An executable PX4."""
 
     binary: Path
     etc: Path
     """Folder of its start-up scripts."""
 
     def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
-        """Return how it is started: in the background, without a shell.
+        """Return the command that starts it: in the background, without a shell.
 
         Args:
             instance: PX4's instance number, which moves all its ports.
@@ -68,7 +68,7 @@ def find_px4(folder: Path) -> Px4Program:
 
 
 def environment(airframe: int) -> dict[str, str]:
-    """Return what PX4's start-up script must find in its environment."""
+    """Return the environment variables that PX4's start-up script reads."""
     return {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": str(airframe)}
 
 

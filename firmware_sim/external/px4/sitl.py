@@ -24,15 +24,15 @@ ANSWER_S = 5.0
 """Longest wait for an answer [wall s]."""
 
 REST_S = 0.1
-"""Longest wait for one answer of a PX4 that is disarmed [wall s]; then the next sample goes out. In
-Offboard on the ground, without a setpoint, it controls nothing and answers only now and then, by
-its own clock, which does not move while it is waited for."""
+"""Longest wait for one answer of a PX4 that is disarmed [wall s]; then the next sample is sent. In
+Offboard on the ground, without a setpoint, it answers only now and then, by its own clock, which
+does not advance while it is waited for."""
 
 START_S = 60.0
 """Longest time from the first sample to the first answer [wall s]: PX4's start script runs."""
 
 EPOCH_US = US_PER_S
-"""PX4's time of the first sample [µs]: 0 means never to it."""
+"""PX4's time of the first sample [µs]: it reads 0 as never."""
 
 STATE_US = 200_000
 """How often the true state is sent [µs], unless PX4 asks."""
@@ -40,7 +40,7 @@ STATE_US = 200_000
 NEVER_US = sys.maxsize
 
 MAX_GARBAGE = 16
-"""Runs of garbage that are put up with; there should be none, TCP damages nothing."""
+"""Most runs of garbage that are tolerated; TCP should deliver none."""
 
 MAX_GARBAGE_BYTES = 4096
 """Longest run of it."""
@@ -54,12 +54,12 @@ class Px4Bridge:
 
     Implements `Bridge`. PX4's clock is HIL_SENSOR's time: while it is being waited for, its time
     stands still. It answers nothing before it has booted; until then samples are sent no faster
-    than they would be measured, and motors stand still.
+    than they would be measured, and motors are stopped.
 
     Disarmed it may leave samples unanswered for a while. Anything else ends the flight
     (`FirmwareLostError`): PX4 silent for too long, its connection closed, its clock jumping back
-    (it restarted) or ahead, garbage, commands that are no motor's. A second answer to a sample is
-    dropped; a second connection is turned away.
+    (it restarted) or ahead, garbage, invalid motor commands. A second answer to a sample is
+    dropped; a second connection is refused.
     """
 
     rate_hz = TICK_HZ
@@ -112,7 +112,7 @@ class Px4Bridge:
         self._answer: WireMessage | None = None
         """The newest one."""
         self._waiting_us: int | None = None
-        """Since when an answer is due [wall µs]; None: none is."""
+        """Since when an answer is due [wall µs]; None: no answer is due."""
         self._garbage_bytes = 0
         """Bytes since the last message."""
 
@@ -126,11 +126,11 @@ class Px4Bridge:
             )
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
-        """Take what tells the true state."""
+        """Accept a source of the true state."""
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance PX4 to the sample's time; see `Bridge`. Motors stand still until it answers."""
+        """Advance PX4 to the sample's time; see `Bridge`. Motors are stopped until it answers."""
         if self._first_us is None:
             self._first_us = sample.time_us
             self._began_us = self._clock.time_us()
@@ -211,7 +211,7 @@ class Px4Bridge:
         return answer
 
     def _receive(self, timeout_s: float) -> bool:
-        """Take what comes in time; return whether anything did."""
+        """Take what arrives in time; return whether anything did."""
         data = self._tcp.receive(timeout_s)
         if data is None:
             self._alive()
@@ -223,7 +223,7 @@ class Px4Bridge:
         for message in messages:
             self._take(message)
         if self._garbage_bytes > MAX_GARBAGE_BYTES or self._decoder.malformed > MAX_GARBAGE:
-            raise self._lost("sends bytes that are no MAVLink")
+            raise self._lost("sends bytes that are not MAVLink")
         return True
 
     def _take(self, message: WireMessage) -> None:
@@ -265,7 +265,7 @@ class Px4Bridge:
     def _lost(self, what: str) -> FirmwareLostError:
         notes = [f"{self._decoder.malformed} runs of garbage"] if self._decoder.malformed else []
         if self._tcp.refused:
-            notes.append(f"{self._tcp.refused} other connections turned away")
+            notes.append(f"{self._tcp.refused} other connections refused")
         more = f" ({', '.join(notes)})" if notes else ""
         return FirmwareLostError(
             f"PX4 on TCP port {self.port} {what}, at {_seconds(self._sent_us)} of its clock{more}"

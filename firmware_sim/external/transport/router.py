@@ -1,7 +1,7 @@
-"""MAVLink between a board on one serial line and those who talk to it over UDP.
+"""Routes MAVLink between a board on one serial line and its clients over UDP.
 
-The line carries two things at once: the simulator's messages, which stay here, and everything that
-companion and ground station say and hear, which passes unchanged, frame by frame.
+The line carries both the simulator's messages, which are handled here, and the traffic of companion
+and ground station, which is forwarded unchanged, frame by frame.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ SIMULATOR_IDS = frozenset(
         "HIL_STATE_QUATERNION",
     )
 )
-"""Pass in neither direction: nobody but us simulates for the board, and nobody else needs it."""
+"""Messages that are forwarded in neither direction: only we simulate for the board."""
 
 BURST_BYTES = 8192
-"""How much may go to the board at once before the budget counts."""
+"""Bytes that may be sent to the board at once before the budget applies."""
 
 HEARD_FRAMES = 4096
-"""Frames kept for who listens in this process: ten seconds of a PX4's telemetry."""
+"""Frames kept for a listener in this process: ten seconds of a PX4's telemetry."""
 
 
 class Frame(NamedTuple):
-    """One frame as it came."""
+    """One frame as received."""
 
     raw: bytes
     number: int
@@ -54,7 +54,7 @@ class Frame(NamedTuple):
 
 
 class FrameDecoder(Decoder):
-    """A decoder that keeps the bytes, of messages that the dialect lacks too."""
+    """A decoder that keeps each frame's bytes, also of messages that the dialect lacks."""
 
     def __init__(self, *, datagrams: bool) -> None:
         super().__init__(datagrams=datagrams)
@@ -74,13 +74,13 @@ class FrameDecoder(Decoder):
 
 
 class Budget:
-    """So many bytes a second, and a burst of them at once."""
+    """A token bucket: a rate in bytes per second, and a burst."""
 
     def __init__(self, bytes_s: int, clock: Clock) -> None:
         """Start with a full burst.
 
         Args:
-            bytes_s: In the long run.
+            bytes_s: Long-term rate [bytes/s].
             clock: Wall time.
         """
         self._bytes_s = bytes_s
@@ -89,7 +89,7 @@ class Budget:
         self._then_us = clock.time_us()
 
     def take(self, count: int) -> bool:
-        """Tell whether `count` bytes may go now; if so they are spent."""
+        """Return whether `count` bytes may be sent now; if so they are spent."""
         now_us = self._clock.time_us()
         self._left += self._bytes_s * (now_us - self._then_us) / US_PER_S
         self._left, self._then_us = min(self._left, BURST_BYTES), now_us
@@ -111,7 +111,7 @@ class Line(Protocol):
         ...
 
     def drain(self) -> None:
-        """Send what waits."""
+        """Send what is queued."""
         ...
 
     def fileno(self) -> int:
@@ -120,7 +120,7 @@ class Line(Protocol):
 
 
 class _Client:
-    """One UDP end."""
+    """One client over UDP."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -129,16 +129,16 @@ class _Client:
 
 
 class Router:
-    """Passes frames on whenever `pump` is called. Nothing blocks; only `send` tells of a loss.
+    """Forwards frames whenever `pump` is called. Nothing blocks or raises; see `lost`.
 
-    The line comes and goes (a board's USB vanishes while it reboots), the clients stay.
+    The line may change (a board's USB device vanishes while it reboots), the clients stay.
     """
 
     def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
         """Take the clients' ends.
 
         Args:
-            clients: Endpoints by the names of their links; they become the router's to close.
+            clients: Endpoints by the names of their links; the router closes them.
             clock: Wall time.
         """
         self.lost: str | None = None
@@ -146,10 +146,10 @@ class Router:
         self.on_message: Callable[[WireMessage], None] | None = None
         """Called with every message of the board that the dialect knows, if set."""
         self.received_bytes = 0
-        """From the line since it was attached."""
+        """Bytes received on the line since it was attached."""
         self.speaks_mavlink = False
-        """A frame with a good checksum has come since the line was attached. Nothing is sent
-        before: at the other end may be a boot loader, which takes bytes for commands."""
+        """Whether a frame with a valid checksum was received since the line was attached. Nothing
+        is sent before: a boot loader at the other end would take bytes for commands."""
         self._clients = {name: _Client(endpoint) for name, endpoint in clients.items()}
         self._clock = clock
         self._line: Line | None = None
@@ -167,11 +167,11 @@ class Router:
     # --- the line
 
     def attach(self, line: Line, budget_bytes_s: int) -> None:
-        """Take a line, in place of another; it stays the caller's to close.
+        """Use a line, in place of another; the caller closes it.
 
         Args:
             line: To the board.
-            budget_bytes_s: How much of it clients may use towards the board [bytes/s].
+            budget_bytes_s: Most that clients may send to the board [bytes/s].
         """
         self.detach()
         self._line, self._line_fd = line, line.fileno()
@@ -182,22 +182,23 @@ class Router:
         self.lost, self.received_bytes, self.speaks_mavlink = None, 0, False
 
     def detach(self) -> None:
-        """Let go of the line; call it before the line is closed."""
+        """Release the line; to be called before it is closed."""
         if self._line is not None:
             self._selector.unregister(self._line_fd)
             self._line = None
 
     def send(self, frame: bytes) -> bool:
-        """Send a frame of the simulator's: outside the budget, ahead of everybody else's.
+        """Send a frame of the simulator: outside the budget, ahead of the clients' frames.
 
-        Return whether it went; False when the line is full, gone (see `lost`), or no MAVLink.
+        Returns whether it was sent; False when the line is full, lost (see `lost`), or has not
+        shown to speak MAVLink.
         """
         return self._to_line(frame)
 
-    # --- passing on
+    # --- forwarding
 
     def pump(self) -> None:
-        """Pass on everything that has arrived."""
+        """Forward everything that has arrived."""
         for frame in self._from_line():
             if frame.known:
                 self.speaks_mavlink = True
@@ -243,11 +244,11 @@ class Router:
             return False
 
     def _lose(self, error: SerialLostError) -> None:
-        # A line that hung up stays readable: waiting for it would never wait again.
+        # A line that hung up stays readable: selecting on it would never wait again.
         self.detach()
         self.lost = str(error)
 
-    # --- who listens
+    # --- the listener in this process
 
     def take_heard(self) -> list[bytes]:
         """Return and forget the board's frames that have come since the last call."""
@@ -281,9 +282,9 @@ class Router:
 
 
 class RouterEnd:
-    """The router as an endpoint for somebody in this process. Implements `Endpoint`.
+    """The router as an endpoint for a listener in this process. Implements `Endpoint`.
 
-    It is the one that keeps the router going between ticks, and closes it.
+    It pumps the router between ticks, and closes it.
     """
 
     datagrams = True
@@ -294,7 +295,7 @@ class RouterEnd:
         self._closed = False
 
     def receive(self) -> list[bytes]:
-        """Pass on what has arrived and return the board's frames, oldest first."""
+        """Forward what has arrived and return the board's frames, oldest first."""
         if self._closed:
             return []
         self._router.pump()

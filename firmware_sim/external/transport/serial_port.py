@@ -1,4 +1,4 @@
-"""A serial port, or USB that looks like one: bytes in, bytes out, nothing blocks."""
+"""A serial port, or a USB device that acts as one. Nothing blocks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEFAULT_BAUD = 921_600
 BAUDS = range(1_200, 12_000_001)
 
 BUFFER_BYTES = 4096
-"""What may wait for the line: a fifth of a second of sensors; older ones are worth nothing."""
+"""Most bytes queued for the line: a fifth of a second of sensors; older ones are worthless."""
 
 BITS_PER_BYTE = 10
 """On a UART, with start and stop bit."""
@@ -28,7 +28,7 @@ _CHUNKS_PER_READ = 16
 """A flood must not hold up the simulation."""
 
 _LAST_CHANCES, _LAST_CHANCE_S = 10, 0.01
-"""How often and how long the last bytes are waited for [wall s]."""
+"""Number and length of the waits for the last bytes when closing [wall s]."""
 
 _NO_UART = ("ttyACM", "pts/", "cu.usbmodem", "tty.usbmodem")
 """Names of devices without a UART behind them: USB's own serial class, and pseudo-terminals."""
@@ -47,11 +47,11 @@ class SerialPort:
     """An open serial device."""
 
     def __init__(self, device: str, baud: int = DEFAULT_BAUD) -> None:
-        """Open it for us alone, 8N1, without flow control; what had arrived before is dropped.
+        """Open it exclusively, 8N1, without flow control; what had arrived before is dropped.
 
         Args:
             device: Path: /dev/ttyACM0, or better one of /dev/serial/by-id.
-            baud: Bits a second; USB and pseudo-terminals do not care.
+            baud: Bits a second; USB and pseudo-terminals ignore it.
 
         Raises:
             UsageError: It cannot be opened.
@@ -70,7 +70,7 @@ class SerialPort:
         self._poll.register(self._fd, select.POLLIN)
 
     def read(self) -> bytes:
-        """Return what has arrived, b"" when nothing has. Raises SerialLostError."""
+        """Return what has arrived, b"" when nothing has. Raises SerialLostError if it is gone."""
         received = bytearray()
         for _ in range(_CHUNKS_PER_READ):
             try:
@@ -83,7 +83,7 @@ class SerialPort:
                 if error.errno in _LATER:
                     break
                 if received:
-                    break  # what came before it went is worth having; the next read tells
+                    break  # return what came before; the next read raises
                 raise SerialLostError(self._lost(error)) from error
             if not chunk:
                 if received:
@@ -95,7 +95,7 @@ class SerialPort:
         return bytes(received)
 
     def write(self, data: bytes) -> bool:
-        """Send when the line takes it; False when too much waits already: `data` is dropped.
+        """Queue data to be sent; False when the queue is full: `data` is dropped.
 
         Raises SerialLostError.
         """
@@ -108,7 +108,7 @@ class SerialPort:
         return True
 
     def drain(self) -> None:
-        """Send as much as the line takes now of what waits. Raises SerialLostError."""
+        """Send as much of the queue as the line accepts. Raises SerialLostError if it is gone."""
         while self._waiting:
             # Not pyserial's write: without a timeout it spins until the line is free.
             try:
@@ -126,7 +126,7 @@ class SerialPort:
         return self._fd
 
     def close(self) -> None:
-        """Close it; what the line does not take in a moment is lost. Harmless when called again."""
+        """Close it; what the line does not accept soon is lost. Harmless when called again."""
         with suppress(SerialLostError, OSError, TypeError):  # pyserial's, when it is closed
             for _ in range(_LAST_CHANCES):
                 self.drain()
@@ -145,13 +145,13 @@ class SerialPort:
 
 
 def check_baud(baud: int) -> None:
-    """Raise UsageError when no device has such a rate."""
+    """Raise UsageError if the baud rate is out of range."""
     if baud not in BAUDS:
         raise UsageError(f"--baud {baud}: must be in {BAUDS[0]}..{BAUDS[-1]}")
 
 
 def carries_bytes_s(device: str, baud: int) -> int | None:
-    """Return what the line carries each way [bytes/s]; None where the baud rate means nothing."""
+    """Return the line's capacity each way [bytes/s]; None where the baud rate has no meaning."""
     # /dev/serial/by-id is full of links.
     path = str(Path(device).resolve())
     if any(name in path for name in _NO_UART):
@@ -163,7 +163,7 @@ def _open_problem(device: str, baud: int, error: Exception) -> str:
     number = error.errno if isinstance(error, OSError) else None
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
         present = ", ".join(sorted(port.device for port in list_ports.comports()))
-        return f"--serial {device}: no such device; there are: {present or 'none'}"
+        return f"--serial {device}: no such device; present: {present or 'none'}"
     if number in (errno.EACCES, errno.EPERM):
         return (
             f"--serial {device}: no permission: add yourself to the device's group (Linux: "
@@ -175,5 +175,5 @@ def _open_problem(device: str, baud: int, error: Exception) -> str:
             "another simulator): close that one first"
         )
     if isinstance(error, ValueError):
-        return f"--baud {baud}: {device} cannot do that ({error})"
+        return f"--baud {baud}: {device} does not support it ({error})"
     return f"--serial {device}: no serial device ({error})"

@@ -1,4 +1,4 @@
-"""A TCP port at which one program is waited for: bytes in and out, never an endless wait."""
+"""A TCP port that accepts one connection; no wait is endless."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import UsageError
 
 WATCH_S = 0.1
-"""Longest stretch of waiting without a look at the other program [wall s]."""
+"""Longest wait without checking that the other program is alive [wall s]."""
 
 CHUNK = 65_536
 """Bytes read at once."""
@@ -21,7 +21,7 @@ _READ, _WRITE = select.POLLIN, select.POLLOUT
 
 
 class TcpPort:
-    """Listens, takes one connection, turns every further one away."""
+    """Listens, accepts one connection, refuses every further one."""
 
     def __init__(self, host: str, port: int, option: str) -> None:
         """Listen.
@@ -35,7 +35,7 @@ class TcpPort:
             UsageError: The port is taken, or cannot be used.
         """
         self.refused = 0
-        """Connections turned away: there already was one."""
+        """Further connections that were refused."""
         self._clock = WallClock()
         self._connection: socket.socket | None = None
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -57,11 +57,11 @@ class TcpPort:
         return self._connection is not None
 
     def accept(self, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Wait for the connection; return whether it came.
+        """Wait for the connection; return whether it was made.
 
         Args:
             timeout_s: Longest wait [wall s].
-            alive: Called now and then; may raise.
+            alive: Called at intervals; may raise.
         """
         deadline_us = self._deadline_us(timeout_s)
         while self._connection is None:
@@ -74,7 +74,7 @@ class TcpPort:
         return True
 
     def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Send all of it; return False when the connection has ended or takes nothing in time."""
+        """Send all of it; False when the connection has ended or does not accept it in time."""
         connection = self._connected()
         sent = _send(connection, data)
         if sent == len(data):
@@ -93,7 +93,7 @@ class TcpPort:
         return sent is not None
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return what has come, b"" when nothing did in time [wall s], None at the end.
+        """Return what has arrived, b"" when nothing did in time [wall s], None at the end.
 
         May return b"" early.
         """
@@ -106,7 +106,7 @@ class TcpPort:
                     return b""
                 except OSError:
                     return None
-            self._turn_away()
+            self._refuse()
         return b""
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class TcpPort:
 
     def _connected(self) -> socket.socket:
         if self._connection is None:
-            raise RuntimeError("nobody has connected yet")
+            raise RuntimeError("there is no connection yet")
         return self._connection
 
     def _take(self) -> None:
@@ -130,7 +130,7 @@ class TcpPort:
         self._connection = connection
         self._poll.register(connection, _READ)
 
-    def _turn_away(self) -> None:
+    def _refuse(self) -> None:
         try:
             connection, _ = self._listener.accept()
         except OSError:

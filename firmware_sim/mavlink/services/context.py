@@ -16,7 +16,7 @@ ANY = 0
 
 @dataclass(slots=True)
 class Context:
-    """One link's surroundings; the server renews `now_us` for every message."""
+    """What a handler may use on one link; the server updates `now_us` for every message."""
 
     link: Link
     port: AutopilotPort
@@ -29,11 +29,11 @@ class Context:
 
 
 Handler = Callable[[WireMessage, Context], bool]
-"""Handles one message; False = not for this vehicle, or nothing to do."""
+"""Handles one message; returns False if it is not for this vehicle, or has no effect."""
 
 
 def for_vehicle(message: WireMessage) -> bool:
-    """Tell whether a message names this vehicle, and its autopilot or all components."""
+    """Return whether a message is addressed to this vehicle, its autopilot or all components."""
     system: int = message.target_system
     component: int = message.target_component
     return system == SYSTEM_ID and component in (COMPONENT_ID, ANY)

@@ -1,7 +1,7 @@
-"""REQUEST_DATA_STREAM: the old way to ask for streams by group.
+"""REQUEST_DATA_STREAM: the deprecated request of streams by group.
 
-A real PX4 ignores it. Here a request may only speed streams up: MAVProxy asks for everything at
-4 Hz on connecting, and another client on the same link must not lose its 100 Hz attitude to that.
+A real PX4 ignores it. Here a request may only raise rates: MAVProxy asks for all streams at 4 Hz
+when it connects, and another client on the same link must keep its 100 Hz attitude.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GROUPS: dict[int, tuple[str, ...]] = {
 
 
 def handle_request(message: WireMessage, context: Context) -> bool:
-    """Speed a group of streams up to the asked rate, or give it back its default rates."""
+    """Raise the rates of a group of streams, or restore its default rates."""
     if not for_vehicle_or_all(message):
         return False
     if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL:

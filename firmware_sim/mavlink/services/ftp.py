@@ -1,4 +1,4 @@
-"""FILE_TRANSFER_PROTOCOL: there are no files; every request is refused, so that clients go on.
+"""FILE_TRANSFER_PROTOCOL: there are no files; every request is refused, so that clients proceed.
 
 Payload layout: https://mavlink.io/en/services/ftp.html
 """

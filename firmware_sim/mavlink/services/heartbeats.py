@@ -1,4 +1,4 @@
-"""HEARTBEAT of others: only a ground station's counts (PX4's data link loss)."""
+"""HEARTBEAT of other systems: only a ground station's matters (PX4's data link loss)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from firmware_sim.mavlink.services.context import Context, Handler
 
 
 def handle_heartbeat(message: WireMessage, context: Context) -> bool:
-    """Tell the autopilot that a ground station is there."""
+    """Notify the autopilot of a ground station's heartbeat."""
     if message.type == dialect.MAV_TYPE_GCS:
         context.port.gcs_heartbeat(context.now_us)
     return True

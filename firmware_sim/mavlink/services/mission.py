@@ -1,6 +1,6 @@
-"""The mission protocol of a vehicle without missions: the list is empty and stays so.
+"""The mission protocol of a vehicle without missions: the list is always empty.
 
-Enough for a ground station to finish connecting; the same for fence and rally points.
+That lets a ground station finish connecting. The same holds for fence and rally points.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ HASH_NAME = "_HASH_CHECK"
 """Pseudo parameter: a checksum by which a ground station recognises its cached values."""
 
 PARAMETERS_PER_TICK = 3
-"""Pace of a full list: no tick has to send hundreds of messages."""
+"""Parameters of a full list that are sent per tick: it has hundreds."""
 
 _NO_INDEX = 65_535
 _ALL_ONES = 0xFFFF_FFFF
@@ -36,7 +36,7 @@ class ParameterService:
         }
 
     def restart(self) -> None:
-        """Forget a running list: the vehicle has been exchanged."""
+        """Cancel a running list: the vehicle was replaced."""
         self._next = None
 
     def send_pending(self, link: Link, store: ParameterStore) -> None:
@@ -57,7 +57,7 @@ class ParameterService:
     def _handle_list(self, message: WireMessage, _context: Context) -> bool:
         if not for_vehicle(message):
             return False
-        # PX4: a client that asks again does not care for the hash.
+        # As PX4: a client that asks again does not need the hash.
         self._next = -1 if self._next is None else 0
         return True
 

@@ -1,4 +1,4 @@
-"""PING: asks all peers from time to time and answers theirs."""
+"""PING: periodic requests to all peers, and answers to theirs."""
 
 from __future__ import annotations
 

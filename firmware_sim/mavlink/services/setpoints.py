@@ -1,8 +1,8 @@
 """SET_POSITION_TARGET_LOCAL_NED: offboard setpoints, read as PX4 reads them.
 
 Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, checked against a
-running PX4 1.16. Not taken over: acceleration setpoints, which the vehicle's controller lacks;
-a message that commands nothing but an acceleration is invalid here.
+running PX4 1.16. Acceleration setpoints are not supported, as the controller lacks them: a message
+that commands only an acceleration is invalid here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _POSITION_SHIFT, _VELOCITY_SHIFT = 0, 3
 
 
 def handle_setpoint(message: WireMessage, context: Context) -> bool:
-    """Hand a valid setpoint to the autopilot; say aloud what is wrong with another."""
+    """Pass a valid setpoint to the autopilot; report what is wrong with an invalid one."""
     if not for_vehicle_or_all(message):
         return False
     mask: int = message.type_mask
