@@ -19,7 +19,7 @@ from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import MAX_LAG_US, Pacing, Unpaced, WallPacing
 from firmware_sim.simulation import EpisodeSetup
-from tests.support.flight_rig import CALM, quad, velocity_setpoint
+from tests.support.flight_rig import quad, velocity_setpoint
 
 TICKS_A_MINUTE = 60 * 250
 
@@ -48,7 +48,7 @@ def blocks_kept_by_two_minutes(*, recording: bool) -> int:
     """Return how many memory blocks two minutes of an offboard flight leave behind."""
     flown = firmware(Unpaced(), recording=recording)
     circle = velocity_setpoint(1.0, 0.0, -0.01, yaw=float("nan"), yaw_rate=0.3)
-    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    flown.load(EpisodeSetup(quad(), None, 1), None, 0)
     autopilot = flown.simulation.autopilot
     fly(flown, 4 * 250)
     assert autopilot.arm(force=False) == 0
@@ -76,7 +76,7 @@ def test_the_same_flight_recorded_keeps_its_samples():
 
 def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten():
     flown = firmware(Unpaced(), recording=False)
-    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    flown.load(EpisodeSetup(quad(), None, 1), None, 0)
     autopilot = flown.simulation.autopilot
     fly(flown, 4 * 250)
     autopilot.arm(force=False)
@@ -95,7 +95,7 @@ def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten():
 def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path):
     """Against the pacing's own account, at a hundred times real time: 10 ms are a second."""
     flown = firmware(WallPacing(100.0), recording=True)
-    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    flown.load(EpisodeSetup(quad(), None, 1), None, 0)
     first_us = flown.simulation.time_us
     for pause_s in (0.0, 0.03, 0.0):
         time.sleep(pause_s)
@@ -117,7 +117,7 @@ def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path):
 @pytest.mark.parametrize("recording", [True, False])
 def test_an_unpaced_flight_has_no_late_ticks(tmp_path: Path, recording: bool):
     flown = firmware(Unpaced(), recording=recording)
-    flown.load(EpisodeSetup(quad(), None, 1, CALM), None, 0)
+    flown.load(EpisodeSetup(quad(), None, 1), None, 0)
     fly(flown, 20)
     assert (flown.simulation.recorder is not None) is recording
     if recording:
