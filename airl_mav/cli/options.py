@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import re
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -111,7 +112,8 @@ def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> s
 
 def option_of(field: str) -> str:
     """Return the option of a field: --hold-s of hold_s, --leave-after-s of watchdog's."""
-    table, _, name = field.rpartition(".")
+    # An element of a list is named by its option: goal.0 is the first word of --goal.
+    table, _, name = re.sub(r"(\.\d+)+$", "", field).rpartition(".")
     full = f"{table}.{name}" if table in PREFIXED else name
     return "--" + full.replace("_", "-")
 
