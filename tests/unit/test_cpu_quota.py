@@ -12,7 +12,6 @@ import pytest
 from airl_mav.core.cpu_quota import CpuGroup, check_permitted, held_to, remove_left
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.rehearsal.channel import Begin
-from airl_mav.rehearsal.evaluation import run_settings
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
@@ -180,6 +179,6 @@ def test_rehearsal_hands_it_on_and_writes_it_down(permitted: None) -> None:
     resolved = resolve(Scenario(cpu_quota=20.0))
     assert resolved.injection.origin == "measured"
     assert "held to 20 % of a core" in resolved.injection.label
-    assert run_settings(resolved)["cpu_quota"] == 20.0
+    assert resolved.config["cpu_quota"] == 20.0
     told = Begin.model_validate_json(Begin(scenario=resolved).to_line())
     assert told.scenario.scenario.cpu_quota == 20.0
