@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from airl_mav.cli.parameters_command import ParametersCommand
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.cli.parameters import KINDS
+from airl_mav.cli.parameters import KINDS, ParametersOptions
 from airl_mav.cli.parameters import run as write_parameters
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
@@ -378,7 +377,7 @@ def test_modes_of_both_families(kind: int, custom: int, landed: int, mode: Mode)
 
 
 def parameters_of(firmware: str, out: Path) -> list[str]:
-    assert write_parameters(ParametersCommand(firmware, out=out)) == 0
+    assert write_parameters(ParametersOptions(firmware=firmware, out=out)) == 0
     return out.read_text(encoding="utf-8").splitlines()
 
 
@@ -409,7 +408,7 @@ def test_another_order_of_motors_is_in_the_file(tmp_path: Path) -> None:
     profile = tmp_path / "other.toml"
     order = '["rear left", "front right", "front left", "rear right"]'
     profile.write_text(f'base = "quad"\n[px4]\nmotors = {order}\n', encoding="utf-8")
-    command = ParametersCommand("px4", vehicle=str(profile), out=tmp_path / "file")
+    command = ParametersOptions(firmware="px4", vehicle=str(profile), out=tmp_path / "file")
     assert write_parameters(command) == 0
     text = (tmp_path / "file").read_text(encoding="utf-8")
     assert "PWM_MAIN_FUNC1\t102\t6\n1\t1\tPWM_MAIN_FUNC2\t101\t6\n" in text
@@ -417,7 +416,7 @@ def test_another_order_of_motors_is_in_the_file(tmp_path: Path) -> None:
 
 def test_parameters_into_no_folder(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no folder"):
-        write_parameters(ParametersCommand("px4", out=tmp_path / "x" / "y"))
+        write_parameters(ParametersOptions(firmware="px4", out=tmp_path / "x" / "y"))
 
 
 # --- programs and options

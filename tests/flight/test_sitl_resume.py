@@ -20,8 +20,8 @@ from rich.console import Console
 
 from airl_mav.cli import sitl
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import fly as fly_module
-from airl_mav.experiments.fly import FlownRun
+from airl_mav.experiments import live
+from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
@@ -85,7 +85,7 @@ class Rehearsal:
 @pytest.fixture(autouse=True)
 def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     stage = Stage()
-    monkeypatch.setattr(fly_module, "Rehearsal", stage.rehearsal)
+    monkeypatch.setattr(live, "Rehearsal", stage.rehearsal)
     return stage
 
 

@@ -240,7 +240,7 @@ def test_report_of_a_damaged_run(refuse: Run, tmp_path: Path, damage: str) -> No
         latency.write_bytes(b"")
     else:
         info.write_text('{"schema": 1, "config": ' + "[" * 100_000, encoding="utf-8")
-    line = refuse(main.main, "report", str(folder.path))
+    line = refuse(entry.airl, "report", str(folder.path))
     assert str(info if damage == "nested" else latency) in line
 
 
