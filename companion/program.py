@@ -61,6 +61,7 @@ def fly_alone(
     mission: Mission,
     stop: threading.Event,
     abandon: threading.Event,
+    waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
     """Fly one mission against whatever answers.
@@ -70,6 +71,7 @@ def fly_alone(
         mission: What is flown.
         stop: Set to land and end.
         abandon: Set to end without landing.
+        waiting: Called once the flight controller is waited for.
         progress: Called with each phase as it begins, and its time [µs].
 
     Raises:
@@ -82,6 +84,7 @@ def fly_alone(
         closing(open_camera(asked.camera, clock)) as frames,
         closing(MavsdkLink(asked.connect, clock, abandon)) as link,
     ):
+        waiting()
         link.connect(asked.connect_timeout, stop)
         check_camera(mission.policy, frames, stop)
         return fly_mission(

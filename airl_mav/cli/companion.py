@@ -50,8 +50,6 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
-    what = "simulator" if options.lockstep else "flight controller"
-    console.print(f"waiting for a {what} on {options.connect}", markup=False)
     try:
         result = _fly(options, mission, stop, abandon, console)
     except (LinkError, Abandoned) as error:
@@ -77,8 +75,12 @@ def _fly(
     def progress(phase: str, time_us: int) -> None:
         console.print(f"{time_us / 1e6:8.2f} s  {phase}")
 
+    def waiting() -> None:
+        what = "simulator" if options.lockstep else "flight controller"
+        console.print(f"waiting for a {what} on {options.connect}", markup=False)
+
     if not options.lockstep:
-        return fly_alone(options, mission, stop, abandon, progress)
+        return fly_alone(options, mission, stop, abandon, waiting, progress)
     # Imported here: a companion on a drone needs nothing of it.
     from airl_mav.lockstep.token_companion import fly
 
@@ -89,6 +91,7 @@ def _fly(
         options.connect_timeout,
         stop,
         abandon,
+        waiting,
         progress,
     )
     for name, digest in sha256.items():

@@ -14,7 +14,8 @@ from airl_mav.core.fields import quantity
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
 from airl_mav.experiments.experiment import known_seeds
-from airl_mav.experiments.fly import EXIT_CODES, fly_scenario
+from airl_mav.experiments.fly import fly_scenario
+from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.record import run_sha256
 from airl_mav.report.run_report import show_report
 from airl_mav.scenario.model import Aircraft, Decisions, Flights, Lateness, LevelName

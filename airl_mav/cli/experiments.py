@@ -8,7 +8,7 @@ from rich.console import Console
 
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.experiment import Experiment, ExperimentRun, run_experiment
-from airl_mav.experiments.fly import EXIT_CODES
+from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.report.comparison.show import print_comparison
 
 

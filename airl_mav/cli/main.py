@@ -63,7 +63,7 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
 
 def _print_help(console: Console) -> None:
     console.print("usage: airl COMMAND [OPTIONS]\n\nCommands:", highlight=False)
-    table = Table.grid(padding=(0, 2, 0, 2))
+    table = Table.grid(padding=(0, 2), pad_edge=True)
     for name, purpose in SUBCOMMANDS.items():
         table.add_row(name, purpose)
     console.print(table)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import re
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -73,11 +74,10 @@ def read_options(
         SystemExit: tyro has printed the help, or what is wrong with the words.
     """
     words = _with_new_names(words, renamed)
-    file: Path | None = None
     held: dict[str, Any] = {}
-    takes_file = "policy" in model.model_fields and not _positionals(model)
-    if takes_file and words and words[0].endswith(".toml"):
-        file, words = Path(words[0]), words[1:]
+    file = _scenario_file(model, words)
+    if file is not None:
+        words = words[1:]
         held = read_scenario_file(file)
         validated(model, held, file)
     parsed = tyro.cli(
@@ -111,7 +111,8 @@ def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> s
 
 def option_of(field: str) -> str:
     """Return the option of a field: --hold-s of hold_s, --leave-after-s of watchdog's."""
-    table, _, name = field.rpartition(".")
+    # An element of a list is named by its option: goal.0 is the first word of --goal.
+    table, _, name = re.sub(r"(\.\d+)+$", "", field).rpartition(".")
     full = f"{table}.{name}" if table in PREFIXED else name
     return "--" + full.replace("_", "-")
 
@@ -130,6 +131,13 @@ def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]
         )
         out += [*new[:-1], f"{new[-1]}{equals}{value}"]
     return out
+
+
+def _scenario_file(model: type[BaseModel], words: Sequence[str]) -> Path | None:
+    """Return the scenario file that a command line begins with; None: it has none."""
+    if "policy" not in model.model_fields or _positionals(model):
+        return None
+    return Path(words[0]) if words and words[0].endswith(".toml") else None
 
 
 def _positionals(model: type[BaseModel]) -> list[str]:
@@ -229,7 +237,7 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     try:
         return int(command.run(options, **more))
     except FieldError as error:
-        raise UsageError(told(error, words)) from None
+        raise UsageError(told(error, words, _scenario_file(type(options), words))) from None
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:

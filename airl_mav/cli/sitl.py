@@ -11,7 +11,7 @@ from rich.console import Console
 from airl_mav.cli.options import RENAMED, run_command, scenario_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.fly import EXIT_CODES, FlownRun, fly_live
+from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario

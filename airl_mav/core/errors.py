@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import reprlib
+from pathlib import PurePath
 
 EXIT_BROKEN = 1
 """The run could not be finished: a flight lost its processes, or its worker, too often."""
@@ -57,12 +58,15 @@ class FieldError(UsageError):
         """Return the message in one line: "NAME VALUE: accepted: RANGE".
 
         Args:
-            name: What to call the field; None: its dotted path.
+            name: What to call the field, an option, whose value is then shown as it was typed;
+                None: its dotted path.
             sign: What stands between name and value; " = " in messages about files.
         """
         where = self.field if name is None else name
         if self.value is not MISSING:
-            where = f"{where}{sign}{shown(self.value)}" if where else shown(self.value)
+            typed = isinstance(self.value, str) and name is not None
+            value = shortened(str(self.value)) if typed else shown(self.value)
+            where = f"{where}{sign}{value}" if where else value
         what = self.problem or f"accepted: {self.accepted}"
         return f"{where}: {what}" if where else what
 
@@ -88,11 +92,18 @@ def shown(value: object) -> str:
     """Return a value as a message shows it: numbers as a person writes them, never too long."""
     if isinstance(value, float) and float(f"{value:g}") == value:
         return min(f"{value:g}", repr(value), key=len)
+    if isinstance(value, PurePath):
+        return shortened(str(value))
     try:
         # reprlib stops early in containers; a plain repr of a long list or number takes ages.
         text = _REPR.repr(value)
     except ValueError:  # A whole number with more digits than Python turns into text.
         return "a number of too many digits"
+    return shortened(text)
+
+
+def shortened(text: str) -> str:
+    """Return a text as a message shows it: never too long."""
     return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
 
 

@@ -7,7 +7,8 @@ says of wrong input into one line.
 from __future__ import annotations
 
 import difflib
-from typing import Any, TypeVar, get_args
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -135,9 +136,12 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
     findings = error.errors(include_url=False)
     # A misspelt field also goes missing: its misspelling says more.
     first = min(findings, key=lambda finding: finding["type"] != "extra_forbidden")
-    tail = f" (and {len(findings) - 1} more)" if len(findings) > 1 else ""
     path, kind = first["loc"], first["type"]
-    field = ".".join(str(part) for part in path)
+    field = _dotted(model, path)
+    # What each branch of a union has to say about one value is one finding.
+    same = [finding for finding in findings if _dotted(model, finding["loc"]) == field]
+    others = len(findings) - len(same)
+    tail = f" (and {others} more)" if others else ""
     if kind == "missing":
         return FieldError(field, problem=f"missing{tail}")
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
@@ -148,7 +152,22 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
         return FieldError(field, problem=f"unknown field{hint}{tail}")
     if kind == "value_error":
         return FieldError(field, problem=first["msg"].removeprefix("Value error, ") + tail)
-    return FieldError(field, first["input"], _accepted(first, model) + tail)
+    accepted = " or ".join(dict.fromkeys(_accepted(finding, model) for finding in same))
+    return FieldError(field, first["input"], accepted + tail)
+
+
+def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
+    """Return the dotted path of a location, without the branches of unions of plain values."""
+    here, parts, plain = model, [], False
+    for part in path:
+        if plain and not isinstance(part, int):
+            continue
+        parts.append(str(part))
+        field = here.model_fields.get(str(part)) if here else None
+        if field is not None:
+            here = _model_in(field.annotation)
+            plain = here is None and get_origin(field.annotation) in (Union, UnionType)
+    return ".".join(parts)
 
 
 def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:

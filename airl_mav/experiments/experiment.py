@@ -15,14 +15,8 @@ from typing import Any
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_flights
-from airl_mav.experiments.fly import (
-    Ended,
-    executor_of,
-    fly_live,
-    raise_unless_complete,
-    shown,
-    tell_end,
-)
+from airl_mav.experiments.fly import executor_of, raise_unless_complete, shown
+from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.run import Run
 from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.rehearsal.run_folder import LoadedRun

@@ -30,6 +30,7 @@ def fly(
     timeout_s: float,
     stop: threading.Event,
     abandon: threading.Event,
+    waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> tuple[MissionResult, dict[str, str]]:
     """Fly one mission; the same simulator and mission give the same flight, bit by bit.
@@ -41,6 +42,7 @@ def fly(
         timeout_s: How long to wait for it, and for each turn [wall s].
         stop: Set to end the flight early; the simulator sets it, too.
         abandon: Set to end it without landing; the simulator sets it, too.
+        waiting: Called once the simulator is waited for.
         progress: Called with the name of each phase as it begins, and the simulated time [µs].
 
     Returns:
@@ -65,6 +67,7 @@ def fly(
         closing(MavsdkLink(connect, clock, abandon, heard=lambda: True)) as link,
     ):
         link.set_timeout(ANSWER_TIMEOUT_S)
+        waiting()
         link.connect(timeout_s, stop)
         camera = TokenFrameSource(frames, turns, clock)
         with turns.taken(link):

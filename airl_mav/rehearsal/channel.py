@@ -16,6 +16,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import field_error
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
@@ -242,9 +243,7 @@ class ChildChannel:
         try:
             return Begin.model_validate_json(line)
         except ValidationError as error:
-            raise UsageError(
-                f"not a scenario: {error.error_count()} errors: {line[:200]!r}"
-            ) from None
+            raise UsageError(f"not a scenario: {field_error(error)}: {line[:200]!r}") from None
 
     def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
         """Call `handle` for every request, on a thread; `gone` when the harness is gone.

@@ -34,6 +34,7 @@ from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.scenario.file import SCENARIO_FILE
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""
@@ -181,7 +182,7 @@ class RunFolder:
 
     def discard(self) -> None:
         """Take back a run that never began, so that the same folder can be used again."""
-        for name in (RUN_FILE, *LOG_FILES):
+        for name in (RUN_FILE, SCENARIO_FILE, *LOG_FILES):
             (self.path / name).unlink(missing_ok=True)
         with suppress(OSError):  # Somebody else's files.
             self.path.rmdir()

@@ -25,9 +25,7 @@ def check_level(scenario: Scenario) -> None:
             raise FieldError("ablate", scenario.ablate, "at level gym or lockstep")
         low, high = SITL_SPEEDS
         if scenario.speed is not None and not low <= scenario.speed <= high:
-            raise FieldError(
-                "speed", f"{scenario.speed:g}", f"{low:g} <= value <= {high:g} at level sitl"
-            )
+            raise FieldError("speed", scenario.speed, f"{low:g} <= value <= {high:g} at level sitl")
     elif level == "gym":
         usual = Scenario()
         for field in ("wind", "estimator", "max_speed_m_s", "speed"):

@@ -67,7 +67,7 @@ def decide_piloting(
     if timeout_s <= pilot.hold_s:
         raise FieldError(
             "watchdog.decision_timeout_s",
-            f"{timeout_s:g}",
+            timeout_s,
             f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
         )
     return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
@@ -81,7 +81,7 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
         why = "an injected latency" if level == "sitl" else f"level {level}"
         raise FieldError(
             "cpu_quota",
-            f"{asked.cpu_quota:g}",
+            asked.cpu_quota,
             f"without {why}: only where the companion's own time counts",
         )
     check_permitted(asked.cpu_quota)

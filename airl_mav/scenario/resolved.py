@@ -78,9 +78,10 @@ class ResolvedScenario:
     def config(self) -> dict[str, Any]:
         """All that is written down of a run, as plain values.
 
-        The scenario as asked for, what it comes to, and the content of profiles and policy: a name
-        does not tell a changed one.
+        The scenario with what was left open decided, so that a default and the same value asked
+        for are one run; and the content of profiles and policy: a name does not tell a changed one.
         """
+        pilot = asdict(self.pilot)
         profiles: dict[str, BaseModel] = {
             "vehicle": self.vehicle,
             "arena": self.arena,
@@ -89,8 +90,9 @@ class ResolvedScenario:
         if self.injection.latency is not None:
             profiles["latency"] = self.injection.latency
         return {
-            **self.scenario.model_dump(mode="json"),
-            "pilot": asdict(self.pilot),
+            **self.scenario.model_dump(mode="json", exclude=set(pilot)),
+            "speed": self.speed,
+            "pilot": pilot,
             "watchdog": self.watchdog.model_dump(mode="json"),
             "policy_sha256": self.policy.sha256,
             "profiles_sha256": {

@@ -191,7 +191,7 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
         raise FieldError(
             "firmware",
             asked.firmware,
-            "without bind, companion-host and gcs-host; its links are its own, on this machine",
+            "without bind, companion_host and gcs_host; its links are its own, on this machine",
         )
     _check_folder("tlog", asked.tlog)
 

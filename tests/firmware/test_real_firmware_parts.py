@@ -8,31 +8,21 @@ import signal
 import struct
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import tyro
-from airl_mav.cli.firmware_options import (
-    FirmwareName,
-    RealFirmwareOptions,
-    arguments,
-    check_firmware,
-    how_to_start,
-    load_timeout_s,
-)
-from airl_mav.cli.parameters_command import ParametersCommand
-from airl_mav.cli.sitl_command import SitlCommand
 from pymavlink import mavparm
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.cli.firmware import FirmwareCommand
-from airl_mav.cli.parameters import KINDS
+from airl_mav.cli.parameters import KINDS, ParametersOptions
 from airl_mav.cli.parameters import run as write_parameters
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import validated
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.scenario.model import Ports
+from airl_mav.scenario.checks import check_firmware
+from airl_mav.scenario.model import Aircraft, LevelName, RealFirmware
+from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.external.airframe_check import (
     ArduPilotAirframe,
@@ -48,6 +38,7 @@ from firmware_sim.external.observer import Observer
 from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
 from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.programs import how_to_start, load_timeout_s
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -386,7 +377,7 @@ def test_modes_of_both_families(kind: int, custom: int, landed: int, mode: Mode)
 
 
 def parameters_of(firmware: str, out: Path) -> list[str]:
-    assert write_parameters(ParametersCommand(firmware, out=out)) == 0
+    assert write_parameters(ParametersOptions(firmware=firmware, out=out)) == 0
     return out.read_text(encoding="utf-8").splitlines()
 
 
@@ -417,7 +408,7 @@ def test_another_order_of_motors_is_in_the_file(tmp_path: Path) -> None:
     profile = tmp_path / "other.toml"
     order = '["rear left", "front right", "front left", "rear right"]'
     profile.write_text(f'base = "quad"\n[px4]\nmotors = {order}\n', encoding="utf-8")
-    command = ParametersCommand("px4", vehicle=str(profile), out=tmp_path / "file")
+    command = ParametersOptions(firmware="px4", vehicle=str(profile), out=tmp_path / "file")
     assert write_parameters(command) == 0
     text = (tmp_path / "file").read_text(encoding="utf-8")
     assert "PWM_MAIN_FUNC1\t102\t6\n1\t1\tPWM_MAIN_FUNC2\t101\t6\n" in text
@@ -425,7 +416,7 @@ def test_another_order_of_motors_is_in_the_file(tmp_path: Path) -> None:
 
 def test_parameters_into_no_folder(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no folder"):
-        write_parameters(ParametersCommand("px4", out=tmp_path / "x" / "y"))
+        write_parameters(ParametersOptions(firmware="px4", out=tmp_path / "x" / "y"))
 
 
 # --- programs and options
@@ -478,48 +469,42 @@ def test_ardupilot_is_started_with_its_parameters_in_a_file(tmp_path: Path) -> N
     assert [word.rpartition(":")[2] for word in words[-5::2]] == ["1", "2", "3"]
 
 
-def test_options_reach_the_other_command_unchanged(tmp_path: Path) -> None:
-    given = RealFirmwareOptions(
-        px4_dir=tmp_path, instance=3, firmware_timeout=12.5, firmware_dir=tmp_path / "x"
-    )
-    words = arguments("px4", given)
-    parsed = tyro.cli(SitlCommand, args=words)
-    assert parsed.firmware == "px4"
-    assert parsed.real == given
-    assert arguments("builtin", RealFirmwareOptions())[:2] == ["--firmware", "builtin"]
-
-
-GOOD = RealFirmwareOptions(px4_connect=True)
-
-
 @pytest.mark.parametrize(
-    ("firmware", "options", "ports", "lockstep", "words"),
+    ("asked", "level", "words"),
     [
-        ("px4", RealFirmwareOptions(), Ports(), False, "with --px4-dir or --px4-connect"),
-        ("px4", replace(GOOD, px4_dir=Path("x")), Ports(), False, "with --px4-dir or --px4-conn"),
-        ("builtin", GOOD, Ports(), False, "--px4-connect: accepted: with --firmware px4"),
-        ("px4-hitl", RealFirmwareOptions(), Ports(), False, "accepted: with --serial"),
-        ("px4", replace(GOOD, instance=10), Ports(), False, "--instance 10"),
-        ("px4", replace(GOOD, firmware_timeout=math.inf), Ports(), False, "--firmware-timeout inf"),
-        ("px4", GOOD, Ports(api_port=15000), False, "--api-port 15000: PX4 SITL has ports"),
-        ("px4", GOOD, Ports(), True, "with --lockstep: accepted: without"),
-        ("px4-hitl", RealFirmwareOptions(serial="x"), Ports(), False, "--speed 2.0 with --firmw"),
+        ({"firmware": "px4"}, "sitl", "firmware px4: accepted: with px4_dir or px4_connect"),
+        ({"firmware": "px4", "px4_connect": True, "px4_dir": "x"}, "sitl", "with px4_dir or px4_c"),
+        ({"px4_connect": True}, "sitl", "real.px4_connect True: accepted: with firmware px4"),
+        ({"firmware": "px4-hitl"}, "sitl", "firmware px4-hitl: accepted: with serial"),
+        ({"px4_connect": True, "instance": 10}, "sitl", "real.instance 10: accepted: 0 <= value"),
+        (
+            {"px4_connect": True, "firmware_timeout": math.inf},
+            "sitl",
+            "real.firmware_timeout inf: accepted: 1 <= value <= 3600 s",
+        ),
+        (
+            {"firmware": "px4", "px4_connect": True, "api_port": 15000},
+            "sitl",
+            "ports.api_port 15000: accepted: its default: PX4 SITL's ports move with instance",
+        ),
+        ({"firmware": "px4", "px4_connect": True}, "lockstep", "at level sitl, not lockstep"),
+        ({"firmware": "px4-hitl", "serial": "x"}, "sitl", "speed 2: accepted: 1 with firmware px4"),
     ],
+    ids=str,
 )
-def test_what_cannot_be_flown_is_told(
-    firmware: FirmwareName, options: RealFirmwareOptions, ports: Ports, lockstep: bool, words: str
-) -> None:
-    command = FirmwareCommand(
-        firmware=firmware, real=options, ports=ports, lockstep=lockstep, speed=2.0
-    )
-    with pytest.raises(UsageError) as raised:
-        check_firmware(command)
+def test_what_cannot_be_flown_is_told(asked: dict[str, Any], level: LevelName, words: str) -> None:
+    plain: dict[str, Any] = {"real": {}, "ports": {}}
+    for name, value in asked.items():
+        table = "ports" if name.endswith("port") else "real" if name != "firmware" else None
+        (plain if table is None else plain[table])[name] = value
+    with pytest.raises(FieldError) as raised:
+        check_firmware(validated(Aircraft, plain), level, 2.0)
     assert words in str(raised.value)
 
 
 def test_the_user_is_told_what_to_start() -> None:
     def told(**options: Any) -> str | None:
-        return how_to_start(FirmwareCommand(real=RealFirmwareOptions(**options)), quad())
+        return how_to_start(Aircraft(real=RealFirmware(**options)), quad())
 
     assert told(px4_connect=True, instance=2) == (
         "PX4_SIM_MODEL=none_iris PX4_SYS_AUTOSTART=10016 build/px4_sitl_default/bin/px4 -i 2"
@@ -531,5 +516,6 @@ def test_the_user_is_told_what_to_start() -> None:
     assert "--model JSON:127.0.0.1 --sim-port-out 9002" in hint
     assert "--serial2 udpclient:127.0.0.1:14030" in hint
     assert told(px4_dir=Path("x")) is None
-    assert load_timeout_s("builtin", GOOD) is None
-    assert load_timeout_s("px4", replace(GOOD, firmware_timeout=10.0)) == 80.0
+    assert load_timeout_s(Aircraft()) is None
+    patient = RealFirmware(px4_connect=True, firmware_timeout=10.0)
+    assert load_timeout_s(Aircraft(firmware="px4", real=patient)) == 80.0

@@ -15,15 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from airl_mav.rehearsal.crew import COMPANION, FIRMWARE
 
 from airl_mav.core.child_process import Exited
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import Part, Setup
-from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.rehearsal import crew, rehearsal
+from airl_mav.rehearsal import process_pair, rehearsal
 from airl_mav.rehearsal.channel import (
     Abort,
     Ended,
@@ -39,11 +36,15 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
-from airl_mav.rehearsal.episode import Plan, ProcessPlan
+from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import ResolvedScenario
 
 GOAL = (10.0, 0.0)
+WATTS = 2.0
 START_US = 1_000_000
 
 Item = tuple[str, Event | Exited]
@@ -206,25 +207,30 @@ class Silent:
         self.losses.append(what)
 
 
+def asked(**changes: Any) -> ResolvedScenario:
+    """Return a scenario with a round goal radius, time limit and power of the computer."""
+    fields = {"policy": "greedy", "seed": 5, "episodes": 1, "time_limit_s": 60.0} | changes
+    resolved = resolve(Scenario(**fields))
+    watts = resolved.computer.model_copy(update={"watts": WATTS})
+    return replace(resolved, computer=watts)
+
+
 class Run:
     """One rehearsal on a stage."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, stage: Stage) -> None:
         FakeChild.stage = stage
-        monkeypatch.setattr(crew, "Child", FakeChild)
-        monkeypatch.setattr(crew, "REPLY_TIMEOUT_S", 0.3)
-        part = Part("x")
-        setup = Setup("sitl", part, part, part, part, 2.0, NOTHING_INJECTED, 1.0, "persist")
-        self.folder = RunFolder.create(folder / "run", "test", {}, setup=setup)
+        monkeypatch.setattr(process_pair, "Child", FakeChild)
+        monkeypatch.setattr(process_pair, "REPLY_TIMEOUT_S", 0.3)
+        self.scenario = asked(episodes=max(1, len(stage.scripts)))
+        self.folder = RunFolder.create(folder / "run", "test", {}, setup=self.scenario.setup)
         self.stage = stage
         self.observer = Silent()
-        process = ProcessPlan("nothing", [])
-        self.plan = Plan(process, process, "corridor", 5, len(stage.scripts), 3.0, 60.0, 1.0, 2.0)
 
     def fly(self, episodes: int | None = None, done: Collection[int] = ()) -> list[EpisodeRecord]:
         if episodes is not None:
-            self.plan = replace(self.plan, episodes=episodes)
-        with Rehearsal(self.plan, self.folder, self.observer, keeps=(7,)) as flown:
+            self.scenario = asked(episodes=episodes)
+        with Rehearsal(self.scenario, self.folder, self.observer, keeps=(7,)) as flown:
             flown.run(done)
         assert all(child.stopped for child in self.stage.all)
         return self.observer.records
@@ -257,7 +263,7 @@ def test_two_good_episodes(play: Callable[..., Run]) -> None:
         assert record.quality.computer_energy_j == pytest.approx(14.0)
     stage = run.stage
     assert stage.requests(COMPANION, Abort) == []
-    assert [r.latency_seed for r in stage.requests(COMPANION, Fly)] == [5, 6]
+    assert [r.seed for r in stage.requests(COMPANION, Fly)] == [5, 6]
     assert [e.index for e in load(run.folder.path).episodes] == [0, 1]
     assert not list(run.folder.path.glob(".*"))
 
@@ -541,8 +547,8 @@ def test_companion_that_never_answers_is_ended(
     for name in ("TAKEOFF_LIMIT_S", "WRAP_UP_S"):
         monkeypatch.setattr(rehearsal, name, 0.1)
     run = play([at(0.05), phase("navigating", 0.06), at(0.08)], FLOWN)
-    run.plan = replace(run.plan, time_limit_s=1.0)
-    (record,) = run.fly(1)
+    run.scenario = asked(time_limit_s=1.0)
+    (record,) = run.fly()
     (note,) = record.notes
     assert re.fullmatch(
         "flown again: gave up waiting for the flight after 1 s; "
@@ -584,7 +590,7 @@ def test_death_at_the_start(play: Callable[..., Run]) -> None:
         run.fly()
 
 
-def test_interrupt_while_a_new_crew_starts(
+def test_interrupt_while_a_new_pair_starts(
     play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = play([at(1.0), (FIRMWARE, Exited(-9))])

@@ -77,7 +77,7 @@ def test_folder_is_complete_and_nothing_else(done: Done) -> None:
     names = {path.name for path in done.folder.iterdir()}
     flights = [f"flight-{i:03d}" for i in range(EPISODES)]
     assert names == {
-        *("run.json", "episodes.jsonl", "latency.npz", "trajectories.npz"),
+        *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
         *("report.html", "firmware.log", "companion.log"),
         *("latency.png", "latency-timeline.png", "energy.png", "flight-3d.png"),
         *(f"{flight}{end}" for flight in flights for end in (".tlog", "-map.png", "-time.png")),

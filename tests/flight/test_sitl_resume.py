@@ -16,18 +16,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.sitl_command import SitlCommand
 from rich.console import Console
 
-from airl_mav.cli import evaluate_task, sitl
+from airl_mav.cli import sitl
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments import live
+from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import lock
-from airl_mav.rehearsal.episode import Plan
-from airl_mav.rehearsal.progress import RichObserver
+from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.scenario.model import Ports
+from airl_mav.scenario.resolved import ResolvedScenario
 from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode
 
@@ -42,16 +42,27 @@ class Stage:
         self.begun = 0
 
     def rehearsal(
-        self, plan: Plan, folder: RunFolder, observer: RichObserver, keeps: Collection[int]
+        self,
+        scenario: ResolvedScenario,
+        folder: RunFolder,
+        observer: LiveObserver,
+        keeps: Collection[int],
     ) -> Rehearsal:
         assert len(keeps) == 1
         self.begun += 1
-        return Rehearsal(self, plan, folder, observer)
+        return Rehearsal(self, scenario, folder, observer)
 
 
 class Rehearsal:
-    def __init__(self, stage: Stage, plan: Plan, folder: RunFolder, observer: RichObserver) -> None:
-        self.stage, self.plan, self.folder, self.observer = stage, plan, folder, observer
+    def __init__(
+        self, stage: Stage, scenario: ResolvedScenario, folder: RunFolder, observer: LiveObserver
+    ) -> None:
+        self.stage, self.asked, self.folder, self.observer = (
+            stage,
+            scenario.scenario,
+            folder,
+            observer,
+        )
 
     def __enter__(self) -> Rehearsal:
         return self
@@ -59,13 +70,13 @@ class Rehearsal:
     def __exit__(self, *_: object) -> None: ...
 
     def run(self, done: Collection[int]) -> None:
-        for index in range(self.plan.episodes):
+        for index, seed in enumerate(self.asked.seeds):
             if index in done:
                 continue
             if index in self.stage.ends:
                 raise self.stage.ends.pop(index)
             record, path, stamps = demo_episode(index, demo_arena(index + 1))
-            record = replace(record, seed=self.plan.seed + index, arena=self.plan.arena)
+            record = replace(record, seed=seed, arena=self.asked.arena)
             self.folder.save_episode(record, path, stamps)
             self.stage.flown.append(index)
             self.observer.finished(record)
@@ -74,7 +85,7 @@ class Rehearsal:
 @pytest.fixture(autouse=True)
 def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     stage = Stage()
-    monkeypatch.setattr(sitl, "Rehearsal", stage.rehearsal)
+    monkeypatch.setattr(live, "Rehearsal", stage.rehearsal)
     return stage
 
 
@@ -85,7 +96,11 @@ Fly = Callable[..., tuple[int, str]]
 def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fly:
     """`airl-sitl --out run`: exit status and output, without a report."""
     shown: list[Path] = []
-    monkeypatch.setattr(sitl, "conclude", lambda path, _: shown.append(path))
+
+    def conclude(flown: FlownRun, _: Console) -> None:
+        shown.append(flown.path)
+
+    monkeypatch.setattr(sitl, "conclude", conclude)
     arena = str(write_arena(tmp_path))
 
     def run(**options: Any) -> tuple[int, str]:
@@ -94,7 +109,7 @@ def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fly:
         words |= {"out": tmp_path / "run"} | options
         before = signal.getsignal(signal.SIGTERM)
         try:
-            code = sitl.run(SitlCommand(**words), console)
+            code = sitl.run(sitl.SitlOptions(**words), console)
         finally:
             assert signal.getsignal(signal.SIGTERM) is before
         assert shown.pop() == words["out"]
@@ -112,14 +127,19 @@ def test_an_interrupted_run_goes_on(fly: Fly, stage: Stage, tmp_path: Path) -> N
     assert stage.flown == [0, 1]
     # Ports decide nothing; an interrupt that comes at once loses nothing.
     stage.ends[2] = KeyboardInterrupt()
-    assert fly(ports=Ports(1, 2, 3, 4, 5))[0] == 130
+    assert (
+        fly(ports=Ports(api_port=1, api_local_port=2, gcs_port=3, gcs_local_port=4, camera_port=5))[
+            0
+        ]
+        == 130
+    )
     code, text = fly()
     assert code == 0
     assert f"{out}: 2 of 4 episodes are there" in text
     assert stage.flown == [0, 1, 2, 3]
     assert [e.seed for e in load(out).episodes] == [5, 6, 7, 8]
-    # Finished: shown again, nothing is started.
-    code, text = fly()
+    # Finished: shown again, nothing is started. What is asked for by its default is the same run.
+    code, text = fly(speed=1.0, hold_s=0.5)
     assert (code, stage.begun) == (0, 3)
     assert f"{out}: 4 of 4 episodes are there" in text
     assert "MAVSDK" not in text
@@ -145,12 +165,12 @@ def test_a_flight_that_is_lost_too_often_ends_the_run(
         ({"speed": 2.0}, "speed = 1.0, not 2.0"),
         ({"policy": "static-obstacles"}, "policy"),
         ({"arena": "no-obstacles"}, "arena"),
-        ({"hold": 0.4}, "hold = 0.5, not 0.4"),
+        ({"hold_s": 0.4}, "pilot.hold_s = 0.5, not 0.4"),
         ({"computer": "ras-pi-4", "workload": "template-5x32"}, "computer = 'workstation'"),
         ({"latency": "150ms"}, "latency = None, not '150ms'"),
         ({"latency_seed": 1}, "latency_seed = 0, not 1"),
         ({"arena_seed": 3}, "arena_seed = None, not 3"),
-        ({"time_limit": 60.0}, "time_limit = 120.0, not 60.0"),
+        ({"time_limit_s": 60.0}, "time_limit_s = 120.0, not 60.0"),
     ],
 )
 def test_another_run_is_not_mixed_in(
@@ -185,8 +205,8 @@ def test_more_episodes_are_added(fly: Fly, stage: Stage, tmp_path: Path) -> None
     # Not from another seed on, nor with anything else changed.
     with pytest.raises(UsageError, match="seed = 5, not 4"):
         fly(episodes=5, seed=4)
-    with pytest.raises(UsageError, match=r"hold = 0\.5, not 0\.4"):
-        fly(episodes=9, hold=0.4)
+    with pytest.raises(UsageError, match=r"pilot\.hold_s = 0\.5, not 0\.4"):
+        fly(episodes=9, hold_s=0.4)
     assert load(tmp_path / "run").info == run.info
 
 
@@ -230,31 +250,12 @@ def test_what_a_killed_run_left_is_swept_and_flown_again(
     assert stage.flown == [0, 1, 1, 2, 3]
     names = {path.name for path in out.iterdir()}
     assert names == {
-        *("run.json", "episodes.jsonl", "latency.npz", "trajectories.npz", "flight-001.tlog"),
+        *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
+        "flight-001.tlog",
     }
     assert [json.loads(line)["index"] for line in lines.read_bytes().splitlines()] == [0, 1, 2, 3]
     run = load(out)
     assert set(run.trajectories) == set(run.latency) == {0, 1, 2, 3}
-
-
-def test_airl_evaluate_and_the_campaigns_over_it_go_on(stage: Stage, tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    arena, out = str(write_arena(tmp_path)), tmp_path / "run" / "cell"
-    command = EvaluateCommand(("greedy",), episodes=3, seed=9, level="sitl")
-    console = Console(record=True, width=200, file=io.StringIO())
-
-    def cell() -> evaluate_task.Result:
-        return evaluate_task.prepare(command, "greedy", arena).fly(out, console)
-
-    stage.ends[1] = KeyboardInterrupt()
-    first = cell()
-    assert (first.path, first.code, first.new, len(first.episodes)) == (out, 130, 1, 1)
-    second = cell()
-    assert (second.code, second.new, len(second.episodes)) == (0, 2, 3)
-    assert (out / "trajectories.png").exists()
-    third = cell()
-    assert (third.code, third.new, third.episodes) == (0, 0, second.episodes)
-    assert stage.begun == 2
 
 
 def test_a_folder_is_kept_to_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,12 +49,11 @@ for name in names:
 """
 
 COMMAND = """
-import companion.mission, airl_mav.cli.companion as cli
-command = cli.CompanionCommand(policy="greedy", computer="ras-pi-4", workload="template-5x32")
-cli.check(command)
-assert cli.sampler(command, 1).sample_us() > 300_000
-from airl_mav.policy.registry import load_policy
-load_policy(command.policy, 0.5)
+import airl_mav.cli.companion as cli
+from companion.program import prepare
+asked = cli.OPTIONS(policy="greedy", computer="ras-pi-4", workload="template-5x32")
+mission = prepare(asked)
+assert mission.latency.sample_us() > 300_000
 """
 
 REPORT = f"""

@@ -8,14 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from airl_mav.cli.companion_command import CompanionCommand
-from airl_mav.cli.companion_command import check as check_companion
-from airl_mav.cli.sitl_command import SitlCommand
-from airl_mav.cli.sitl_command import check as check_sitl
 
-from airl_mav.cli.sitl import plan, settings
 from airl_mav.core.cpu_quota import CpuGroup, check_permitted, held_to, remove_left
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.rehearsal.channel import Begin
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.program import prepare
 from tests.support.processes import ROOT
 
 BUSY = """
@@ -159,20 +159,26 @@ def test_refused_out_of_range(percent: float) -> None:
         check_permitted(percent)
 
 
-def test_companion_refuses_it_where_its_time_does_not_count() -> None:
-    with pytest.raises(UsageError, match="--cpu-quota 20 with --lockstep"):
-        check_companion(CompanionCommand(cpu_quota=20.0, lockstep=True))
-    with pytest.raises(UsageError, match="--cpu-quota 20 with an injected latency"):
-        check_companion(CompanionCommand(cpu_quota=20.0, latency="150ms"))
-    with pytest.raises(UsageError, match="--cpu-quota 20 with an injected latency"):
-        check_sitl(SitlCommand(cpu_quota=20.0, computer="ras-pi-4", workload="template-5x32"))
+def test_it_is_refused_where_the_companions_time_does_not_count() -> None:
+    for asked, why in (
+        ({"lockstep": True}, "without level lockstep"),
+        ({"latency": "150ms"}, "without an injected latency"),
+    ):
+        with pytest.raises(FieldError, match=f"cpu_quota 20: accepted: {why}"):
+            prepare(StandAloneCompanion(cpu_quota=20.0, **asked))
+    for asked, why in (
+        ({"level": "lockstep"}, "without level lockstep"),
+        ({"level": "gym"}, "without level gym"),
+        ({"computer": "ras-pi-4", "workload": "template-5x32"}, "without an injected latency"),
+    ):
+        with pytest.raises(FieldError, match=f"cpu_quota 20: accepted: {why}"):
+            resolve(Scenario(cpu_quota=20.0, **asked))
 
 
 def test_rehearsal_hands_it_on_and_writes_it_down(permitted: None) -> None:
-    command = SitlCommand(cpu_quota=20.0)
-    setup, pilot = check_sitl(command)
-    assert setup.injection.origin == "measured"
-    assert "held to 20 % of a core" in setup.injection.label
-    assert settings(command, setup, pilot)["cpu_quota"] == 20.0
-    words = plan(command, setup, pilot, Path()).companion.arguments
-    assert words[words.index("--cpu-quota") + 1] == "20.0"
+    resolved = resolve(Scenario(cpu_quota=20.0))
+    assert resolved.injection.origin == "measured"
+    assert "held to 20 % of a core" in resolved.injection.label
+    assert resolved.config["cpu_quota"] == 20.0
+    told = Begin.model_validate_json(Begin(scenario=resolved).to_line())
+    assert told.scenario.scenario.cpu_quota == 20.0

@@ -11,7 +11,7 @@ import scipy.stats
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import ReplaySampler, latency_generator
 from airl_mav.latency.source import longest_ms, parse_latency, select_injection
-from airl_mav.profiles.computer import Latency
+from airl_mav.profiles.computer import Latency, load_computer
 
 
 @pytest.mark.parametrize(
@@ -82,10 +82,11 @@ def test_what_is_none_is_refused_in_a_line(text: str, told: str) -> None:
 
 
 def test_a_source_and_a_workload_are_one_too_many() -> None:
+    computer = load_computer("ras-pi-4")
     with pytest.raises(UsageError, match="one of them"):
-        select_injection("150ms", "ras-pi-4", "template-5x32")
-    assert select_injection(None, "ras-pi-4", "template-5x32").latency is not None
-    assert select_injection("150ms", "ras-pi-4", None).latency is not None
+        select_injection("150ms", computer, "template-5x32")
+    assert select_injection(None, computer, "template-5x32").latency is not None
+    assert select_injection("150ms", computer, None).latency is not None
 
 
 def test_replay_keeps_histogram_and_autocorrelation() -> None:

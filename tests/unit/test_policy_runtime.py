@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.cli import companion, companion_command, sitl, sitl_command
+from airl_mav.cli import entry
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
@@ -33,9 +34,12 @@ from airl_mav.policy.observation import Kinematics, Observation, encode
 from airl_mav.policy.registry import find_policy, load_policy, policy_names
 from airl_mav.policy.runtime import Runtime, TorchRuntime
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings
+from airl_mav.scenario.model import DEFAULT_POLICY, Decisions, PilotSettings, Scenario
+from airl_mav.scenario.piloting import decide_piloting, select_latency
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import ReceivedFrame
-from companion.mission import first_lens
+from companion.mission import check_camera, first_lens
 from tests.support.policy_kit import SPEC, export_tiny, noise
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, running
@@ -321,7 +325,7 @@ def test_policies_are_found_by_name_and_by_path(
 
 def test_greedy_takes_no_runtime_and_no_ablation() -> None:
     for options in ({"runtime": "torch"}, {"ablate": "depth"}):
-        with pytest.raises(UsageError, match="'greedy': not a learned policy"):
+        with pytest.raises(UsageError, match="accepted: for a learned policy; greedy is none"):
             load_policy("greedy", 0.5, **options)  # type: ignore[arg-type]
 
 
@@ -330,39 +334,42 @@ def test_greedy_takes_no_runtime_and_no_ablation() -> None:
 
 def test_the_pilot_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> None:
     learned, greedy = find_policy(str(exported / "discrete")), find_policy("greedy")
-    silent = companion_command.PilotOptions()
-    assert companion_command.pilot_settings(silent, greedy) == PilotSettings()
-    assert companion_command.pilot_settings(silent, learned) == PilotSettings(
+    silent, radius_m = Decisions(), PilotSettings.goal_radius_m
+    assert decide_piloting(silent, greedy, radius_m)[0] == PilotSettings()
+    assert decide_piloting(silent, learned, radius_m)[0] == PilotSettings(
         hold_s=0.4, goal_radius_m=2.5, altitude_m=2.0, max_speed_m_s=5.0
     )
-    asked = companion_command.PilotOptions(hold_s=0.0, altitude_m=3.0)
-    for info, radius in ((learned, 2.5), (greedy, PilotSettings.goal_radius_m)):
-        settings = companion_command.pilot_settings(asked, info)
-        assert (settings.hold_s, settings.altitude_m) == (0.0, 3.0)
-        assert settings.goal_radius_m == radius
+    asked = Decisions(hold_s=0.0, altitude_m=3.0)
+    for info, radius in ((learned, 2.5), (greedy, radius_m)):
+        pilot, _ = decide_piloting(asked, info, radius_m)
+        assert (pilot.hold_s, pilot.altitude_m) == (0.0, 3.0)
+        assert pilot.goal_radius_m == radius
 
 
 def test_sitl_flies_as_the_card_says_unless_told_otherwise(exported: Path) -> None:
     path = str(exported / "discrete")
-    setup, pilot = sitl_command.check(sitl_command.SitlCommand(policy=path))
+    resolved = resolve(Scenario(policy=path))
+    pilot = resolved.pilot
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.4, 2.0, 2.5)
-    assert (setup.policy.name, setup.policy.description) == ("discrete", "random weights")
-    words = sitl.plan(
-        sitl_command.SitlCommand(policy=path, threads=2), setup, pilot, Path()
-    ).companion.arguments
-    for option, value in (
-        ("--policy", path),
-        ("--runtime", "onnx"),
-        ("--threads", "2"),
-        ("--hold-s", "0.4"),
-        ("--altitude-m", "2.0"),
-        ("--goal-radius-m", "2.0"),
-    ):
-        assert words[words.index(option) + 1] == value
-    _, pilot = sitl_command.check(sitl_command.SitlCommand(policy=path, hold=0.7, goal_radius=4.0))
+    policy = resolved.setup.policy
+    assert (policy.name, policy.description) == ("discrete", "random weights")
+    # The companion goes closer than the referee asks for.
+    assert resolved.companion_pilot == replace(pilot, goal_radius_m=2.0)
+    pilot = resolve(Scenario(policy=path, hold_s=0.7, goal_radius_m=4.0)).pilot
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.7, 2.0, 4.0)
-    _, pilot = sitl_command.check(sitl_command.SitlCommand(policy="greedy"))
+    pilot = resolve(Scenario(policy="greedy")).pilot
     assert (pilot.hold_s, pilot.altitude_m, pilot.goal_radius_m) == (0.5, 2.5, 3.0)
+
+
+def test_a_torch_program_of_a_stranger_is_not_loaded_unasked(
+    exported: Path, refuse: Callable[..., str]
+) -> None:
+    path = str(exported / "discrete")
+    for command in (entry.sitl, entry.companion):
+        line = refuse(command, "--policy", path, "--runtime", "torch")
+        assert "--runtime torch: accepted: with trust" in line
+        assert "policy.pt2" in line
+    resolve(Scenario(policy=path, runtime="torch", trust=True))
 
 
 def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path: Path) -> None:
@@ -377,25 +384,18 @@ def test_what_was_measured_for_this_policy_is_injected(exported: Path, tmp_path:
         encoding="utf-8",
     )
     path = str(exported / "discrete")
-    setup, _ = sitl_command.check(sitl_command.SitlCommand(policy=path, computer=str(computer)))
-    assert setup.injection.origin == "injected"
-    assert "this policy as timed" in setup.injection.label
-    other, _ = sitl_command.check(
-        sitl_command.SitlCommand(policy=str(exported / "continuous"), computer=str(computer))
-    )
+    resolved = resolve(Scenario(policy=path, computer=str(computer)))
+    assert resolved.injection.origin == "injected"
+    assert "this policy as timed" in resolved.injection.label
+    other = resolve(Scenario(policy=str(exported / "continuous"), computer=str(computer)))
     assert other.injection.origin == "measured"
-    guess, _ = sitl_command.check(
-        sitl_command.SitlCommand(policy=path, computer="ras-pi-4", workload="estimate")
-    )
+    guess = resolve(Scenario(policy=path, computer="ras-pi-4", workload="estimate"))
     assert guess.injection.origin == "estimated"
 
-    # The companion draws the same, under a harness; by itself it runs on that very computer.
-    served = companion_command.CompanionCommand(
-        policy=path, computer=str(computer), control="stdio"
-    )
-    assert companion_command.injection(served) == setup.injection
-    alone = companion_command.CompanionCommand(policy=path, computer=str(computer))
-    assert companion_command.injection(alone).origin == "measured"
+    # By itself the companion runs on that very computer, but in lockstep no computer counts.
+    asked, policy = StandAloneCompanion(policy=path, computer=str(computer)), resolved.policy
+    assert select_latency(asked, policy, on_this_computer=True).origin == "measured"
+    assert select_latency(asked, policy, on_this_computer=False) == resolved.injection
 
 
 # --- refused before anything flies
@@ -407,11 +407,11 @@ def refuse(
 ) -> Callable[..., str]:
     """Run a command that must refuse its options; return its one line of error."""
 
-    def run(entry: Callable[[], None], *options: str) -> str:
+    def run(command: Callable[[], None], *options: str) -> str:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", ["airl", *options])
         with pytest.raises(SystemExit) as end:
-            entry()
+            command()
         out, err = capsys.readouterr()
         assert end.value.code == 2
         assert out == ""
@@ -423,26 +423,26 @@ def refuse(
     return run
 
 
-@pytest.mark.parametrize("entry", [sitl.main, companion.main])
+@pytest.mark.parametrize("command", [entry.sitl, entry.companion])
 def test_a_policy_that_cannot_be_flown_is_refused(
-    folder: Path, refuse: Callable[..., str], entry: Callable[[], None]
+    folder: Path, refuse: Callable[..., str], command: Callable[[], None]
 ) -> None:
-    assert "no such policy; known: greedy" in refuse(entry, "--policy", "nowhere/to/be/found")
-    assert "card.json: No such file" in refuse(entry, "--policy", str(folder.parent))
+    assert "no such policy; known: greedy" in refuse(command, "--policy", "nowhere/to/be/found")
+    assert "card.json: No such file" in refuse(command, "--policy", str(folder.parent))
     edit(folder, hold_s=99.0)
-    assert "hold_s = 99: accepted: 0 <= value <= 10 s" in refuse(entry, "--policy", str(folder))
+    assert "hold_s = 99: accepted: 0 <= value <= 10 s" in refuse(command, "--policy", str(folder))
     edit(folder, hold_s=3.0)
-    assert "--decision-timeout-s 2: accepted: more than" in refuse(entry, "--policy", str(folder))
+    assert "--decision-timeout-s 2: accepted: more than" in refuse(command, "--policy", str(folder))
     edit(folder, hold_s=0.5, torch_sha256=None)
-    line = refuse(entry, "--policy", str(folder), "--runtime", "torch")
+    line = refuse(command, "--policy", str(folder), "--runtime", "torch", "--trust")
     assert "policy.pt2: the card names none" in line
     assert "--threads 0: accepted: 1 <= value" in refuse(
-        entry, "--policy", str(folder), "--threads", "0"
+        command, "--policy", str(folder), "--threads", "0"
     )
     data = bytearray((folder / "policy.onnx").read_bytes())
     data[len(data) // 2] ^= 4
     (folder / "policy.onnx").write_bytes(data)
-    assert "policy.onnx: SHA-256" in refuse(entry, "--policy", str(folder))
+    assert "policy.onnx: SHA-256" in refuse(command, "--policy", str(folder))
 
 
 @pytest.mark.parametrize(
@@ -465,7 +465,7 @@ def test_a_vehicle_with_another_camera_is_refused(
     assert old in shipped
     vehicle = tmp_path / "mine.toml"
     vehicle.write_text(shipped.replace(old, new), encoding="utf-8")
-    line = refuse(sitl.main, "--policy", str(exported / "discrete"), "--vehicle", str(vehicle))
+    line = refuse(entry.sitl, "--policy", str(exported / "discrete"), "--vehicle", str(vehicle))
     for word in ("--policy", str(vehicle), *words):
         assert word in line
 
@@ -488,10 +488,10 @@ class Camera:
 def test_the_companion_looks_at_its_camera_before_take_off(exported: Path) -> None:
     policy = load_policy(str(exported / "discrete"), 0.5)
     wide, stop = Intrinsics.from_fov(64, 48, 2.0), threading.Event()
-    companion.check_camera(policy, Camera(LENS, 3), stop)
+    check_camera(policy, Camera(LENS, 3), stop)
     with pytest.raises(UsageError, match="--policy discrete: camera with a horizontal field"):
-        companion.check_camera(policy, Camera(wide, 3), stop)
-    companion.check_camera(load_policy("greedy", 0.5), Camera(wide), stop)
+        check_camera(policy, Camera(wide, 3), stop)
+    check_camera(load_policy("greedy", 0.5), Camera(wide), stop)
     # No frame: what to do about that is the pilot's business, not the card's.
     assert first_lens(Camera(wide, 1000), stop) is None
     stop.set()
@@ -515,9 +515,9 @@ sys.meta_path.insert(0, Absent())
 import math
 import numpy as np
 import companion.mission, companion.pilot, airl_mav.cli.companion as cli
+from companion.program import prepare
 assert "onnxruntime" not in sys.modules, "nobody asked for a network yet"
-command = cli.CompanionCommand(policy={folder!r})
-policy = cli.load(command, cli.check(command))
+policy = prepare(cli.OPTIONS(policy={folder!r})).policy
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.policy.observation import Observation
 lens = Intrinsics.from_fov(64, 48, math.radians(90.0))
@@ -563,7 +563,7 @@ def test_a_learned_policy_flies_a_rehearsal(folder: Path, tmp_path: Path) -> Non
         process.no_child_left()
     config = json.loads((run / "run.json").read_text(encoding="utf-8"))
     assert config["setup"]["policy"] == {"name": "discrete", "description": "random weights"}
-    assert config["config"]["hold"] == 0.3
+    assert config["config"]["pilot"]["hold_s"] == 0.3
     assert (run / "companion.log").read_text() == ""
     with np.load(run / "latency.npz") as archive:
         sent = [archive[key] for key in archive.files if key.endswith("sent_us")]

@@ -1,0 +1,70 @@
+"""The two processes of a rehearsal, told something else than a scenario: they say so and end."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE
+from airl_mav.rehearsal.channel import Begin, Failed, parse_event
+from airl_mav.rehearsal.process_pair import MODULES
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from tests.support.processes import ROOT
+
+
+def told(module: str, first: bytes, folder: Path) -> subprocess.CompletedProcess[bytes]:
+    """Start a process, say one thing to it, and close the pipe."""
+    return subprocess.run(
+        [sys.executable, "-m", module],
+        input=first,
+        cwd=folder,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(folder)},
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def of_another_version() -> bytes:
+    line: dict[str, Any] = json.loads(Begin(scenario=resolve(Scenario())).to_line())
+    line["scenario"]["scenario"]["colour"] = "blue"
+    return json.dumps(line).encode() + b"\n"
+
+
+@pytest.mark.parametrize("module", MODULES.values(), ids=MODULES)
+@pytest.mark.parametrize(
+    ("first", "named"),
+    [
+        (b"\x00\xff garbage \xfe\n", "not a scenario"),
+        (b'{"type":"begin"}\n', "scenario"),
+        (b'{"type":"shutdown"}\n', "not a scenario"),
+        (b'{"type":"begin","scenario":', "not a scenario"),
+        (of_another_version(), "colour"),
+    ],
+    ids=["garbage", "nothing in it", "a request", "cut short", "another version"],
+)
+def test_something_else_is_refused_in_one_line(
+    module: str, first: bytes, named: str, tmp_path: Path
+) -> None:
+    done = told(module, first, tmp_path)
+    assert done.returncode == EXIT_USAGE
+    (line,) = done.stdout.splitlines()
+    event = parse_event(line)
+    assert isinstance(event, Failed)
+    assert event.usage
+    assert named in event.message
+    assert len(event.message.splitlines()) == 1
+    assert done.stderr == b""
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("module", MODULES.values(), ids=MODULES)
+def test_a_pipe_that_ends_at_once_ends_the_process(module: str, tmp_path: Path) -> None:
+    done = told(module, b"", tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (EXIT_BROKEN, b"", b"")

@@ -1,0 +1,123 @@
+"""The commands: `airl` finds its subcommands, and each says what it is for and how it is used."""
+
+from __future__ import annotations
+
+import difflib
+import subprocess
+import sys
+
+import pytest
+
+from airl_mav import __version__
+from airl_mav.cli import entry
+from airl_mav.cli.listing import KINDS
+from airl_mav.cli.main import SUBCOMMANDS, main
+from airl_mav.policy.registry import policy_names
+from airl_mav.profiles.loading import list_profiles
+from tests.support.processes import ROOT
+
+OLD = ("profile",)
+"""Subcommands whose modules do not have their options as a model yet."""
+
+NAMES = [name for name in SUBCOMMANDS if name not in OLD]
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """Run `airl WORDS`; return exit status and what it printed."""
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    out, err = capsys.readouterr()
+    assert isinstance(end.value.code, int)
+    return end.value.code, out, err
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, "--version") == (0, f"airl-mav {__version__}\n", "")
+
+
+def test_without_a_word_it_says_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:
+    code, told, _ = run(capsys)
+    assert code == 2
+    assert run(capsys, "--help") == (0, told, "")
+    for name in SUBCOMMANDS:
+        assert f"\n  {name} " in told
+
+
+@pytest.mark.parametrize(
+    ("word", "hint"), [("evalute", "did you mean evaluate?"), ("fly", "accepted: sitl, firmware, ")]
+)
+def test_an_unknown_command_gets_a_hint(
+    word: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = run(capsys, word)
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: airl {word}: no such command; {hint}")
+    assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_shipped_is_listed(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "list", kind)
+    assert code == 0
+    names = policy_names() if kind == "policies" else list_profiles(kind)  # type: ignore[arg-type]
+    assert names
+    for name in names:
+        assert name in out
+
+
+def test_everything_is_listed_unless_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "list")
+    assert code == 0
+    assert all(kind in out for kind in KINDS)
+    code, _, err = run(capsys, "list", "zeppelins")
+    assert code == 2
+    assert "zeppelins" in err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_has_examples_that_can_be_typed(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    code, out, _ = run(capsys, name, "--help")
+    assert code == 0
+    assert out.startswith(f"usage: airl {name}")
+    lines = [line.strip(" │") for line in out.splitlines()]
+    assert "Examples:" in lines
+    examples = lines[lines.index("Examples:") + 1 :]
+    assert any(line.startswith((f"airl {name}", f"airl-{name}")) for line in examples)
+
+
+@pytest.mark.parametrize("name", ["sitl", "firmware", "companion"])
+def test_the_script_is_the_subcommand(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, told, _ = run(capsys, name, "--help")
+    monkeypatch.setattr(sys, "argv", [f"airl-{name}", "--help"])
+    with pytest.raises(SystemExit) as end:
+        getattr(entry, name)()
+    assert end.value.code == 0
+    script = capsys.readouterr().out
+    for line in difflib.ndiff(told.splitlines(), script.splitlines()):
+        assert line[:2] in ("  ", "? ") or "usage: " in line, line
+    _, _, err = run(capsys, name, "--seed", "-1")
+    assert err == "error: --seed -1: accepted: 0 <= value <= 2147483648\n"
+
+
+def test_help_loads_no_simulator_and_no_figures() -> None:
+    code = (
+        "import sys; from airl_mav.cli.main import main\n"
+        "try: main(['sitl', '--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'pybullet', 'numba', 'matplotlib', 'torch', 'mavsdk'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

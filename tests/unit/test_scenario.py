@@ -1,0 +1,306 @@
+"""The scenario: declared once, read once, the same in a file, as options and in a process."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from rich.console import Console
+
+from airl_mav.cli import entry, sitl
+from airl_mav.cli.options import read_options
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import unit_of, validated
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.scenario.file import load_scenario, save_scenario
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import RESOLVED
+from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
+from tests.support.processes import ROOT
+
+# --- the model
+
+
+def fields_of(model: type[BaseModel], table: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Yield all fields with their dotted names, those of the tables too."""
+    for name, field in model.model_fields.items():
+        yield f"{table}{name}", field
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            yield from fields_of(kind, f"{name}.")
+
+
+@pytest.mark.parametrize("model", [Scenario, StandAloneVehicle, StandAloneCompanion])
+def test_every_field_has_a_meaning_and_every_number_its_unit(model: type[BaseModel]) -> None:
+    for name, field in fields_of(model):
+        assert field.description, name
+        assert not field.is_required(), name
+        kinds = {field.annotation, *get_args(field.annotation)}
+        # The pace of the stand-alone vehicle is a number or "max"; a goal is two numbers.
+        if kinds & {int, float} and name not in ("speed", "goal"):
+            assert unit_of(field), name
+
+
+def test_options_are_unique_without_their_tables() -> None:
+    """--px4-dir stands for real.px4_dir: no other table has a field of that name."""
+    names = [
+        name.rpartition(".")[2]
+        for model in (Scenario,)
+        for name, _ in fields_of(model)
+        if not name.startswith("wind.")
+    ]
+    assert len(names) == len(set(names))
+
+
+# --- resolution
+
+BUSY: dict[str, Any] = {
+    "policy": "greedy",
+    "latency": "lognormal:396ms,20.125ms",
+    "hold_s": 0.1,
+    "arena_seed": 7,
+    "wind": {"north_m_s": 1 / 3, "gust_m_s": 0.1},
+    "watchdog": {"hover_after_s": 0.06},
+    "real": {"firmware_dir": "kept"},
+}
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{}, BUSY, {"level": "lockstep", "computer": "ras-pi-4", "workload": "template-5x32"}],
+    ids=["default", "busy", "lockstep"],
+)
+def test_a_resolved_scenario_survives_json_bit_by_bit(fields: dict[str, Any]) -> None:
+    resolved = resolve(Scenario.model_validate(fields))
+    text = RESOLVED.dump_json(resolved)
+    again = RESOLVED.validate_json(text)
+    assert again == resolved
+    assert RESOLVED.dump_json(again) == text
+    # What flies is decided the same way on both sides of the pipe.
+    assert (again.companion_pilot, again.setup, again.rules) == (
+        resolved.companion_pilot,
+        resolved.setup,
+        resolved.rules,
+    )
+    for native in (False, True):
+        here = resolved.latency_sampler(3, native=native)
+        there = again.latency_sampler(3, native=native)
+        if here is None:
+            assert there is None
+            continue
+        assert there is not None
+        assert [here.sample_us() for _ in range(50)] == [there.sample_us() for _ in range(50)]
+
+
+READS = """
+import sys
+from collections import Counter
+from pathlib import Path
+
+opened = Counter()
+
+def note(event, arguments):
+    if event == "open" and isinstance(arguments[0], (str, Path)):
+        path = Path(arguments[0])
+        if path.suffix in (".toml", ".json", ".onnx") and "profiles" in path.parts:
+            opened["/".join(path.parts[-2:])] += 1
+
+sys.addaudithook(note)
+from airl_mav.lockstep.flight import fly
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+
+resolved = resolve(Scenario(level="lockstep", time_limit_s=3.0, computer="ras-pi-4",
+                            workload="template-5x32"))
+for name in ("vehicles/quad.toml", "arenas/static-obstacles.toml", "computers/ras-pi-4.toml",
+             "static-obstacles/card.json"):
+    assert opened.pop(name) == 1, (name, opened)
+del opened["static-obstacles/policy.onnx"]
+assert not opened, opened
+fly(resolved, resolved.fresh_policy(1), 0, 1)
+assert not opened, opened
+"""
+
+
+def test_profiles_and_card_are_read_once_and_never_in_flight(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", READS],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("fields", "line"),
+    [
+        ({"hold_s": 3.0}, "watchdog.decision_timeout_s 2: accepted: more than the hold time, 3 s"),
+        ({"ablate": "depth"}, "ablate 'depth': accepted: at level gym or lockstep"),
+        ({"speed": 20.0}, "speed 20: accepted: 0.5 <= value <= 10 at level sitl"),
+        ({"tlogs": True}, "tlogs True: accepted: at level lockstep"),
+        ({"workers": 2}, "workers 2: accepted: at level gym or lockstep"),
+        ({"ports": {"camera_port": 0}}, "ports.camera_port 0: accepted: 1 <= value <= 65535"),
+        ({"ports": {"gcs_port": 14540}}, "ports.gcs_port 14540: accepted: another than that of"),
+        ({"firmware": "px4"}, "firmware 'px4': accepted: with px4_dir or px4_connect"),
+        ({"real": {"serial": "x"}}, "real.serial 'x': accepted: with firmware px4-hitl"),
+        ({"policy": "greedy", "ablate": "depth", "level": "gym"}, "ablate 'depth': accepted: for"),
+    ],
+    ids=lambda value: str(value)[:50],
+)
+def test_fields_that_contradict_each_other_are_named(fields: dict[str, Any], line: str) -> None:
+    with pytest.raises(FieldError) as refused:
+        resolve(validated(Scenario, fields))
+    assert str(refused.value).startswith(line)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--hold-s", "3"], "--decision-timeout-s 2: accepted: more than the hold time, 3 s"),
+        (["--ablate", "depth"], "--ablate depth: accepted: at level gym or lockstep"),
+        (["--firmware", "px4"], "--firmware px4: accepted: with "),
+        (["--level", "gym"], "--level gym: accepted: lockstep or sitl"),
+        (["--wind.gust-m-s", "99"], "--wind.gust-m-s 99: accepted: 0 <= value <= 50 m/s"),
+        (["--serial", "/dev/ttyX"], "--serial /dev/ttyX: accepted: with firmware px4-hitl"),
+    ],
+    ids=" ".join,
+)
+def test_options_that_contradict_each_other_are_named(
+    words: list[str],
+    line: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["airl-sitl", *words])
+    with pytest.raises(SystemExit) as end:
+        entry.sitl()
+    out, err = capsys.readouterr()
+    assert (end.value.code, out) == (2, "")
+    assert err.startswith(f"error: {line}")
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- files
+
+
+def options(*words: str) -> sitl.SitlOptions:
+    renamed = sitl.RENAMED_OPTIONS
+    return read_options(sitl.SitlOptions, "airl-sitl", words, renamed=renamed)
+
+
+def test_a_scenario_survives_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    for fields in ({}, BUSY):
+        scenario = Scenario.model_validate(fields)
+        save_scenario(scenario, path)
+        assert load_scenario(path) == scenario
+
+
+def test_options_lie_over_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'policy = "greedy"\nepisodes = 7\nhold_s = 0.3\n[wind]\nnorth_m_s = 2.0\n[ports]\n'
+        "gcs_port = 15000\n"
+    )
+    asked = options(str(path), "--episodes", "2", "--wind.east-m-s", "1")
+    assert (asked.policy, asked.episodes, asked.hold_s) == ("greedy", 2, 0.3)
+    assert (asked.wind.north_m_s, asked.wind.east_m_s) == (2.0, 1.0)
+    assert asked.ports.gcs_port == 15000
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("episodes = 0", "episodes = 0: accepted: 1 <= value <= 100000"),
+        ("episodes = [", "not valid TOML: "),
+        ("episode = 3", "episode: unknown field; did you mean 'episodes'?"),
+        ("[wind]\nnorth_m_s = 99", "wind.north_m_s = 99: accepted: -50 <= value <= 50 m/s"),
+        ('[watchdog]\nhover_after_s = "soon"', "watchdog.hover_after_s = 'soon': accepted: 0 <= "),
+        ('level = "hil"', "level = 'hil': accepted: 'gym', 'lockstep' or 'sitl'"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_errors_in_a_file_name_it_and_the_field(tmp_path: Path, text: str, line: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    for read in (lambda: load_scenario(path), lambda: options(str(path))):
+        with pytest.raises(UsageError) as refused:
+            read()
+        assert str(refused.value).startswith(f"{path}: {line}")
+        assert "\n" not in str(refused.value)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"nowhere\.toml: No such file"):
+        options(str(tmp_path / "nowhere.toml"))
+
+
+def test_contradictions_in_a_file_name_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("hold_s = 3.0\n")
+    monkeypatch.setattr(sys, "argv", ["airl-sitl", str(path)])
+    with pytest.raises(SystemExit) as end:
+        entry.sitl()
+    assert end.value.code == 2
+    assert capsys.readouterr().err.startswith(
+        f"error: {path}: watchdog.decision_timeout_s = 2: accepted: more than the hold time, 3 s"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_the_scenario_of_a_run_flies_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sitl, "conclude", lambda *_: None)
+    out, console = [tmp_path / "first", tmp_path / "again"], Console(quiet=True)
+    words = ("--level", "lockstep", "--episodes", "1", "--seed", "11", "--time-limit-s", "5")
+    assert sitl.run(options(*words, "--latency", "80ms", "--out", str(out[0])), console) == 0
+    assert sitl.run(options(str(out[0] / "scenario.toml"), "--out", str(out[1])), console) == 0
+    first, again = (load(path) for path in out)
+    assert first.episodes[0].sha256 is not None
+    assert first.episodes == again.episodes
+    assert first.info.config == again.info.config
+
+
+# --- old names
+
+
+@pytest.mark.parametrize(
+    ("words", "field", "value", "new"),
+    [
+        (["--hold", "0.4"], "hold_s", 0.4, "--hold-s"),
+        (["--hold=0.4"], "hold_s", 0.4, "--hold-s"),
+        (["--altitude", "3"], "altitude_m", 3.0, "--altitude-m"),
+        (["--goal-radius", "1"], "goal_radius_m", 1.0, "--goal-radius-m"),
+        (["--time-limit", "60"], "time_limit_s", 60.0, "--time-limit-s"),
+        (["--lockstep"], "level", "lockstep", "--level lockstep"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_old_options_work_and_say_their_new_name(
+    words: list[str], field: str, value: object, new: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert getattr(options(*words), field) == value
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == f"{words[0].partition('=')[0]} is called {new} now\n"
+
+
+def test_the_old_option_of_hovering_reaches_the_watchdog() -> None:
+    assert options("--hover-after", "0.06").watchdog.hover_after_s == 0.06
