@@ -4,7 +4,6 @@ The project speaks PX4's frames: world NED (north, east, down), body FRD (forwar
 pybullet speaks ENU / FLU. Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate
 body vectors into the world: v_ned = R(q) v_frd. Euler angles are the aerospace sequence yaw,
 pitch, roll (Z-Y-X, intrinsic).
-
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def quat_normalize(q: Vector) -> Vector:
     """Return q (4,) scaled to length 1 with w >= 0. Raises ValueError on a zero quaternion."""
     norm = float(np.linalg.norm(q))
     if norm == 0.0:
-        raise ValueError("a zero quaternion is no rotation")
+        raise ValueError("a zero quaternion does not stand for a rotation")
     return q / (norm if q[0] >= 0.0 else -norm)
 
 
@@ -86,15 +85,6 @@ def quat_rotate(q: Vector, v: Vector) -> Vector:
     """Rotate a body vector (3,) into the world by a unit quaternion (4,)."""
     rotated: Vector = quat_to_matrix(q) @ v
     return rotated
-
-
-def quat_from_rotation_vector(r: Vector) -> Vector:
-    """Return the unit quaternion (4,) of a rotation vector (3,) [rad]."""
-    angle = math.sqrt(float(r[0] * r[0] + r[1] * r[1] + r[2] * r[2]))
-    if angle < 1e-8:
-        return quat_normalize(np.array([1.0, 0.5 * r[0], 0.5 * r[1], 0.5 * r[2]]))
-    s = math.sin(0.5 * angle) / angle
-    return np.array([math.cos(0.5 * angle), s * r[0], s * r[1], s * r[2]])
 
 
 def quat_from_euler(roll: float, pitch: float, yaw: float) -> Vector:
@@ -151,12 +141,7 @@ _FRD_FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 
 
 def quat_ned_frd_to_enu_flu(q: Vector) -> Vector:
-    """Turn an attitude NED <- FRD (4,) into the same attitude as ENU <- FLU (4,)."""
-    return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
-
-
-def quat_enu_flu_to_ned_frd(q: Vector) -> Vector:
-    """Turn an attitude ENU <- FLU (4,) into the same attitude as NED <- FRD (4,)."""
+    """Turn an attitude NED <- FRD (4,) into the same as ENU <- FLU (4,). Its own inverse."""
     return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
 
 

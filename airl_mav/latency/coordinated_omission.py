@@ -63,13 +63,6 @@ class CommandAges:
         a, b = self.youngest_us.astype(np.float64), self.oldest_us.astype(np.float64)
         return float(((b * b - a * a) / 2.0).sum() / (b - a).sum())
 
-    def share_older(self, age_us: float) -> float | None:
-        """Return the share of the time that the command was older than an age [µs]."""
-        if not self.time_us:
-            return None
-        older = np.clip(self.oldest_us - np.maximum(self.youngest_us, age_us), 0.0, None)
-        return float(older.sum() / self.time_us)
-
     def percentile(self, p: float) -> float | None:
         """Return the age [µs] that the command did not exceed for p percent of the time.
 

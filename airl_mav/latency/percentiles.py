@@ -13,8 +13,6 @@ MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 99.0: 662, 99.9: 6636}
 we print, at most one sample over the bound would be a 1 % chance (the early-stopping rule of MLPerf
 LoadGen at 99 % confidence)."""
 
-TOO_FEW: Final = "too few samples"
-
 
 @dataclass(frozen=True)
 class Summary:

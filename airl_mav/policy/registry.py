@@ -74,11 +74,6 @@ def find_policy(name: str) -> PolicyInfo:
     return PolicyInfo(card.name, card.description, card, folder)
 
 
-def policy_description(name: str) -> str:
-    """Return one line about a policy. Raises UsageError as `find_policy` does."""
-    return find_policy(name).description
-
-
 def load_policy(
     policy: PolicyInfo | str,
     hold_s: float,

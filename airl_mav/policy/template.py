@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec
@@ -76,7 +77,7 @@ def write_template(
             f"{GREATEST_BYTES // 4:,} (a smaller --image has fewer)"
         )
     model = build_template(layers, filters, spec, facts.actions, rng)
-    (folder / ONNX_FILE).write_bytes(model)
+    replace_file(folder / ONNX_FILE, model)
     card = PolicyCard(
         **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
         sha256=digest(model),

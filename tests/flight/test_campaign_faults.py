@@ -273,7 +273,7 @@ from airl_mav.cli import evaluate_task, main, report
 from airl_mav.rehearsal import episode_saver
 from airl_mav.report import run_page
 
-chunks.EVERY_S, chunks.PAUSE, run_page.MAX_PICTURED = 0.02, 0.0, 1
+episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE, run_page.MAX_PICTURED = 0.02, 0.0, 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:
         exec(script)

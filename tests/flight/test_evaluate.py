@@ -39,7 +39,7 @@ from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal import run_folder
+from airl_mav.rehearsal import episode_saver, run_folder
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import run_page
 from airl_mav.report.run_report import write_report
@@ -428,7 +428,7 @@ SCRIPT = """
 import sys
 from airl_mav.rehearsal import episode_saver
 from airl_mav.report import run_report
-chunks.EVERY_S, chunks.MOST = 60.0, 5
+episode_saver.INTERVAL_S, episode_saver.MAX_WAITING = 60.0, 5
 # The table is printed; the page takes longer than the flights.
 run_report.build_page = lambda run, *_, **__: run.path / "report.html"
 from airl_mav.cli.main import main
@@ -482,8 +482,8 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
 ) -> None:
     out = tmp_path / "run"
     options = {"arena": ("no-obstacles",), "episodes": 60, "out": out}
-    monkeypatch.setattr(chunks, "EVERY_S", 60.0)
-    monkeypatch.setattr(chunks, "MOST", 20)
+    monkeypatch.setattr(episode_saver, "INTERVAL_S", 60.0)
+    monkeypatch.setattr(episode_saver, "MAX_WAITING", 20)
     real, calls = RunFolder.save_episodes, []
 
     def save(folder: RunFolder, episodes: Sequence[FlownEpisode]) -> None:
@@ -675,16 +675,16 @@ def test_a_table_goes_on_where_it_was_left(
     out = tmp_path / "matrix"
     options = {"arena": ("no-obstacles", "static-obstacles"), "episodes": 5, "out": out}
     flights = []
-    real = chunks.Saver.add
+    real = episode_saver.EpisodeSaver.add
 
-    def interrupted(saver: chunks.Saver, episode: FlownEpisode) -> None:
+    def interrupted(saver: episode_saver.EpisodeSaver, episode: FlownEpisode) -> None:
         real(saver, episode)
         flights.append(episode)
         if len(flights) == 8:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patched:
-        patched.setattr(chunks.Saver, "add", interrupted)
+        patched.setattr(episode_saver.EpisodeSaver, "add", interrupted)
         code, text = evaluate("greedy", linear, slots=2, **options)
     assert code == 130
     assert "interrupted" in text

@@ -159,7 +159,7 @@ def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> 
 SCRIPT = """
 from airl_mav.cli import main, report
 from airl_mav.rehearsal import episode_saver
-chunks.EVERY_S, chunks.PAUSE = 0.05, 0.0
+episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.05, 0.0
 report.run = lambda *_: 0  # takes longer than the flights
 main.main()
 """

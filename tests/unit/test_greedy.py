@@ -20,7 +20,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.policy.actions import Action, limited
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings, clearance, near_points
 from airl_mav.policy.observation import Kinematics, Observation, encode
-from airl_mav.policy.registry import POLICIES, load_policy, policy_description
+from airl_mav.policy.registry import POLICIES, find_policy, load_policy
 
 LENS = Intrinsics.from_fov(64, 48, math.radians(90.0))
 HALF_FOV = math.radians(45.0)
@@ -386,7 +386,7 @@ def test_limited_zeroes_what_is_not_finite(bad: float) -> None:
 def test_policies_are_found_by_name() -> None:
     assert "greedy" in POLICIES
     for name in POLICIES:
-        assert policy_description(name)
+        assert find_policy(name).description
         action = load_policy(name, 0.5).act(blank((10.0, 0.0)))
         assert action.forward_m_s > 0.0
 
@@ -397,7 +397,7 @@ def test_a_longer_hold_makes_greedy_slower_before_an_obstacle() -> None:
     assert slow.forward_m_s < quick.forward_m_s
 
 
-@pytest.mark.parametrize("find", [policy_description, lambda name: load_policy(name, 0.5)])
+@pytest.mark.parametrize("find", [find_policy, lambda name: load_policy(name, 0.5)])
 def test_an_unknown_policy_lists_those_that_exist(find) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(UsageError) as error:
         find("gredy")
