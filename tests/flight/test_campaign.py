@@ -123,7 +123,7 @@ def test_a_campaign_that_is_stopped_goes_on(tmp_path: Path, reference: Path, wor
 
 @pytest.mark.slow
 def test_a_campaign_that_is_killed_leaves_nobody_behind_and_goes_on(tmp_path: Path) -> None:
-    root, episodes = tmp_path / "root", 400
+    root, episodes = tmp_path / "root", 100
     words = ["-m", "tests.support.campaign_kit", f"{root}", f"{episodes}"]
     with running(words, tmp_path, path=ROOT) as parent:
 
