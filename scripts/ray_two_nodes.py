@@ -43,6 +43,7 @@ HEAD, NODE = "10.99.0.1", "10.99.0.2"
 PORT = 6399
 RAY = {
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
