@@ -24,7 +24,13 @@ from airl_mav.experiments.fly import (
     tell_end,
 )
 from airl_mav.experiments.run import Run
-from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
+from airl_mav.experiments.store import (
+    CampaignStore,
+    Declaration,
+    DeclaredCell,
+    DeclaredComparison,
+    open_campaign,
+)
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, ComparisonRecipe, Kind, RunEntry
@@ -60,6 +66,7 @@ class Experiment:
     def declaration(self) -> Declaration:
         """What the folder says of it."""
         shared = shared_flights(self.cells)
+        recipe = self.recipe(self.facts, [self.roles[cell.name] for cell in self.cells])
         return Declaration(
             kind=self.kind,
             settings={},
@@ -71,6 +78,10 @@ class Experiment:
                 )
                 for cell in self.cells
             },
+            comparisons=tuple(
+                DeclaredComparison(each.reference, each.target, each.title)
+                for each in recipe.contrasts
+            ),
         )
 
 

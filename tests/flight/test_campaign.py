@@ -18,9 +18,9 @@ from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, 
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
 from airl_mav.experiments.store import (
     CAMPAIGN_FILE,
-    Comparison,
     Declaration,
     DeclaredCell,
+    DeclaredComparison,
     load_campaign,
     open_campaign,
 )
@@ -196,7 +196,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
     tmp_path: Path,
 ) -> None:
     flown = cells()
-    asked = replace(declared(flown), comparisons=(Comparison("a", "b", "shorter hold"),))
+    asked = replace(declared(flown), comparisons=(DeclaredComparison("a", "b", "shorter hold"),))
     with open_campaign(tmp_path, asked, command="the first command") as store:
         held = load_campaign(tmp_path)
         assert held == store.campaign
@@ -274,4 +274,4 @@ def test_a_cell_is_named_as_a_folder_can_be(name: str) -> None:
 
 def test_only_declared_cells_are_compared() -> None:
     with pytest.raises(ValueError, match=r"comparison of 'b': accepted: a"):
-        Declaration("test", {}, {"a": DeclaredCell("")}, (Comparison("a", "b"),))
+        Declaration("test", {}, {"a": DeclaredCell("")}, (DeclaredComparison("a", "b"),))
