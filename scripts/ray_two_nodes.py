@@ -32,30 +32,18 @@ from rich.console import Console
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import ExecutorSettings, open_executor
-from airl_mav.experiments.lockstep_flier import LockstepFlier
-from airl_mav.flight.setup import Part, Setup
-from airl_mav.latency.injection import NOTHING_INJECTED
-from airl_mav.lockstep.flight import LockstepPlan
-from airl_mav.policy.actions import Policy
 from airl_mav.policy.card import read_card
-from airl_mav.policy.registry import load_policy
-from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.evaluation import Evaluation
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 from airl_mav.sweep.config import load_sweep
 from airl_mav.sweep.run import run_sweep
-from companion.pilot import PilotSettings
-from companion.watchdog import WatchdogSettings
-from firmware_sim.plant.wind import WindSettings
 
 ROOT = Path(__file__).resolve().parents[1]
-ARENA = POLICY = "static-obstacles"
-FIRST_SEED = 1
 HEAD, NODE = "10.99.0.1", "10.99.0.2"
 PORT = 6399
 RAY = {
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",
     "RAY_AUTH_MODE": "token",
     "RAY_AUTH_TOKEN": secrets.token_hex(32),
 }
@@ -79,39 +67,9 @@ class Command:
 # --- the work, wherever it is done
 
 
-def load(_hold_s: float) -> Callable[[int], Policy]:
-    policy = load_policy(POLICY, _hold_s)
-    return lambda _seed: policy
-
-
 def lockstep_cell(episodes: int) -> Cell:
-    plan = LockstepPlan(
-        vehicle=load_vehicle("quad"),
-        arena_name=ARENA,
-        arena=load_profile("arenas", ARENA, ArenaSpec),
-        wind=WindSettings(),
-        pilot=PilotSettings(goal_radius_m=2.4),
-        watchdog=WatchdogSettings(),
-        injection=NOTHING_INJECTED,
-        native_t2_us=1_000,
-        transport_us=5_000,
-        goal_radius_m=3.0,
-        time_limit_s=60.0,
-        computer_watts=0.0,
-    )
-    setup = Setup(
-        level="lockstep",
-        vehicle=Part("quad"),
-        arena=Part(ARENA),
-        policy=Part(POLICY),
-        computer=Part("workstation"),
-        computer_watts=0.0,
-        injection=NOTHING_INJECTED,
-        speed=None,
-        between_commands="persist",
-    )
-    evaluation = Evaluation(setup, tuple(range(FIRST_SEED, FIRST_SEED + episodes)), {})
-    return Cell("lockstep", "lockstep", evaluation, LockstepFlier(plan, partial(load, 0.5), False))
+    scenario = Scenario(level="lockstep", episodes=episodes, time_limit_s=60.0)
+    return Cell("lockstep", "lockstep", resolve(scenario))
 
 
 def work(what: str, out: Path, episodes: int, address: str | None) -> int:

@@ -18,7 +18,13 @@ from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_fligh
 from airl_mav.experiments.fly import executor_of, raise_unless_complete, shown
 from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.run import Run
-from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
+from airl_mav.experiments.store import (
+    CampaignStore,
+    Declaration,
+    DeclaredCell,
+    DeclaredComparison,
+    open_campaign,
+)
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, ComparisonRecipe, Kind, RunEntry
@@ -54,6 +60,7 @@ class Experiment:
     def declaration(self) -> Declaration:
         """What the folder says of it."""
         shared = shared_flights(self.cells)
+        recipe = self.recipe(self.facts, [self.roles[cell.name] for cell in self.cells])
         return Declaration(
             kind=self.kind,
             settings={},
@@ -65,6 +72,10 @@ class Experiment:
                 )
                 for cell in self.cells
             },
+            comparisons=tuple(
+                DeclaredComparison(each.reference, each.target, each.title)
+                for each in recipe.contrasts
+            ),
         )
 
 

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.experiments.executors import (
     ONE_THREAD,
     POLL_S,
@@ -132,13 +132,13 @@ def _check_reachable(address: str) -> None:
     """Raise UsageError unless something listens at HOST:PORT: Ray itself would wait minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) <= MAX_PORT:
-        raise UsageError(
-            f"ray_address = {address}: accepted: local, auto, HOST:PORT or ray://HOST:PORT"
-        )
+        accepted = "local, auto, HOST:PORT or ray://HOST:PORT"
+        raise FieldError("ray_address", address, accepted)
     try:
         socket.create_connection((host, int(port)), timeout=CONNECT_S).close()
     except OSError as error:
-        raise UsageError(f"ray_address = {address}: {error.strerror or error}") from None
+        problem = f"{error.strerror or error}"
+        raise FieldError("ray_address", address, problem=problem) from None
 
 
 @contextmanager
@@ -153,7 +153,7 @@ def connected(settings: ExecutorSettings, cores: int) -> Iterator[RayExecutor]:
         UsageError: Ray is not installed, or there is none at that address.
     """
     if find_spec("ray") is None:
-        raise UsageError("executor = ray: not installed: ray; pip install 'airl-mav[ray]'")
+        raise FieldError("executor", "ray", problem="not installed: pip install 'airl-mav[ray]'")
     address, local = settings.ray_address, settings.ray_address == LOCAL
     if address not in (LOCAL, AUTO):
         _check_reachable(address)
@@ -174,7 +174,7 @@ def connected(settings: ExecutorSettings, cores: int) -> Iterator[RayExecutor]:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **started)
     except (ConnectionError, RuntimeError, ValueError) as error:
         first = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise UsageError(f"ray_address = {address}: {first}") from None
+        raise FieldError("ray_address", address, problem=first) from None
     try:
         nodes = [node for node in ray.nodes() if node["Alive"]]
         there = sum(int(node["Resources"].get("CPU", 0)) for node in nodes)

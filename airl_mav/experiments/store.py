@@ -46,7 +46,7 @@ class DeclaredCell:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class DeclaredComparison:
     """Two cells that are compared flight by flight."""
 
     baseline: str
@@ -64,7 +64,7 @@ class Declaration:
     """What all cells have in common."""
     cells: dict[str, DeclaredCell]
     """By name: that of the cell's folder."""
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[DeclaredComparison, ...] = ()
 
     def __post_init__(self) -> None:
         """Raise ValueError for a name that cannot be a folder's, or a comparison of no cells."""

@@ -28,7 +28,7 @@ from airl_mav.report.theme import (
 )
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SWEEP_FILE, SweepFolder, as_data
-from airl_mav.sweep.summary import Cell, Computer, Sweep, estimated_ms, published_best
+from airl_mav.sweep.summary import Computer, NetworkSummary, Sweep, estimated_ms, published_best
 from airl_mav.sweep.trial import Trial, size_of, training_of, trials
 
 ASIDE = 1.03
@@ -157,7 +157,7 @@ def percent(share: float | None) -> str:
     return NONE if share is None else f"{100.0 * share:.1f}"
 
 
-def _interval(cell: Cell) -> str:
+def _interval(cell: NetworkSummary) -> str:
     rate = cell.success_rate
     return NONE if rate.low is None else f"{percent(rate.low)} … {percent(rate.high)}"
 
@@ -199,7 +199,7 @@ def networks_table(sweep: Sweep, arena: str) -> TableView:
     return TableView(f"networks-{arena}", title, columns, rows, tuple(notes))
 
 
-def _network_row(cell: Cell, timed: bool) -> tuple[str, ...]:
+def _network_row(cell: NetworkSummary, timed: bool) -> tuple[str, ...]:
     n = cell.success_rate.n
     return (
         cell.network,
@@ -319,7 +319,7 @@ def success_picture(sweep: Sweep, arena: str) -> Picture:
     return heat_picture(f"sweep-{arena}", alt, heat)
 
 
-def _success_text(cell: Cell) -> str:
+def _success_text(cell: NetworkSummary) -> str:
     text = percent(cell.success_rate.value)
     if cell.success_std is not None:
         text += f"\n± {percent(cell.success_std)}"
@@ -381,7 +381,7 @@ def _heat_map(
     )
 
 
-def _cost(sweep: Sweep, cell: Cell) -> float:
+def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
     return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
 
 
@@ -429,7 +429,7 @@ def trade_picture(sweep: Sweep) -> Picture:
 
 
 def _draw_network(
-    ax: Axes, cell: Cell, x: float, number: int, *, chosen: bool, label: str | None
+    ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
 ) -> None:
     """Draw one network of the arena with a number."""
     rate, colour = cell.success_rate, line_style(number).colour

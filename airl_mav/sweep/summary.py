@@ -30,7 +30,7 @@ class Computer:
 
 
 @dataclass(frozen=True)
-class Cell:
+class NetworkSummary:
     """One network in one arena, over its training seeds."""
 
     arena: str
@@ -62,17 +62,17 @@ class Cell:
         return f"{self.layers}x{self.filters}"
 
 
-_CELL = TypeAdapter(Cell)
+_NETWORK = TypeAdapter(NetworkSummary)
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """All cells of a sweep, as far as they are."""
+    """All networks of a sweep, as far as they are."""
 
     folder: SweepFolder
     made: dict[str, Any]
     computer: Computer | None
-    cells: tuple[Cell, ...]
+    cells: tuple[NetworkSummary, ...]
     """By arena, layers, filters."""
 
     @property
@@ -85,11 +85,11 @@ class Sweep:
         """Names of the arenas, in the order of the grids."""
         return tuple(grid.name for grid in self.config.grids)
 
-    def of(self, arena: str) -> tuple[Cell, ...]:
+    def of(self, arena: str) -> tuple[NetworkSummary, ...]:
         """Return the cells of an arena."""
         return tuple(cell for cell in self.cells if cell.arena == arena)
 
-    def best(self, arena: str) -> Cell | None:
+    def best(self, arena: str) -> NetworkSummary | None:
         """Return the cell with the greatest mean success; of equals the one with fewer MACs.
 
         None while no trial has ended.
@@ -97,7 +97,7 @@ class Sweep:
         known = [cell for cell in self.of(arena) if cell.results]
         return max(known, key=lambda cell: (_rate(cell), -cell.macs), default=None)
 
-    def rivals(self, arena: str) -> tuple[Cell, ...]:
+    def rivals(self, arena: str) -> tuple[NetworkSummary, ...]:
         """Return the other cells whose mean lies within the interval of the best one."""
         best = self.best(arena)
         if best is None or best.success_rate.low is None:
@@ -123,7 +123,7 @@ def published_best(arena: str) -> tuple[str, float] | None:
     return None if best is None else (best.network, best.success_percent / 100.0)
 
 
-def _rate(cell: Cell) -> float:
+def _rate(cell: NetworkSummary) -> float:
     value = cell.success_rate.value
     return -1.0 if value is None else value
 
@@ -157,16 +157,18 @@ def summarize(folder: SweepFolder, made: dict[str, Any], computer: Computer | No
     by_cell: dict[tuple[str, int, int], list[Trial]] = {}
     for trial in trials(folder.config):
         by_cell.setdefault((trial.arena, trial.layers, trial.filters), []).append(trial)
-    cells = tuple(_cell(folder, wanted, computer) for wanted in by_cell.values())
+    cells = tuple(_summarized(folder, wanted, computer) for wanted in by_cell.values())
     return Sweep(folder, made, computer, cells)
 
 
-def _cell(folder: SweepFolder, wanted: Sequence[Trial], computer: Computer | None) -> Cell:
+def _summarized(
+    folder: SweepFolder, wanted: Sequence[Trial], computer: Computer | None
+) -> NetworkSummary:
     first = wanted[0]
     size = size_of(folder.config, first)
     results = tuple(folder.results(wanted))
     rates = [result.success_rate for result in results]
-    return Cell(
+    return NetworkSummary(
         arena=first.arena_name,
         layers=first.layers,
         filters=first.filters,
@@ -216,7 +218,7 @@ def write_sweep(sweep: Sweep) -> None:
         "trials_planned": sweep.planned,
         "trials_ended": sweep.ended,
         "best": {arena: _best(sweep, arena) for arena in sweep.arenas},
-        "cells": [_cell_data(cell) for cell in sweep.cells],
+        "cells": [_network_data(cell) for cell in sweep.cells],
     }
     write_json(sweep.folder.path / SWEEP_FILE, data)
 
@@ -234,7 +236,7 @@ def _best(sweep: Sweep, arena: str) -> dict[str, Any] | None:
     }
 
 
-def _cell_data(cell: Cell) -> dict[str, Any]:
-    data: dict[str, Any] = _CELL.dump_python(cell, mode="json")
+def _network_data(cell: NetworkSummary) -> dict[str, Any]:
+    data: dict[str, Any] = _NETWORK.dump_python(cell, mode="json")
     data["trials"] = data.pop("results")
     return data

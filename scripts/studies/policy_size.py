@@ -20,15 +20,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
-from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from numpy.typing import NDArray
 from pydantic import Field
 from rich.console import Console
 from size_latency_fit import Fit, fit_times
 
+from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
@@ -69,24 +68,23 @@ class StudyConfig(ProfileModel):
     actions: ActionSpec = Field(default_factory=ActionSpec, description="what they choose among")
 
 
-@dataclass(frozen=True)
-class Command:
+class StudyOptions(ProfileModel):
     """Time the template grid on this machine."""
 
-    config: Path | None = None
-    """Which networks, on which image. None: policy_size.toml beside this script."""
+    config: Path = Field(default=DEFAULT, description="which networks, on which image")
+    runs: int | None = quantity(
+        "inferences of each network, by default the configuration's; a p99 needs 662",
+        "1",
+        ge=1,
+        le=1_000_000,
+        default=None,
+    )
+    quick: bool = Field(default=False, description="70 inferences each")
+    threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
+    out: Path = Field(default=Path("runs/policy-size"), description="folder of the results")
 
-    runs: int | None = None
-    """Inferences of each network, >= 1. None: the configuration's. A p99 needs 662."""
 
-    quick: bool = False
-    """70 inferences each."""
-
-    threads: int = 1
-    """Threads of one inference, 1 to 64."""
-
-    out: Path = Path("runs/policy-size")
-    """Folder of the results."""
+OPTIONS = StudyOptions
 
 
 @dataclass(frozen=True)
@@ -120,34 +118,26 @@ class Timed:
         return self.processor_p50_ms / (self.macs / 1e9)
 
 
-def main() -> None:
-    command = tyro.cli(Command, description=__doc__)
-    run_command(lambda: checked(command, Console()))
-
-
-def checked(command: Command, console: Console) -> int:
-    check_range("--threads", command.threads, 1, 64)
-    if command.runs is not None:
-        check_range("--runs", command.runs, 1, 1_000_000)
-    config = load_profile("sweeps", f"{command.config or DEFAULT}", StudyConfig)
+def run(options: StudyOptions, console: Console | None = None) -> int:
+    console = console or Console()
     try:
-        study(command, config, console)
+        study(options, load_profile("sweeps", f"{options.config}", StudyConfig), console)
     except KeyboardInterrupt:
-        console.print(f"interrupted: the same command with --out {command.out} goes on")
+        console.print(f"interrupted: the same command with --out {options.out} goes on")
         return EXIT_INTERRUPTED
     return 0
 
 
-def study(command: Command, config: StudyConfig, console: Console) -> None:
-    runs = QUICK_RUNS if command.quick else command.runs or config.runs
-    cells = command.out / "cells"
+def study(options: StudyOptions, config: StudyConfig, console: Console) -> None:
+    runs = QUICK_RUNS if options.quick else options.runs or config.runs
+    cells = options.out / "cells"
     cells.mkdir(parents=True, exist_ok=True)
     # Small ones first: something is there early, and what takes long comes last.
     grid = sorted(
         ((layers, filters) for layers in config.layers for filters in config.filters),
         key=lambda cell: size_of(config, *cell).macs,
     )
-    done = {cell: read(cells, cell, config, command.threads) for cell in grid}
+    done = {cell: read(cells, cell, config, options.threads) for cell in grid}
     work = {cell: size_of(config, *cell).macs * runs for cell in grid}
     with RichProgress(console) as progress:
         bar = progress.bar("networks", sum(work.values()))
@@ -155,18 +145,18 @@ def study(command: Command, config: StudyConfig, console: Console) -> None:
             bar.update(postfix=f"{cell[0]}x{cell[1]}")
             held = done[cell]
             if held is None or held.runs < runs:
-                timed = time_network(config, *cell, runs, command.threads)
+                timed = time_network(config, *cell, runs, options.threads)
                 write(cells / f"{timed.network}.json", asdict(timed) | shared(config))
                 done[cell] = timed
                 progress.note(told(timed))
-                conclude(command.out, config, [t for t in done.values() if t is not None])
+                conclude(options.out, config, [t for t in done.values() if t is not None])
             bar.advance(work[cell])
     everything = [timed for timed in done.values() if timed is not None]
-    conclude(command.out, config, everything)
+    conclude(options.out, config, everything)
     print_table(table(everything), console, wrap=True)
     for line in words(everything):
         console.print(line, highlight=False)
-    console.print(f"figure  {command.out / 'policy-size.png'}", highlight=False)
+    console.print(f"figure  {options.out / 'policy-size.png'}", highlight=False)
 
 
 # --- one network
@@ -384,4 +374,4 @@ def heat_map(config: StudyConfig, timed: list[Timed], key: str, title: str) -> H
 
 
 if __name__ == "__main__":
-    main()
+    run_command("policy_size.py", __name__)

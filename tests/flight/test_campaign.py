@@ -13,20 +13,20 @@ import pytest
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import SilentProgress
+from airl_mav.experiments import campaign
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
 from airl_mav.experiments.store import (
     CAMPAIGN_FILE,
-    Comparison,
     Declaration,
     DeclaredCell,
+    DeclaredComparison,
     load_campaign,
     open_campaign,
 )
 from airl_mav.rehearsal import lock
-from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
-from tests.flight.test_evaluate import same_runs
-from tests.support.campaign_kit import cells, declared, gym_cell
+from airl_mav.rehearsal.run_folder import FlownEpisode, load
+from tests.support.campaign_kit import cells, declared, gym_cell, same_runs
 from tests.support.processes import ROOT, is_running, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
@@ -123,7 +123,7 @@ def test_a_campaign_that_is_stopped_goes_on(tmp_path: Path, reference: Path, wor
 
 @pytest.mark.slow
 def test_a_campaign_that_is_killed_leaves_nobody_behind_and_goes_on(tmp_path: Path) -> None:
-    root, episodes = tmp_path / "root", 400
+    root, episodes = tmp_path / "root", 100
     words = ["-m", "tests.support.campaign_kit", f"{root}", f"{episodes}"]
     with running(words, tmp_path, path=ROOT) as parent:
 
@@ -156,19 +156,17 @@ def children(parent: int) -> list[int]:
     return found
 
 
-def paper(run: LoadedRun, cell: Cell, deadly: int, per_job: int) -> Cell:
-    flown = {
-        e.index: FlownEpisode(e, run.trajectories[e.index], run.latency[e.index])
-        for e in run.episodes
-    }
-    return replace(cell, flier=PaperFlier(flown, deadly, per_job))
-
-
 def test_a_job_that_loses_its_workers_ends_the_campaign_with_one_line(
-    tmp_path: Path, reference: Path
+    tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = load(reference / "a")
-    broken = [paper(whole, cells()[0], 8, 2), cells()[1]]
+    broken = cells()
+    episodes = {
+        e.index: FlownEpisode(e, whole.trajectories[e.index], whole.latency[e.index])
+        for e in whole.episodes
+    }
+    flier = PaperFlier(episodes, deadly=8, per_job=2)
+    monkeypatch.setitem(campaign.FLIERS, "gym", lambda _: flier)
     with open_executor(ExecutorSettings(workers=1)) as executor:
         notes = Notes()
         with open_campaign(tmp_path, declared(broken), command="a test") as store:
@@ -198,7 +196,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
     tmp_path: Path,
 ) -> None:
     flown = cells()
-    asked = replace(declared(flown), comparisons=(Comparison("a", "b", "shorter hold"),))
+    asked = replace(declared(flown), comparisons=(DeclaredComparison("a", "b", "shorter hold"),))
     with open_campaign(tmp_path, asked, command="the first command") as store:
         held = load_campaign(tmp_path)
         assert held == store.campaign
@@ -216,7 +214,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
         ({"kind": "gap"}, "kind = 'test', not 'gap'"),
         ({"settings": {"policy": "other"}}, "policy = 'greedy', not 'other'"),
         (
-            {"cells": {"a": DeclaredCell("the cell a", {"hold_s": 0.7})}},
+            {"cells": {"a": declared([gym_cell("a", hold_s=0.7)]).cells["a"]}},
             "another cell a: hold_s = 0.5, not 0.7",
         ),
     ],
@@ -276,4 +274,4 @@ def test_a_cell_is_named_as_a_folder_can_be(name: str) -> None:
 
 def test_only_declared_cells_are_compared() -> None:
     with pytest.raises(ValueError, match=r"comparison of 'b': accepted: a"):
-        Declaration("test", {}, {"a": DeclaredCell("")}, (Comparison("a", "b"),))
+        Declaration("test", {}, {"a": DeclaredCell("")}, (DeclaredComparison("a", "b"),))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ from matplotlib.colors import to_rgb
 from rich.console import Console
 from scipy import stats
 
-from airl_mav.cli.sweep import SweepCommand, run
+from airl_mav.cli.sweep import SweepOptions, run
 from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.core.provenance import provenance
 from airl_mav.experiments.store import load_campaign, open_campaign
 from airl_mav.policy.action_sets import ActionSpec
@@ -118,13 +118,13 @@ def test_a_wrong_sweep_gets_one_line(tmp_path: Path, old: str, new: str, message
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"workers": 0}, "workers = 0: accepted: 1 <= value <= 256"),
-        ({"seeds": 0}, "--seeds 0"),
-        ({"episodes": 0}, "evaluation.episodes = 0: accepted: 1 <= value"),
-        ({"steps": 0}, "training.steps = 0: accepted: 1 <= value"),
+        ({"workers": 0}, "workers 0: accepted: 1 <= value <= 256"),
+        ({"seeds": 0}, "seeds 0: accepted: 1 <= value <= 1000"),
+        ({"episodes": 0}, "evaluation.episodes 0: accepted: 1 <= value"),
+        ({"steps": 0}, "training.steps 0: accepted: 1 <= value"),
         ({"seed": 499_999}, "evaluation: seed . episodes = 500019: accepted: <= 500000"),
-        ({"ray_gpus": 1.0}, "--ray-gpus 1: accepted: with --executor ray"),
-        ({"ray_gpus": 9.0, "executor": "ray"}, "ray_gpus = 9.0: accepted: 0 <= value <= 8"),
+        ({"ray_gpus": 1.0}, "ray_gpus 1: accepted: with executor ray"),
+        ({"ray_gpus": 9.0, "executor": "ray"}, "ray_gpus 9: accepted: 0 <= value <= 8"),
         ({"computer": "bare.toml"}, "no workload to estimate from"),
         ({"computer": "nowhere"}, "no computer profile 'nowhere'"),
         ({"sweep": "huge"}, "no sweep profile 'huge'; shipped: full, paper, quick, tiny"),
@@ -135,18 +135,18 @@ def test_a_wrong_option_gets_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bare.toml").write_text(BARE, encoding="utf-8")
-    command = replace(SweepCommand(sweep="tiny", out=tmp_path / "out", dry_run=True), **changes)
+    asked = {"sweep": "tiny", "out": tmp_path / "out", "dry_run": True} | changes
     with pytest.raises(UsageError, match=message):
-        run(command, Console(quiet=True))
+        run(validated(SweepOptions, asked), Console(quiet=True))
 
 
 def test_a_dry_run_says_all_and_leaves_nothing(tmp_path: Path) -> None:
     console = Console(width=120, record=True, file=None, quiet=False)
     with console.capture() as told:
-        command = SweepCommand(
+        options = SweepOptions(
             sweep="full", out=tmp_path / "out", computer="ras-pi-4", dry_run=True
         )
-        assert run(command, console) == 0
+        assert run(options, console) == 0
     text = told.get()
     assert "225, of which 0 have ended" in text
     assert "200,000 each, 45,000,000 in all" in text
@@ -294,7 +294,7 @@ def test_a_result_is_read_as_it_was_written_and_no_other_is_taken(tmp_path: Path
     with pytest.raises(UsageError, match="of another trial or of other flights"):
         folder.result(second)
     (path / "result.json").write_text(text[: len(text) // 2])
-    with pytest.raises(UsageError, match="not JSON"):
+    with pytest.raises(UsageError, match="JSON"):
         folder.result(first)
 
 

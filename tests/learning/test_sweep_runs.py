@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from airl_mav.cli.common import EXIT_INTERRUPTED
 
+from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.policy.card import read_card
 from airl_mav.policy.template import Size
 from airl_mav.sweep.config import load_sweep

@@ -3,57 +3,60 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 
-from airl_mav.envs.evaluation import Pilots, SinglePilots
-from airl_mav.envs.spec import spec_of
+import numpy as np
+
 from airl_mav.experiments.campaign import Cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, open_executor
-from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.experiments.store import Declaration, DeclaredCell, open_campaign
-from airl_mav.flight.setup import Part, Setup
-from airl_mav.latency.injection import NOTHING_INJECTED
-from airl_mav.policy.registry import load_policy
-from airl_mav.rehearsal.evaluation import Evaluation
+from airl_mav.rehearsal.run_folder import Arrays, LoadedRun
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 
 SEED = 5
 
 
-def greedy_pilots(hold_s: float) -> Pilots:
-    return SinglePilots(partial(load_policy, "greedy", hold_s), 5.0)
-
-
-def gym_cell(name: str, *, episodes: int = 8, seed: int = SEED, hold_s: float = 0.5) -> Cell:
-    environment = spec_of(
-        None, {"arena": "no-obstacles", "episode": {"hold_s": hold_s, "time_limit_s": 30.0}}
-    )
-    setup = Setup(
+def gym_cell(name: str, *, episodes: int = 8, hold_s: float = 0.5) -> Cell:
+    scenario = Scenario(
         level="gym",
-        vehicle=Part("quad"),
-        arena=Part("no-obstacles"),
-        policy=Part("greedy"),
-        computer=Part("workstation"),
-        computer_watts=0.0,
-        injection=NOTHING_INJECTED,
-        speed=None,
-        between_commands="persist",
+        policy="greedy",
+        arena="no-obstacles",
+        episodes=episodes,
+        seed=SEED,
+        hold_s=hold_s,
+        time_limit_s=30.0,
+        slots=2,
     )
-    flier = GymFlier(environment, NOTHING_INJECTED, 0.0, partial(greedy_pilots, hold_s), slots=2)
-    evaluation = Evaluation(setup, tuple(range(seed, seed + episodes)), {"hold_s": hold_s})
-    return Cell(name, f"the cell {name}", evaluation, flier)
+    return Cell(name, f"the cell {name}", resolve(scenario))
 
 
 def declared(cells: list[Cell], kind: str = "test") -> Declaration:
     return Declaration(
         kind,
         {"policy": "greedy"},
-        {cell.name: DeclaredCell(cell.title, dict(cell.evaluation.config)) for cell in cells},
+        {cell.name: DeclaredCell(cell.title, cell.scenario.config) for cell in cells},
     )
 
 
 def cells(episodes: int = 8) -> list[Cell]:
     return [gym_cell("a", episodes=episodes), gym_cell("b", episodes=episodes, hold_s=0.3)]
+
+
+def same_runs(one: LoadedRun, other: LoadedRun) -> bool:
+    """Return whether two runs hold the same episodes, to the last bit."""
+
+    def equal(mine: Mapping[int, Arrays], theirs: Mapping[int, Arrays]) -> bool:
+        return mine.keys() == theirs.keys() and all(
+            np.array_equal(array, theirs[i][name])
+            for i, arrays in mine.items()
+            for name, array in arrays.items()
+        )
+
+    paths = [{i: path.arrays() for i, path in run.trajectories.items()} for run in (one, other)]
+    same_paths, same_stamps = equal(*paths), equal(one.latency, other.latency)
+    return one.episodes == other.episodes and same_paths and same_stamps
 
 
 def main(path: Path, episodes: int) -> None:

@@ -270,7 +270,7 @@ def test_the_job_of_a_lost_worker_of_ray_begins_again_twice(
 @NEEDS_RAY
 @pytest.mark.parametrize(
     ("address", "message"),
-    [("127.0.0.1:9", "ray_address = 127.0.0.1:9: "), ("nowhere", "accepted: local, auto, ")],
+    [("127.0.0.1:9", "ray_address '127.0.0.1:9': "), ("nowhere", "accepted: local, auto, ")],
 )
 def test_ray_where_there_is_none_is_told_in_one_line(address: str, message: str) -> None:
     settings = ExecutorSettings(executor="ray", ray_address=address)
@@ -281,7 +281,9 @@ def test_ray_where_there_is_none_is_told_in_one_line(address: str, message: str)
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("airl_mav.experiments.ray_executor.find_spec", lambda _: None)
     with (
-        pytest.raises(UsageError, match=r"not installed: ray; pip install 'airl-mav\[ray\]'"),
+        pytest.raises(
+            UsageError, match=r"executor 'ray': not installed: pip install 'airl-mav\[ray\]'"
+        ),
         open_executor(ExecutorSettings(executor="ray")),
     ):
         pass
