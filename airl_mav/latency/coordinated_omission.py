@@ -63,13 +63,6 @@ class CommandAges:
         a, b = self.youngest_us.astype(np.float64), self.oldest_us.astype(np.float64)
         return float(((b * b - a * a) / 2.0).sum() / (b - a).sum())
 
-    def share_older(self, age_us: float) -> float | None:
-        """Return the share of the time that the command was older than an age [µs]."""
-        if not self.time_us:
-            return None
-        older = np.clip(self.oldest_us - np.maximum(self.youngest_us, age_us), 0.0, None)
-        return float(older.sum() / self.time_us)
-
     def percentile(self, p: float) -> float | None:
         """Return the age [µs] that the command did not exceed for p percent of the time.
 
@@ -103,21 +96,21 @@ class CommandAges:
 
 
 def command_ages(
-    seen_us: ArrayLike, flown_us: ArrayLike, flight: ArrayLike | None = None
+    exposed_us: ArrayLike, flown_us: ArrayLike, flight: ArrayLike | None = None
 ) -> CommandAges:
     """Return how old the commands of flights were while they were flown.
 
     Args:
-        seen_us: (n,) when what each command rests on was seen [µs].
+        exposed_us: (n,) when the image that each command rests on was exposed [µs].
         flown_us: (n,) when each took effect [µs], increasing within a flight.
         flight: (n,) number of the flight of each; None: all of one. The last command of a flight is
             left out: nothing says how long it was flown.
     """
-    seen, flown = np.asarray(seen_us, np.int64), np.asarray(flown_us, np.int64)
-    flights = np.zeros(seen.size, np.int64) if flight is None else np.asarray(flight, np.int64)
+    exposed, flown = np.asarray(exposed_us, np.int64), np.asarray(flown_us, np.int64)
+    flights = np.zeros(exposed.size, np.int64) if flight is None else np.asarray(flight, np.int64)
     same = flights[1:] == flights[:-1]
     return CommandAges(
-        youngest_us=(flown - seen)[:-1][same], oldest_us=(flown[1:] - seen[:-1])[same]
+        youngest_us=(flown - exposed)[:-1][same], oldest_us=(flown[1:] - exposed[:-1])[same]
     )
 
 
