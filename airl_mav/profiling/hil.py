@@ -17,9 +17,9 @@ from airl_mav.latency.stamps import STAMPS
 from airl_mav.policy.actions import Action, Policy
 from airl_mav.policy.observation import Observation
 from airl_mav.profiling.bare import cold_start
-from airl_mav.profiling.measurement import FLOWN_SPEED_M_S, ProfilingError, Recording, Stamps
+from airl_mav.profiling.measurement import ProfilingError, Recording, Stamps
 from airl_mav.profiling.policy_under_test import PolicyUnderTest
-from airl_mav.profiling.request import ProfileRequest
+from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import open_camera
@@ -124,16 +124,10 @@ def _fly(
     """Fly until there are enough decisions, or until `stop`. Raises UsageError, LinkError."""
     asked = StandAloneCompanion(
         policy=policy.name,
-        runtime=request.runtime,
-        threads=request.threads,
-        trust=request.trust,
         goal=GOAL,
-        hold_s=request.hold_s,
-        goal_radius_m=0.5,
-        max_speed_m_s=FLOWN_SPEED_M_S,
         connect=request.connect,
         camera=request.camera,
-        seed=request.seed,
+        **request.flown_as,
     )
     mission = prepare(asked)
     decisions = request.warm_up + request.decisions

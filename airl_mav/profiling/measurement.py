@@ -33,9 +33,6 @@ from airl_mav.profiling.request import ProfileRequest
 SCHEMA = 1
 """Version of the facts beside the samples."""
 
-FLOWN_SPEED_M_S = 0.1
-"""Speed limit in flight: far below what a goal or a wall could be reached with."""
-
 ROUND_TRIP = "mavlink_round_trip"
 """Key of the TIMESYNC exchanges in flight."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -12,6 +12,9 @@ from airl_mav.scenario.stand_alone import CompanionAddresses
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 """Names that become names of files."""
+
+FLOWN_SPEED_M_S = 0.1
+"""Speed limit in flight: far below what a goal or a wall could be reached with."""
 
 ProfileLevel = Literal["bare", "sitl", "hil"]
 
@@ -101,3 +104,10 @@ class ProfileRequest(CompanionAddresses, Inference):
         " by default the first shipped one whose camera fits",
     )
     ports: Ports = Field(default_factory=Ports, description="ports of level sitl")
+
+    @property
+    def flown_as(self) -> dict[str, Any]:
+        """How the policy is flown at levels sitl and hil, as fields of a scenario."""
+        shared = {*Inference.model_fields, "hold_s", "seed"}
+        limits = {"goal_radius_m": 0.5, "max_speed_m_s": FLOWN_SPEED_M_S}
+        return {**self.model_dump(include=shared), **limits}

@@ -12,11 +12,10 @@ import numpy as np
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Bar, SilentProgress
 from airl_mav.latency.stamps import STAMPS
-from airl_mav.profiles.arena import ArenaSpec, Goal, Size, Start
 from airl_mav.profiling.bare import cold_start
-from airl_mav.profiling.measurement import FLOWN_SPEED_M_S, ProfilingError, Recording, Stamps
+from airl_mav.profiling.measurement import ProfilingError, Recording, Stamps
 from airl_mav.profiling.policy_under_test import PolicyUnderTest
-from airl_mav.profiling.request import ProfileRequest
+from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.rehearsal.channel import State
 from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
@@ -27,18 +26,10 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 
 LONGEST_FLIGHT_S = 300.0
-"""Well within a battery."""
+"""Well within a battery, and at walking pace far from every wall."""
 
 MARGIN = 1.1
 """A flight's time limit over the time that its decisions are expected to take."""
-
-OPEN_FIELD = ArenaSpec(
-    description="nothing within 200 m",
-    size=Size(north_m=500.0, east_m=500.0),
-    start=Start(north_m=250.0, east_m=250.0),
-    goal=Goal(north_m=240.0, east_m=0.0),
-)
-"""Neither a wall nor the goal is ever reached."""
 
 COLUMNS = (*STAMPS, "accepted_us", "motor_us")
 
@@ -71,27 +62,17 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
         UsageError: It cannot be flown as asked.
         ProfilingError: A process was lost too often, or the flights are too short.
     """
-    load_us, first_us, later_us = cold_start(
-        request, policy
-    )  # before the network is opened for anything else
-    # Resolved once, in an arena that exists under a name; flown over the open field.
-    scenario = replace(
-        resolve(
-            Scenario(
-                vehicle=policy.vehicle,
-                policy=policy.name,
-                runtime=request.runtime,
-                threads=request.threads,
-                trust=request.trust,
-                episodes=1,
-                seed=request.seed,
-                goal_radius_m=0.5,
-                hold_s=request.hold_s,
-                max_speed_m_s=FLOWN_SPEED_M_S,
-                ports=request.ports,
-            )
-        ),
-        arena=OPEN_FIELD,
+    # Before the network is opened for anything else.
+    load_us, first_us, later_us = cold_start(request, policy)
+    scenario = resolve(
+        Scenario(
+            vehicle=policy.vehicle,
+            arena="open-field",
+            policy=policy.name,
+            episodes=1,
+            ports=request.ports,
+            **request.flown_as,
+        )
     )
     # A hold shorter than a frame's interval waits for the next frame.
     frame_s = 1.0 / scenario.vehicle.camera.rate_hz

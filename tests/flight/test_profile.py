@@ -435,17 +435,17 @@ def test_frames_of_yet_another_clock() -> None:
 
 FIRMWARE_THAT_TELLS_ITS_EPOCH = """
 import sys
-import airl_mav.cli.firmware as cli
 from airl_mav.cli.options import run_command
+from airl_mav.rehearsal import stand_alone
 
-fly = cli.fly
+fly = stand_alone.fly
 
 def told(firmware, *rest):
     fly(firmware, *rest)
     print("epoch_ns", firmware.epoch_ns, flush=True)
     print("slipped_us", firmware.slipped_us, flush=True)
 
-cli.fly = told
+stand_alone.fly = told
 run_command("airl-firmware", "airl_mav.cli.firmware")
 """
 
