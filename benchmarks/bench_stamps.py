@@ -27,13 +27,15 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.camera.frame import Frame
-from airl_mav.cli import profile_bare, profile_hil
-from airl_mav.cli.profile_command import ProfileCommand
-from airl_mav.cli.profile_plan import ProfilePlan, planned
 from airl_mav.core.clock import WallClock
+from airl_mav.core.progress import SilentProgress
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
+from airl_mav.profiling import hil
+from airl_mav.profiling.bare import BareLoop
+from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
+from airl_mav.profiling.request import ProfileRequest
 from companion import pilot
 
 CALLS, REPEATS = 10_000, 50
@@ -41,8 +43,10 @@ FLIGHTS, DECISIONS, WARM_UP = 3, 200, 20
 STAMP_LIMIT_US, CHANGE_LIMIT = 0.5, 0.01
 
 NETWORKS = {
-    "milliseconds": ProfileCommand(network="3x32", image="64x48"),
-    "shipped policy": ProfileCommand(),
+    "milliseconds": ProfileRequest(
+        level="hil", network="3x32", image="64x48", decisions=DECISIONS, warm_up=WARM_UP
+    ),
+    "shipped policy": ProfileRequest(level="hil", decisions=DECISIONS, warm_up=WARM_UP),
 }
 
 
@@ -113,25 +117,23 @@ def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
             process.wait(20)
 
 
-def flown(plan: ProfilePlan) -> Flight:
+def flown(request: ProfileRequest, policy: PolicyUnderTest) -> Flight:
     """Fly, and pair each t2 with the work inside it."""
     with Watch() as watch:
-        (stamps,) = profile_hil.measure(plan, lambda _: None).flights
+        (stamps,) = hil.measure(request, policy, SilentProgress()).flights
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     inside_us = np.array(watch.took_ns[WARM_UP : WARM_UP + len(t2_us)]) / 1e3
     return Flight(t2_us - inside_us, inside_us)
 
 
-def alone(plan: ProfilePlan) -> float:
+def alone(request: ProfileRequest, policy: PolicyUnderTest) -> float:
     """Return the median of the same decisions without a flight, with the same pauses [µs]."""
-    policy, _ = profile_bare.opened(plan, WallClock())
-    views, times = profile_bare.seen_by(plan), []
-    for k in range(WARM_UP + DECISIONS):
-        time.sleep(plan.hold_s)
-        start = time.perf_counter_ns()
-        profile_bare.decide(plan, policy, views[k % len(views)])
-        times.append(time.perf_counter_ns() - start)
-    return float(np.median(times[WARM_UP:])) / 1e3
+    loop, times = BareLoop(request, policy), []
+    for _ in range(WARM_UP + DECISIONS):
+        time.sleep(request.hold_s)
+        start_us, end_us = loop.decide()
+        times.append(end_us - start_us)
+    return float(np.median(times[WARM_UP:]))
 
 
 def main() -> None:
@@ -156,21 +158,15 @@ def main() -> None:
         title=f"t2 in flight, {DECISIONS} decisions a flight (medians)",
     )
     shares = []
-    for name, command in NETWORKS.items():
-        options = {**vars(command), "decisions": DECISIONS, "warm_up": WARM_UP, "on": "bench"}
-        with TemporaryDirectory() as scratch:
-            # Nothing is written there: the folder only has to be a new one.
-            bare = ProfileCommand(**{**options, "out": Path(scratch)})
-            with planned(bare) as first:
-                vehicle = first.vehicle
+    for name, request in NETWORKS.items():
+        with TemporaryDirectory() as scratch, open_policy(request) as policy:
             before: float | None = None
             for k in range(FLIGHTS):
-                with firmware(vehicle, Path(scratch)) as (connect, camera):
-                    asked = {**vars(bare), "level": "hil", "connect": connect, "camera": camera}
-                    with planned(ProfileCommand(**asked)) as plan:
-                        before = alone(plan) if before is None else before
-                        flight = flown(plan)
-                        after = alone(plan)
+                with firmware(policy.vehicle, Path(scratch)) as (connect, camera):
+                    addresses = {"connect": connect, "camera": camera}
+                    before = alone(request, policy) if before is None else before
+                    flight = flown(request.model_copy(update=addresses), policy)
+                    after = alone(request, policy)
                 added = float(np.median(flight.added_us))
                 inside = float(np.median(flight.inside_us))
                 share = float(np.median(flight.added_us / flight.inside_us))

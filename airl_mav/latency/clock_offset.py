@@ -1,8 +1,8 @@
 """How two clocks relate, from exchanges in which one asks and the other answers with its time.
 
-An answer was stamped somewhere between asking and hearing it. So an exchange tells the offset up to
-half its round trip, however unequal the two ways are (F. Cristian, "Probabilistic clock
-synchronization", Distributed Computing 3, 1989), and the one with the least round trip tells most
+An answer was stamped somewhere between question and reception. So an exchange gives the offset up
+to half its round trip, however unequal the two ways are (F. Cristian, "Probabilistic clock
+synchronization", Distributed Computing 3, 1989), and the one with the least round trip is the best
 (the clock filter of NTP, RFC 5905, section 10). A line through the best exchange before and the
 best one after gives the drift; the exchanges in between check it.
 """
@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from airl_mav.core.constants import US_PER_MS
 
 RESOLUTION_US = 1.0
-"""Both clocks tell whole microseconds, cut off [µs]."""
+"""Both clocks give whole microseconds, rounded down [µs]."""
 
 GREATEST_DRIFT = 1e-3
-"""Rate at which two clocks of real time may part, seconds a second: Linux corrects a clock by up to
-500 ppm (adjtimex), and both may be corrected."""
+"""Greatest relative rate of two clocks of real time, seconds a second: Linux corrects a clock by up
+to 500 ppm (adjtimex), and both may be corrected."""
 
 LEAST_EXCHANGES = 8
 """Fewest answers before, in between and after: the stages of NTP's clock filter."""
@@ -44,7 +44,7 @@ class Exchanges:
     remote_us: NDArray[np.int64]
     """Answered, by the other clock."""
     received_us: NDArray[np.int64]
-    """Answer heard, by the own clock."""
+    """Answer received, by the own clock."""
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -52,12 +52,12 @@ class Exchanges:
 
     @property
     def round_trip_us(self) -> NDArray[np.int64]:
-        """(n,) from asking to hearing [µs]."""
+        """(n,) from question to answer [µs]."""
         return self.received_us - self.sent_us
 
     @property
     def middle_us(self) -> NDArray[np.float64]:
-        """(n,) middle between asking and hearing, by the own clock [µs]."""
+        """(n,) middle between question and answer, by the own clock [µs]."""
         return self.sent_us + self.round_trip_us / 2.0
 
     @property
@@ -106,7 +106,7 @@ def best_reading(exchanges: Exchanges) -> Reading:
 
 @dataclass(frozen=True)
 class ClockRelation:
-    """The other clock as a line over the own one."""
+    """The offset of the other clock as a line over the own one."""
 
     before: Reading
     after: Reading
@@ -140,7 +140,7 @@ class ClockRelation:
         return np.asarray(np.abs(1.0 - share) * a + np.abs(share) * b)
 
     def own_time(self, remote_us: ArrayLike) -> NDArray[np.float64]:
-        """Return by the own clock times told by the other one [µs]."""
+        """Return times of the other clock [µs] by the own one [µs]."""
         # remote = own + before.offset + drift (own - before.at), solved for own.
         remote_before = self.before.at_us + self.before.offset_us
         told = np.asarray(remote_us, np.float64) - remote_before
@@ -152,7 +152,7 @@ def relate(before: Exchanges, between: Exchanges, after: Exchanges) -> ClockRela
 
     Raises:
         ClockError: There are too few answers, the clocks do not run at the same rate, or the line
-            contradicts what was heard in between.
+            contradicts the exchanges in between.
     """
     first, last = best_reading(before), best_reading(after)
     if len(between) < LEAST_EXCHANGES:

@@ -96,21 +96,21 @@ class CommandAges:
 
 
 def command_ages(
-    seen_us: ArrayLike, flown_us: ArrayLike, flight: ArrayLike | None = None
+    exposed_us: ArrayLike, flown_us: ArrayLike, flight: ArrayLike | None = None
 ) -> CommandAges:
     """Return how old the commands of flights were while they were flown.
 
     Args:
-        seen_us: (n,) when what each command rests on was seen [µs].
+        exposed_us: (n,) when the image that each command rests on was exposed [µs].
         flown_us: (n,) when each took effect [µs], increasing within a flight.
         flight: (n,) number of the flight of each; None: all of one. The last command of a flight is
             left out: nothing says how long it was flown.
     """
-    seen, flown = np.asarray(seen_us, np.int64), np.asarray(flown_us, np.int64)
-    flights = np.zeros(seen.size, np.int64) if flight is None else np.asarray(flight, np.int64)
+    exposed, flown = np.asarray(exposed_us, np.int64), np.asarray(flown_us, np.int64)
+    flights = np.zeros(exposed.size, np.int64) if flight is None else np.asarray(flight, np.int64)
     same = flights[1:] == flights[:-1]
     return CommandAges(
-        youngest_us=(flown - seen)[:-1][same], oldest_us=(flown[1:] - seen[:-1])[same]
+        youngest_us=(flown - exposed)[:-1][same], oldest_us=(flown[1:] - exposed[:-1])[same]
     )
 
 

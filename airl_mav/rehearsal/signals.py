@@ -23,7 +23,7 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         seen.append(number)
 
-    with _handled(note, signal.SIGINT, signal.SIGTERM):
+    with signal_handlers(note, signal.SIGINT, signal.SIGTERM):
         yield lambda: bool(seen)
 
 
@@ -34,12 +34,13 @@ def terminated_as_interrupted() -> Iterator[None]:
     def interrupt(*_: object) -> NoReturn:
         raise KeyboardInterrupt
 
-    with _handled(interrupt, signal.SIGTERM):
+    with signal_handlers(interrupt, signal.SIGTERM):
         yield
 
 
 @contextmanager
-def _handled(handler: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
+def signal_handlers(handler: Callable[[int, object], None], *numbers: int) -> Iterator[None]:
+    """Handle signals for a while; does nothing outside the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

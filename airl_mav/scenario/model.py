@@ -202,8 +202,8 @@ class Aircraft(ProfileModel):
         return self.ports.api_port + moved
 
 
-class Decisions(ProfileModel):
-    """Who decides, and how its actions are flown."""
+class Inference(ProfileModel):
+    """What runs a policy's network."""
 
     runtime: RuntimeName = Field(
         default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
@@ -215,6 +215,11 @@ class Decisions(ProfileModel):
         " that"
         " its author wrote",
     )
+
+
+class Decisions(Inference):
+    """Who decides, and how its actions are flown."""
+
     cpu_quota: float | None = quantity(
         "hold the companion to this share of one core, for real, by a Linux control group; what it"
         " then takes is measured, nothing is injected",

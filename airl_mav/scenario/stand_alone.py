@@ -9,7 +9,7 @@ from pydantic import Field
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import quantity
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.scenario.checks import check_firmware, check_ports
 from airl_mav.scenario.model import (
@@ -127,7 +127,20 @@ class StandAloneVehicle(Aircraft):
         return self.speed if isinstance(self.speed, float) else None
 
 
-class StandAloneCompanion(Lateness, Decisions):
+class CompanionAddresses(ProfileModel):
+    """Where a companion by itself finds the flight controller and the camera."""
+
+    connect: str = Field(
+        default="udpin://127.0.0.1:14540",
+        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
+        " serial://DEVICE:BAUD",
+    )
+    camera: str = Field(
+        default="tcp://127.0.0.1:5600", description="ZeroMQ address of the depth camera"
+    )
+
+
+class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     """What flies a policy, by itself: on an onboard computer, or against any simulator."""
 
     policy: str = Field(
@@ -137,14 +150,6 @@ class StandAloneCompanion(Lateness, Decisions):
     )
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
-    )
-    connect: str = Field(
-        default="udpin://127.0.0.1:14540",
-        description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
-        " serial://DEVICE:BAUD",
-    )
-    camera: str = Field(
-        default="tcp://127.0.0.1:5600", description="ZeroMQ address of the depth camera"
     )
     lockstep: bool = Field(
         default=False,

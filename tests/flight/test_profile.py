@@ -16,46 +16,48 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from airl_mav.cli.companion_command import CompanionCommand, sampler
 from rich.console import Console
 
-from airl_mav.cli import profile, profile_hil
-from airl_mav.cli.profile_command import ProfileCommand
-from airl_mav.cli.profile_plan import Measured, planned
-from airl_mav.cli.profile_report import correlation_line, stages_of, verdict
+from airl_mav.cli import profile as command
+from airl_mav.cli.options import read_options, run_command
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.machine import MachineState
 from airl_mav.latency.clock_offset import Exchanges
+from airl_mav.latency.samplers import latency_generator
 from airl_mav.latency.stages import STAGES
 from airl_mav.latency.stamps import DecisionLog
+from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.computer import existing_profile, load_computer, write_profile
 from airl_mav.profiles.loading import list_profiles
-from airl_mav.scenario.model import Ports
+from airl_mav.profiling import hil
+from airl_mav.profiling.measurement import Recording
+from airl_mav.profiling.profile import busy_remark, profile
+from airl_mav.profiling.report import correlation_line, verdict
+from airl_mav.profiling.request import ProfileRequest
+from airl_mav.scenario.model import Lateness
+from airl_mav.scenario.piloting import select_latency
 from companion.mission import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT
 from tests.unit.test_companion_light import BLOCK
 
-SMALL = {"network": "2x4", "image": "64x48"}
+SMALL = ("--network", "2x4", "--image", "64x48")
 
 
-def profiled(command: ProfileCommand) -> str:
+def profiled(out: Path, *words: str) -> str:
     """Run the command; return what it printed."""
     console = Console(file=io.StringIO(), width=200, force_terminal=False)
-    assert profile.run(command, console) == 0
+    few = ("--decisions", "80", "--warm-up", "5")
+    given = ("--on", "box", "--out", str(out), *few, *words)
+    assert command.run(read_options(command.OPTIONS, "airl profile", given), console) == 0
     printed = console.file.getvalue()  # type: ignore[attr-defined]
     assert isinstance(printed, str)
     return printed
 
 
-def bare(out: Path, **options: object) -> ProfileCommand:
-    given = {"on": "box", "out": out, "decisions": 80, "warm_up": 5, **options}
-    return ProfileCommand(**given)  # type: ignore[arg-type]
-
-
 def test_profile_flies(tmp_path: Path) -> None:
-    printed = profiled(bare(tmp_path))
+    printed = profiled(tmp_path)
     path = tmp_path / "box.toml"
     computer = load_computer(str(path))
     work = computer.workloads["static-obstacles-bare"]
@@ -67,17 +69,37 @@ def test_profile_flies(tmp_path: Path) -> None:
     assert work.latency.samples_ms == tuple(took_us / 1000.0)
     assert "--computer" in printed
     assert f"{path} --workload static-obstacles-bare" in printed
-    command = CompanionCommand(computer=str(path), workload="static-obstacles-bare")
-    drawn = sampler(command, 1)
+    policy = find_policy("static-obstacles")
+    asked = Lateness(computer=str(path), workload="static-obstacles-bare")
+    drawn = select_latency(asked, policy, on_this_computer=True).sampler(latency_generator(1, 0))
     assert drawn is not None
     assert {drawn.sample_us() for _ in range(80)} == set(took_us.tolist())
     # This very policy on that computer: found by its digest, in a rehearsal.
-    found = sampler(CompanionCommand(computer=str(path), control="stdio"), 1)
-    assert found is not None
+    found = select_latency(Lateness(computer=str(path)), policy, on_this_computer=False)
+    assert found.latency == work.latency
+
+
+def test_python_api_measures_without_a_word(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    request = ProfileRequest(decisions=30, warm_up=5, on="box")
+    measured = profile(request)
+    assert capfd.readouterr() == ("", "")
+    assert measured.files == ()
+    assert measured.t2_us.dtype == np.int64
+    assert len(measured.t2_us) == 30
+    samples_ms = measured.profile.workloads[measured.workload].latency.samples_ms
+    assert samples_ms == tuple(measured.t2_us / 1000.0)
+    written = profile(request, out=tmp_path)
+    assert [path.name for path in written.files] == [
+        "box.toml",
+        *(f"box.static-obstacles-bare{end}" for end in (".txt", ".npz", ".json")),
+    ]
+    assert load_computer(str(written.files[0])) == written.profile
 
 
 def test_what_is_said(tmp_path: Path) -> None:
-    printed = profiled(bare(tmp_path))
+    printed = profiled(tmp_path)
     assert "this computer adds" in printed
     assert "396 ms" in printed
     assert "--network 5x32 --image 256x154" in printed
@@ -90,29 +112,30 @@ def test_what_is_said(tmp_path: Path) -> None:
 
 
 def test_other_workloads_are_kept(tmp_path: Path) -> None:
-    profiled(bare(tmp_path, watts=6.4, price=80.0))
-    profiled(bare(tmp_path, decisions=30, workload="again"))
+    profiled(tmp_path, "--watts", "6.4", "--price-usd", "80")
+    profiled(tmp_path, "--decisions", "30", "--workload", "again")
     computer = load_computer(str(tmp_path / "box.toml"))
     assert list(computer.workloads) == ["static-obstacles-bare", "again"]
     assert len(computer.workloads["static-obstacles-bare"].latency.samples_ms or ()) == 80
     assert len(computer.workloads["again"].latency.samples_ms or ()) == 30
     assert (computer.watts, computer.price_usd) == (6.4, 80.0)
     assert "not measured" not in computer.source
+    assert "not known" not in computer.source
 
 
 def test_power_that_nobody_gave_is_said_to_be_unknown(tmp_path: Path) -> None:
-    profiled(bare(tmp_path))
+    profiled(tmp_path)
     held = load_computer(str(tmp_path / "box.toml"))
     assert held.watts == 0.0
     assert "watts: not measured" in held.source
-    profiled(bare(tmp_path, watts=5.0))
+    profiled(tmp_path, "--watts", "5")
     later = load_computer(str(tmp_path / "box.toml"))
     assert later.watts == 5.0
     assert "watts: not measured" not in later.source
 
 
 def test_facts_beside_the_samples(tmp_path: Path) -> None:
-    profiled(bare(tmp_path))
+    profiled(tmp_path)
     facts = json.loads((tmp_path / "box.static-obstacles-bare.json").read_text())
     assert facts["schema"] == 1
     assert facts["command"]["decisions"] == 80
@@ -123,7 +146,7 @@ def test_facts_beside_the_samples(tmp_path: Path) -> None:
 
 
 def test_random_network_needs_no_policy(tmp_path: Path) -> None:
-    printed = profiled(bare(tmp_path, **SMALL))
+    printed = profiled(tmp_path, *SMALL)
     work = load_computer(str(tmp_path / "box.toml")).workloads["template-2x4-64x48-bare"]
     assert (work.network.layers, work.network.filters) == (2, 4)
     assert (work.network.image_width_px, work.network.image_height_px) == (64, 48)
@@ -145,16 +168,17 @@ def test_paper_network_has_its_size() -> None:
     assert template_size(5, 32, 154, 256, 25) == (paper.parameters, paper.macs)
 
 
-def test_verdict_follows_the_measurement(tmp_path: Path) -> None:
-    with planned(bare(tmp_path)) as plan:
-        assert verdict(plan, np.full(1000, 100)).startswith("this computer adds no gap for")
-        assert "0.02% of its decision period of 0.5 s" in verdict(plan, np.full(1000, 100))
-        assert verdict(plan, np.full(1000, 20_000)).startswith("this computer adds a small gap")
-        assert verdict(plan, np.full(1000, 396_000)).startswith("this computer adds a gap for")
-        # A rare stall is not hidden behind the median: the p99 decides.
-        rare = np.full(1000, 100)
-        rare[::50] = 400_000
-        assert verdict(plan, rare).startswith("this computer adds a gap for")
+def test_verdict_follows_the_measurement() -> None:
+    card = find_policy("static-obstacles").card
+    assert card is not None
+    assert verdict(card, np.full(1000, 100)).startswith("this computer adds no gap for")
+    assert "0.02% of its decision period of 0.5 s" in verdict(card, np.full(1000, 100))
+    assert verdict(card, np.full(1000, 20_000)).startswith("this computer adds a small gap")
+    assert verdict(card, np.full(1000, 396_000)).startswith("this computer adds a gap for")
+    # A rare stall is not hidden behind the median: the p99 decides.
+    rare = np.full(1000, 100)
+    rare[::50] = 400_000
+    assert verdict(card, rare).startswith("this computer adds a gap for")
 
 
 def test_runs_of_slow_decisions_are_seen() -> None:
@@ -166,29 +190,43 @@ def test_runs_of_slow_decisions_are_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("words", "message"),
     [
-        ({"policy": "telepathy"}, "no such policy; known: greedy"),
-        ({"policy": "greedy"}, "POLICY greedy: has no network"),
-        ({"policy": "static-obstacles", "network": "2x4"}, "accepted: one of them"),
-        ({"network": "five"}, "--network five: accepted: LAYERSxFILTERS"),
-        ({"network": "0x32"}, "--network 0x32: accepted"),
-        ({"network": "2x4", "image": "big"}, "--image big: accepted: WIDTHxHEIGHT"),
-        ({"network": "2x4", "image": "4000x4"}, "width_px = 4000: accepted: 4 <= value <= 640"),
-        ({"network": "20x256", "image": "640x480"}, "parameters; accepted: at most 475,000,000"),
-        ({"network": "2x4", "image": "50x50", "level": "sitl"}, "--image 50x50: vehicle"),
-        ({"network": "2x4", "runtime": "torch"}, "--runtime torch with --network: accepted: onnx"),
-        ({"decisions": 5}, "--decisions 5: accepted: 10 <= value"),
-        ({"warm_up": 0}, "--warm-up 0: accepted: 1 <= value"),
-        ({"on": "../x"}, "--on '../x': accepted: letters"),
-        ({"watts": -1.0}, "--watts -1: accepted"),
-        ({"vehicle": "quad-256x144"}, "--vehicle quad-256x144: camera"),
+        (["telepathy"], "no such policy; known: greedy"),
+        (["greedy"], "'greedy': accepted: a learned policy"),
+        (["static-obstacles", "--network", "2x4"], "accepted: either a policy or a network"),
+        (["--network", "five"], "--network 'five': accepted: a text that matches"),
+        (["--network", "0x32"], "--network '0x32': accepted"),
+        (["--network", "2x4", "--image", "big"], "--image 'big': accepted: a text that matches"),
+        (["--network", "2x4", "--image", "4000x4"], "width_px = 4000: accepted: 4 <= value <= 640"),
+        (["--network", "20x256", "--image", "640x480"], "accepted: at most 475,000,000"),
+        (["--network", "2x4", "--image", "50x50", "--level", "sitl"], "'50x50': vehicle"),
+        (["--network", "2x4", "--runtime", "torch"], "--runtime 'torch': accepted: onnx"),
+        (["--decisions", "5"], "--decisions 5: accepted: 10 <= value"),
+        (["--warm-up", "0"], "--warm-up 0: accepted: 1 <= value"),
+        (["--hold-s", "2"], "--hold-s 2: accepted: 0 <= value <= 1 s"),
+        (["--on", "../x"], "--on '../x': accepted"),
+        (["--watts", "-1"], "--watts -1: accepted"),
+        (["--vehicle", "quad-256x144"], "--vehicle 'quad-256x144': camera"),
     ],
 )
-def test_what_cannot_be_used(tmp_path: Path, options: dict[str, object], message: str) -> None:
-    with pytest.raises(UsageError, match=re.escape(message)):
-        profile.run(bare(tmp_path, **options), Console(file=io.StringIO()))
+def test_what_cannot_be_used(
+    tmp_path: Path, words: list[str], message: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    given = ["--on", "box", "--out", str(tmp_path), *words]
+    with pytest.raises(SystemExit, match="2"):
+        run_command("airl profile", command.__name__, given)
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert message in line
     assert not list(tmp_path.iterdir())
+
+
+def test_old_names_of_options_still_work(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ["--hold", "0.1", "--price", "80", "--out", str(tmp_path)]
+    options = read_options(command.OPTIONS, "airl profile", words, renamed=command.RENAMED_OPTIONS)
+    assert (options.hold_s, options.price_usd) == (0.1, 80.0)
+    assert "--price is called --price-usd now" in capfd.readouterr().err
 
 
 def test_file_of_another_machine_is_left_alone(tmp_path: Path) -> None:
@@ -196,7 +234,7 @@ def test_file_of_another_machine_is_left_alone(tmp_path: Path) -> None:
     write_profile(path, load_computer("ras-pi-4"))
     before = path.read_bytes()
     with pytest.raises(UsageError, match=r"Cortex-A72.*accepted: another --on or --out"):
-        profile.run(bare(tmp_path), Console(file=io.StringIO()))
+        profile(ProfileRequest(on="box"), out=tmp_path)
     assert path.read_bytes() == before
     assert existing_profile(path, "4 x Arm Cortex-A72, 1.5 GHz") is not None
 
@@ -287,16 +325,8 @@ def test_interrupted_profile_writes_nothing(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_stages_in_flight(tmp_path: Path) -> None:
-    free = choose_ports()
-    ports = Ports(
-        api_port=free.api,
-        api_local_port=free.api_local,
-        gcs_port=free.gcs,
-        gcs_local_port=free.gcs_local,
-        camera_port=free.camera,
-    )
-    command = bare(tmp_path, level="sitl", decisions=70, warm_up=10, ports=ports)
-    printed = profiled(command)
+    words = ("--level", "sitl", "--decisions", "70", "--warm-up", "10", *choose_ports().options())
+    printed = profiled(tmp_path, *words)
     stamps = np.load(tmp_path / "box.static-obstacles-sitl.npz")
     assert len(stamps["sent_us"]) == 70
     order = [stamps[stage.start] for stage in STAGES[:6]]
@@ -305,15 +335,15 @@ def test_stages_in_flight(tmp_path: Path) -> None:
     assert (held >= 50_000).mean() > 0.95
     assert (np.diff(stamps["sent_us"]) >= 50_000).mean() > 0.95
     assert "link" in printed
-    assert "timing was measured, not flying well" in printed
+    assert "timing was measured, not the quality of flight" in printed
     assert "static-obstacles-sitl" in load_computer(str(tmp_path / "box.toml")).workloads
 
 
 def test_busy_machine_is_said_to_be_so() -> None:
     idle = MachineState(None, None, None, None, None, (0.1, 3.0, 3.0))
-    assert profile.busy_remark(idle, 2) is None
-    assert profile.busy_remark(replace(idle, load=None), 2) is None
-    remark = profile.busy_remark(replace(idle, load=(8.5, 0.0, 0.0)), 2)
+    assert busy_remark(idle, 2) is None
+    assert busy_remark(replace(idle, load=None), 2) is None
+    remark = busy_remark(replace(idle, load=(8.5, 0.0, 0.0)), 2)
     assert remark is not None
     assert "load average 8.50 on 2 usable cores" in remark
 
@@ -321,7 +351,7 @@ def test_busy_machine_is_said_to_be_so() -> None:
 AHEAD_US = 5_000_000
 
 
-def flown_beside(simulator_us: Callable[[int], int]) -> profile_hil.Flown:
+def flown_beside(simulator_us: Callable[[int], int]) -> hil.TimedMission:
     """A flight of 40 decisions against a simulator whose clock is a function of ours."""
 
     def asked(start_us: int, n: int, interval_us: int, trip_us: int) -> Exchanges:
@@ -334,7 +364,7 @@ def flown_beside(simulator_us: Callable[[int], int]) -> profile_hil.Flown:
         seen_us = 2_000_000 + 60_000 * i
         stamps = (np.array([8_000, 8_100, 9_000, 9_100, 59_100]) + seen_us).tolist()
         log.record(simulator_us(seen_us), *stamps, (0.0, 0.0, 0.0, 0.0))
-    return profile_hil.Flown(
+    return hil.TimedMission(
         MissionResult("stopped", (), log),
         asked(0, 100, 5_000, 400),
         asked(1_000_000, 50, 100_000, 700),
@@ -344,8 +374,8 @@ def flown_beside(simulator_us: Callable[[int], int]) -> profile_hil.Flown:
 
 def test_exposures_are_brought_to_this_computers_clock() -> None:
     flown = flown_beside(lambda own_us: own_us + AHEAD_US)
-    stamps, seen, remarks = profile_hil.joined(flown, 10)
-    assert seen == "capture_us"
+    stamps, exposure, remarks = hil.relate_stamps(flown, 10)
+    assert exposure == "capture_us"
     t1_us = stamps["decoded_us"] - stamps["capture_us"]
     assert (np.abs(t1_us - 8_000) <= stamps["capture_uncertainty_us"]).all()
     # Between half of 400 and half of 600, and 2 for two clocks of whole microseconds.
@@ -358,8 +388,7 @@ def test_exposures_are_brought_to_this_computers_clock() -> None:
     assert "least round trip 0.400 ms" in remarks[0]
     assert "least round trip 0.600 ms" in remarks[0]
     assert "50 of 50 exchanges in flight agree" in remarks[0]
-    measured = Measured((stamps,), seen, 0, 0)
-    stages = stages_of(measured)
+    stages = Recording((stamps,), exposure, 0, 0).stages
     assert set(stages["mavlink_round_trip"].tolist()) == {700}
     assert stages["t1_uncertainty"].max() == stamps["capture_uncertainty_us"].max()
     assert stages["link"].size == stages["end_to_end"].size == 0
@@ -374,21 +403,21 @@ def test_exposures_are_brought_to_this_computers_clock() -> None:
     ],
 )
 def test_clocks_that_cannot_be_related(simulator_us: Callable[[int], int], why: str) -> None:
-    stamps, seen, (remark,) = profile_hil.joined(flown_beside(simulator_us), 10)
-    assert seen == "decoded_us"
+    stamps, exposure, (remark,) = hil.relate_stamps(flown_beside(simulator_us), 10)
+    assert exposure == "decoded_us"
     assert "capture_us" not in stamps
     assert remark.startswith("t1, link, control and end to end were not measured (-)")
     assert why in remark
-    assert "t1_uncertainty" not in stages_of(Measured((stamps,), seen, 0, 0))
+    assert "t1_uncertainty" not in Recording((stamps,), exposure, 0, 0).stages
 
 
 def test_an_autopilot_without_timesync() -> None:
     none = Exchanges(*(np.zeros(0, np.int64) for _ in range(3)))
     flown = replace(
-        flown_beside(lambda own_us: own_us + AHEAD_US), before=none, between=none, after=none
+        flown_beside(lambda own_us: own_us + AHEAD_US), before=none, during=none, after=none
     )
-    stamps, seen, (remark,) = profile_hil.joined(flown, 10)
-    assert (seen, len(stamps["exchange_sent_us"])) == ("decoded_us", 0)
+    stamps, exposure, (remark,) = hil.relate_stamps(flown, 10)
+    assert (exposure, len(stamps["exchange_sent_us"])) == ("decoded_us", 0)
     assert "0 answers in a row" in remark
 
 
@@ -396,27 +425,28 @@ def test_frames_of_yet_another_clock() -> None:
     flown = flown_beside(lambda own_us: own_us + AHEAD_US)
     shifted = [
         Exchanges(row.sent_us, row.remote_us - 20_000, row.received_us)
-        for row in (flown.before, flown.between, flown.after)
+        for row in (flown.before, flown.during, flown.after)
     ]
-    flown = profile_hil.Flown(flown.result, *shifted)
-    _, seen, (remark,) = profile_hil.joined(flown, 10)
-    assert seen == "decoded_us"
+    flown = hil.TimedMission(flown.result, *shifted)
+    _, exposure, (remark,) = hil.relate_stamps(flown, 10)
+    assert exposure == "decoded_us"
     assert "30 frames would have been decoded before they were exposed" in remark
 
 
 FIRMWARE_THAT_TELLS_ITS_EPOCH = """
 import sys
-import airl_mav.cli.firmware as cli
+from airl_mav.cli.options import run_command
+from airl_mav.rehearsal import stand_alone
 
-fly = cli.fly
+fly = stand_alone.fly
 
 def told(firmware, *rest):
     fly(firmware, *rest)
     print("epoch_ns", firmware.epoch_ns, flush=True)
     print("slipped_us", firmware.slipped_us, flush=True)
 
-cli.fly = told
-cli.main()
+stand_alone.fly = told
+run_command("airl-firmware", "airl_mav.cli.firmware")
 """
 
 
@@ -429,7 +459,7 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         clocks.append(WallClock())
         return clocks[-1]
 
-    monkeypatch.setattr(profile_hil, "WallClock", made)
+    monkeypatch.setattr(hil, "WallClock", made)
     free = choose_ports()
     words = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
     log_path = tmp_path / "firmware.log"
@@ -442,15 +472,10 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             stderr=log,
         )
         try:
-            command = bare(
-                tmp_path,
-                level="hil",
-                decisions=70,
-                warm_up=10,
-                connect=f"udpin://127.0.0.1:{free.api}",
-                camera=f"tcp://127.0.0.1:{free.camera}",
-            )
-            printed = profiled(command)
+            connect = f"udpin://127.0.0.1:{free.api}"
+            words = ("--level", "hil", "--decisions", "70", "--warm-up", "10")
+            addresses = ("--connect", connect, "--camera", f"tcp://127.0.0.1:{free.camera}")
+            printed = profiled(tmp_path, *words, *addresses)
         finally:
             firmware.terminate()
             firmware.wait(30)

@@ -1,0 +1,1 @@
+"""Profiling: how long this computer takes for a policy's decisions, as a computer profile."""

@@ -1,0 +1,120 @@
+"""Level bare: the network alone, on this computer."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.clock import WallClock, processor_time_us
+from airl_mav.core.progress import Bar
+from airl_mav.policy.actions import limited
+from airl_mav.policy.layouts import camera_mismatch
+from airl_mav.policy.learned import LearnedPolicy, open_network
+from airl_mav.policy.observation import Kinematics, encode
+from airl_mav.profiling.measurement import Recording
+from airl_mav.profiling.policy_under_test import PolicyUnderTest
+from airl_mav.profiling.request import ProfileRequest
+
+OBSERVATIONS = 64
+"""Different observations, in turn, so that they do not stay in the caches."""
+
+GOAL = 20.0, 5.0
+"""North, east [m]."""
+
+OBSERVATION_STREAM, ACTION_STREAM = 11, 12
+"""Second words of the seed."""
+
+COLD_DECISIONS = 20
+"""Decisions by which a flight's length is planned."""
+
+
+class BareLoop:
+    """Decisions without a flight: what the pilot does between its two stamps of t2."""
+
+    def __init__(self, request: ProfileRequest, policy: PolicyUnderTest) -> None:
+        """Open the network. Raises UsageError if it cannot be run."""
+        self.clock = WallClock()
+        start_us = self.clock.time_us()
+        network = open_network(
+            policy.folder, policy.card, request.runtime, request.threads, trust=request.trust
+        )
+        self.load_us = self.clock.time_us() - start_us
+        """Opening the network [µs]."""
+        rng = np.random.default_rng((request.seed, ACTION_STREAM))
+        self._policy = LearnedPolicy(policy.card, network, rng=rng)
+        self._max_speed_m_s = policy.card.actions.max_speed_m_s
+        self._observations = itertools.cycle(random_observations(request, policy))
+
+    def decide(self) -> tuple[int, int]:
+        """Make a decision; return when it began and when it ended [µs]."""
+        frame, state = next(self._observations)
+        start_us = self.clock.time_us()
+        limited(self._policy.act(encode(frame, state, GOAL)), self._max_speed_m_s)
+        return start_us, self.clock.time_us()
+
+
+def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+    """Time the decisions.
+
+    Args:
+        request: What was asked for.
+        policy: What decides.
+        bar: Counts the decisions, warm-up included.
+
+    Raises:
+        UsageError: The network cannot be run.
+    """
+    loop = BareLoop(request, policy)
+    stamps = []
+    used_us = processor_time_us()
+    for count in range(request.warm_up + request.decisions + 1):
+        stamps.append(loop.decide())
+        bar.update(completed=count)
+    used_us = processor_time_us() - used_us
+    starts, ends = np.array(stamps, np.int64).T
+    cores = used_us / max(ends[-1] - starts[0], 1)
+    measured = slice(1 + request.warm_up, None)
+    threads = f"{request.threads} thread{'s' if request.threads > 1 else ''}"
+    return Recording(
+        flights=({"infer_start_us": starts[measured], "action_ready_us": ends[measured]},),
+        exposure=None,
+        load_us=loop.load_us,
+        first_us=int(ends[0] - starts[0]),
+        remarks=(
+            "inference alone, one decision straight after the other: no camera and no telemetry "
+            "ran beside it, which may slow it down (--level sitl, --level hil)",
+            f"this process used {cores:.2g} cores of processor time with {threads}: less than one "
+            "means that it had to wait",
+        ),
+    )
+
+
+def cold_start(request: ProfileRequest, policy: PolicyUnderTest) -> tuple[int, int, int]:
+    """Return how long opening, the first and a typical later decision take [µs]."""
+    loop = BareLoop(request, policy)
+    stamps = [loop.decide() for _ in range(COLD_DECISIONS)]
+    first_us, *later_us = (end_us - start_us for start_us, end_us in stamps)
+    return loop.load_us, first_us, round(float(np.median(later_us)))
+
+
+def random_observations(
+    request: ProfileRequest, policy: PolicyUnderTest
+) -> list[tuple[Frame, Kinematics]]:
+    """Return depth images of noise, as large as the camera's, and states of a level vehicle."""
+    spec, lens = policy.card.observation, policy.camera
+    if camera_mismatch(spec, lens) is not None:
+        fov = math.radians(spec.horizontal_fov_deg)
+        lens = Intrinsics.from_fov(spec.width_px, spec.camera_rows, fov)
+    rng = np.random.default_rng((request.seed, OBSERVATION_STREAM))
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    return [
+        (
+            Frame(k, 0, rng.integers(0, 20_000, (lens.height, lens.width), np.uint16), lens),
+            Kinematics(rng.normal(0.0, 5.0, 3), rng.normal(0.0, 2.0, 3), level),
+        )
+        for k in range(OBSERVATIONS)
+    ]

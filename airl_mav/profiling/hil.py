@@ -1,0 +1,224 @@
+"""Level hil: the companion on this computer, against a simulator that runs elsewhere."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.progress import Bar
+from airl_mav.latency.clock_offset import ClockError, ClockRelation, Exchanges, relate
+from airl_mav.latency.stamps import STAMPS
+from airl_mav.policy.actions import Action, Policy
+from airl_mav.policy.observation import Observation
+from airl_mav.profiling.bare import cold_start
+from airl_mav.profiling.measurement import ProfilingError, Recording, Stamps
+from airl_mav.profiling.policy_under_test import PolicyUnderTest
+from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
+from airl_mav.rehearsal.signals import signal_handlers
+from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.camera import open_camera
+from companion.guard import ThreadGuard
+from companion.interfaces import LinkError
+from companion.mission import MissionResult, check_camera, fly_mission
+from companion.program import prepare
+from companion.timesync import TimesyncLink
+
+GOAL = 9_000.0, 0.0
+"""North, east of the start [m]: out of reach."""
+
+GROUND_EXCHANGES = 100
+"""TIMESYNC exchanges before the flight, and as many after it."""
+
+GROUND_INTERVAL_S = 0.005
+"""From one of them to the next [s]: out of step with the simulator's tick soon enough."""
+
+FLIGHT_INTERVAL_S = 0.1
+"""From one exchange in flight to the next [s]. Each takes 0.3 ms of processor time on a desktop
+core, and one or two decisions of a hundred coincide with one."""
+
+
+@dataclass(frozen=True)
+class TimedMission:
+    """A mission, and the exchanges with the simulator's clock."""
+
+    result: MissionResult
+    before: Exchanges
+    during: Exchanges
+    after: Exchanges
+
+
+class DecisionLimit:
+    """A policy that ends the flight after so many decisions. Implements `actions.Policy`."""
+
+    def __init__(self, policy: Policy, limit: int, stop: threading.Event, bar: Bar) -> None:
+        self._policy, self._limit = policy, limit
+        self._stop, self._bar = stop, bar
+        self._count = 0
+
+    def act(self, observation: Observation) -> Action:
+        """Return the policy's action."""
+        # Stopped before the decision, not after: the pilot drops the one that it is stopped in.
+        if self._count == self._limit:
+            self._stop.set()
+        else:
+            self._count += 1
+            self._bar.update(completed=self._count)
+        return self._policy.act(observation)
+
+
+def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+    """Fly until there are enough decisions; arguments as `bare.measure`.
+
+    Raises:
+        UsageError: It cannot be flown as asked.
+        ProfilingError: No flight controller is heard, or the flight ended before there were enough
+            decisions.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; the vehicle has been asked to land.
+    """
+    load_us, first_us, _ = cold_start(request, policy)
+    interrupted, stop = threading.Event(), threading.Event()
+
+    def interrupt(*_: object) -> None:
+        interrupted.set()
+        stop.set()
+
+    with signal_handlers(interrupt, signal.SIGINT, signal.SIGTERM):
+        try:
+            mission = _fly(request, policy, bar, stop, interrupted)
+        except LinkError as error:
+            if interrupted.is_set():
+                raise KeyboardInterrupt from None
+            raise ProfilingError(str(error)) from error
+    if interrupted.is_set():
+        raise KeyboardInterrupt
+    decisions = len(mission.result.log)
+    if decisions < request.warm_up + request.decisions:
+        raise ProfilingError(f"{mission.result.reason} after {decisions} decisions: too few")
+    stamps, exposure, remarks = relate_stamps(mission, request.warm_up)
+    return Recording(
+        flights=(stamps,),
+        exposure=exposure,
+        load_us=load_us,
+        first_us=first_us,
+        remarks=(
+            f"in flight against a simulator elsewhere, hold {request.hold_s:g} s and at most "
+            f"{FLOWN_SPEED_M_S:g} m/s: timing was measured, not the quality of flight",
+            *remarks,
+        ),
+    )
+
+
+def _fly(
+    request: ProfileRequest,
+    policy: PolicyUnderTest,
+    bar: Bar,
+    stop: threading.Event,
+    interrupted: threading.Event,
+) -> TimedMission:
+    """Fly until there are enough decisions, or until `stop`. Raises UsageError, LinkError."""
+    asked = StandAloneCompanion(
+        policy=policy.name,
+        goal=GOAL,
+        connect=request.connect,
+        camera=request.camera,
+        **request.flown_as,
+    )
+    mission = prepare(asked)
+    decisions = request.warm_up + request.decisions
+    limited = DecisionLimit(mission.policy, decisions, stop, bar)
+    clock, abandon = WallClock(), threading.Event()
+    with (
+        closing(open_camera(asked.camera, clock)) as frames,
+        closing(TimesyncLink(asked.connect, clock, abandon)) as link,
+    ):
+        link.connect(asked.connect_timeout, stop)
+        check_camera(mission.policy, frames, stop)
+        link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, stop)
+        before = link.take_exchanges()
+        with link.exchanging(FLIGHT_INTERVAL_S):
+            result = fly_mission(
+                link,
+                frames,
+                limited,
+                mission.goal,
+                clock,
+                stop,
+                abandon,
+                lambda _: None,
+                pilot_settings=mission.pilot,
+                watchdog_settings=mission.watchdog,
+                guard=ThreadGuard(clock),
+            )
+        during = link.take_exchanges()
+        # `stop` is set by now: it ends the flight.
+        link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, interrupted)
+        return TimedMission(result, before, during, link.take_exchanges())
+
+
+def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
+    """Convert the exposure of the frames to this computer's clock, if the two can be related.
+
+    Returns:
+        Columns of the decisions after the warm-up, and `exchange_*` ones, one row an exchange in
+        flight; the stamp from which the age of a command counts; remarks. `capture_simulator_us` is
+        the exposure by the simulator's clock, `capture_us` by this computer's, within
+        `capture_uncertainty_us`.
+    """
+    columns = mission.result.log.columns()
+    stamps = {name: np.asarray(columns[name][warm_up:], np.int64) for name in STAMPS}
+    exposed_us = stamps.pop("capture_us")
+    during = mission.during
+    flying = during.sent_us >= stamps["infer_start_us"][0]
+    flying &= during.received_us <= stamps["held_until_us"][-1]
+    exchanges = {
+        "exchange_sent_us": during.sent_us[flying],
+        "exchange_simulator_us": during.remote_us[flying],
+        "exchange_received_us": during.received_us[flying],
+    }
+    try:
+        relation = relate(mission.before, during, mission.after)
+        captured_us = np.rint(relation.own_time(exposed_us)).astype(np.int64)
+        # One more for rounding.
+        within_us = np.ceil(relation.uncertainty_at(captured_us)).astype(np.int64) + 1
+        if (early := int(np.count_nonzero(captured_us - within_us > stamps["decoded_us"]))) > 0:
+            raise ClockError(
+                f"{early} frames would have been decoded before they were exposed: they are "
+                "stamped by another clock than the autopilot's, or it was set back"
+            )
+    except ClockError as error:
+        remark = (
+            "t1, link, control and end to end were not measured (-): nothing relates the "
+            f"simulator's clock to this computer's: {error}"
+        )
+        return {**stamps, **exchanges}, "decoded_us", (remark,)
+    related = {
+        "capture_simulator_us": exposed_us,
+        "capture_us": captured_us,
+        "capture_uncertainty_us": within_us,
+    }
+    remarks = (
+        _relation_remark(mission, relation, int(within_us.max())),
+        "link, control and end to end were not measured (-): the autopilot reports only 10 times a "
+        "second what it flies; a setpoint's way there is a part of the MAVLink round trip",
+    )
+    return {**related, **stamps, **exchanges}, "capture_us", remarks
+
+
+def _relation_remark(mission: TimedMission, relation: ClockRelation, within_us: int) -> str:
+    ground = " and ".join(
+        f"{len(exchanges)} exchanges {when} the flight (least round trip "
+        f"{exchanges.round_trip_us.min() / US_PER_MS:.3f} ms)"
+        for exchanges, when in ((mission.before, "before"), (mission.after, "after"))
+    )
+    return (
+        f"t1 is uncertain by ±{within_us / US_PER_MS:.3f} ms, all decisions alike: the simulator's "
+        f"clock was related to this computer's by TIMESYNC, {ground}; it gained "
+        f"{relation.drift * 1e6:+.1f} ppm (±{relation.drift_uncertainty * 1e6:.1f}), and "
+        f"{relation.agreeing} of {relation.checked} exchanges in flight agree"
+    )

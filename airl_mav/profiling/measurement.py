@@ -1,0 +1,187 @@
+"""What was measured: the stamps of every decision, a computer profile, and their files."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.clock import utc_now
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import save_arrays, write_json
+from airl_mav.core.machine import MachineState
+from airl_mav.core.provenance import package_versions
+from airl_mav.latency.coordinated_omission import CommandAges, ages_in_closed_loop, command_ages
+from airl_mav.latency.percentiles import summarize
+from airl_mav.latency.stages import Samples, pool, stage_samples
+from airl_mav.policy.card import PolicyCard
+from airl_mav.profiles.computer import (
+    ComputerProfile,
+    Latency,
+    Network,
+    with_workload,
+    write_profile,
+    write_samples,
+)
+from airl_mav.profiling.request import ProfileRequest
+
+SCHEMA = 1
+"""Version of the facts beside the samples."""
+
+ROUND_TRIP = "mavlink_round_trip"
+"""Key of the TIMESYNC exchanges in flight."""
+
+T1_UNCERTAINTY = "t1_uncertainty"
+"""Key of the greatest error of each decision's t1."""
+
+Stamps = dict[str, NDArray[np.int64]]
+
+
+class ProfilingError(RuntimeError):
+    """The measurement broke off: a process or the link was lost, or the flight ended too early."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The stamps of the decisions after the warm-up, and how they were taken."""
+
+    flights: tuple[Stamps, ...]
+    """Stamps [µs] by column, one row a decision, of each flight; at level bare of the one run."""
+    exposure: str | None
+    """Stamp from which the age of a command counts; None: no command was flown."""
+    load_us: int
+    """Opening the network [µs]."""
+    first_us: int
+    """The very first decision [µs]."""
+    remarks: tuple[str, ...] = ()
+    """How it was measured, and what was not."""
+
+    @cached_property
+    def stages(self) -> dict[str, Samples]:
+        """Durations [µs] of each stage, all flights together, by the stage's key.
+
+        At level hil also `ROUND_TRIP`, and `T1_UNCERTAINTY` if the clocks could be related.
+        """
+        stages = pool(stage_samples(flight) for flight in self.flights)
+        columns = self.columns
+        if "exchange_sent_us" in columns:
+            stages[ROUND_TRIP] = columns["exchange_received_us"] - columns["exchange_sent_us"]
+        if "capture_uncertainty_us" in columns:
+            stages[T1_UNCERTAINTY] = columns["capture_uncertainty_us"]
+        return stages
+
+    @cached_property
+    def columns(self) -> Stamps:
+        """The stamps of all flights, one after the other."""
+        return {
+            name: np.concatenate([flight[name] for flight in self.flights])
+            for name in self.flights[0]
+        }
+
+    @property
+    def flight_numbers(self) -> NDArray[np.int64]:
+        """Number of the flight of each decision."""
+        rows = [len(flight["infer_start_us"]) for flight in self.flights]
+        return np.repeat(np.arange(len(rows), dtype=np.int64), rows)
+
+    def command_ages(self, hold_s: float) -> CommandAges:
+        """Return how old the flown command was.
+
+        Args:
+            hold_s: t3 [s] with which the commands would be flown, if they were not.
+        """
+        if self.exposure is None:
+            return ages_in_closed_loop(self.stages["t2"], round(hold_s * US_PER_S))
+        columns = self.columns
+        return command_ages(columns[self.exposure], columns["sent_us"], self.flight_numbers)
+
+
+@dataclass(frozen=True)
+class ComputerMeasurement:
+    """How long a computer takes for a policy's decisions."""
+
+    request: ProfileRequest
+    card: PolicyCard
+    """Of the policy that was timed."""
+    recording: Recording
+    computer: str
+    """Name of the computer."""
+    workload: str
+    """Name of the workload in the profile."""
+    profile: ComputerProfile
+    """The computer with this workload, whose samples are inline, and those that were measured
+    before."""
+    machine: dict[str, Any]
+    """Processor, cores, memory, operating system and Python."""
+    before: MachineState
+    after: MachineState
+    files: tuple[Path, ...] = ()
+    """Profile, samples, stamps and facts, if they were written."""
+
+    @property
+    def stages(self) -> dict[str, Samples]:
+        """Durations [µs] of each stage, by its key; empty where it was not measured."""
+        return self.recording.stages
+
+    @property
+    def t2_us(self) -> Samples:
+        """Durations of the decisions [µs], in their order."""
+        return self.stages["t2"]
+
+    @property
+    def network(self) -> Network:
+        """The network that was timed, and what ran it."""
+        return self.profile.workloads[self.workload].network
+
+
+def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
+    """Write samples, stamps, facts, and last of all the profile that names them.
+
+    Returns:
+        The files: the profile at `path`, and beside it samples, stamps and facts.
+
+    Raises:
+        UsageError: The folder cannot be written to.
+    """
+    recording, profile = measured.recording, measured.profile
+    stem = f"{measured.computer}.{measured.workload}"
+    samples, arrays, facts = (path.with_name(stem + end) for end in (".txt", ".npz", ".json"))
+    workload = profile.workloads[measured.workload]
+    by_file = Latency(distribution="samples", samples_file=samples.name)
+    written = workload.model_copy(update={"latency": by_file})
+    title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_samples(samples, workload.latency.samples_ms or (), (title, workload.source))
+        save_arrays(arrays, {**recording.columns, "flight": recording.flight_numbers})
+        write_json(facts, _facts(measured, path.parent))
+        write_profile(path, with_workload(profile, measured.workload, written))
+    except OSError as error:
+        raise UsageError(f"--out {path.parent}: {error.strerror}") from None
+    return path, samples, arrays, facts
+
+
+def _facts(measured: ComputerMeasurement, out: Path) -> dict[str, Any]:
+    recording, request = measured.recording, measured.request
+    return {
+        "schema": SCHEMA,
+        "computer": measured.computer,
+        "workload": measured.workload,
+        "level": request.level,
+        "command": {**request.model_dump(mode="json"), "out": str(out)},
+        "network": measured.network.model_dump(),
+        "date_utc": utc_now().isoformat(timespec="seconds"),
+        "machine": measured.machine,
+        "before": asdict(measured.before),
+        "after": asdict(measured.after),
+        "versions": package_versions(),
+        "load_us": recording.load_us,
+        "first_us": recording.first_us,
+        "stages_us": {key: asdict(summarize(samples)) for key, samples in measured.stages.items()},
+        "remarks": recording.remarks,
+    }

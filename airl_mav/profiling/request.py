@@ -1,0 +1,113 @@
+"""What `profile` can be asked for: meaning, unit, range and default of each field."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from airl_mav.core.fields import quantity
+from airl_mav.scenario.model import GREATEST_SEED, Inference, Ports
+from airl_mav.scenario.stand_alone import CompanionAddresses
+
+NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+"""Names that become names of files."""
+
+FLOWN_SPEED_M_S = 0.1
+"""Speed limit in flight: far below what a goal or a wall could be reached with."""
+
+ProfileLevel = Literal["bare", "sitl", "hil"]
+
+
+class ProfileRequest(CompanionAddresses, Inference):
+    """What is measured, and how."""
+
+    policy: str | None = Field(
+        default=None,
+        description="policy to measure: a name, or a path to a folder with policy.onnx and"
+        " card.json; by default the default policy, or with a network a random one",
+    )
+    network: str | None = Field(
+        default=None,
+        pattern=r"^[1-9]\d?x[1-9]\d{0,2}$",
+        description="LAYERSxFILTERS of a randomly initialised network of the paper's template to"
+        " measure instead of a policy, such as 5x32; needs the [profile] extra; latency depends on"
+        " the shapes of the weights, not on their values",
+    )
+    image: str = Field(
+        default="256x154",
+        pattern=r"^\d{1,4}x\d{1,4}$",
+        description="with a network: WIDTHxHEIGHT of the image that is its input, px",
+    )
+    level: ProfileLevel = Field(
+        default="bare",
+        description="bare: inference alone, on this computer. sitl: in flight, through the"
+        " processes of airl-sitl, all stages. hil: the companion on this computer, against an"
+        " airl-firmware that runs elsewhere",
+    )
+    decisions: int = quantity(
+        "decisions to measure, after the warm-up", "1", ge=10, le=100_000, default=1000
+    )
+    warm_up: int = quantity(
+        "decisions at the start of each flight that are left out; the very first one is reported"
+        " separately",
+        "1",
+        ge=1,
+        le=10_000,
+        default=50,
+    )
+    hold_s: float = quantity(
+        "levels sitl and hil, t3: how long an action is held before the next observation; short,"
+        " and flown at walking pace, because timing is measured and not the quality of flight",
+        "s",
+        ge=0,
+        le=1,
+        default=0.05,
+    )
+    on: str | None = Field(
+        default=None,
+        pattern=NAME,
+        description="name of the computer, and of its profile's file; by default after its"
+        " processor",
+    )
+    workload: str | None = Field(
+        default=None,
+        pattern=NAME,
+        description="name of the workload in the profile; one of the same name is replaced; by"
+        " default after policy, level, runtime and threads",
+    )
+    watts: float | None = quantity(
+        "power that the computer draws, which is not measured here; by default that of an existing"
+        " profile, or 0",
+        "W",
+        ge=0,
+        le=10_000,
+        default=None,
+    )
+    price_usd: float | None = quantity(
+        "price of the computer; by default that of an existing profile, or 0",
+        "USD",
+        ge=0,
+        le=1_000_000,
+        default=None,
+    )
+    seed: int = quantity(
+        "seed of the random network, of the observations at level bare, and of the flights",
+        "1",
+        ge=0,
+        le=GREATEST_SEED,
+        default=1,
+    )
+    vehicle: str | None = Field(
+        default=None,
+        description="vehicle profile that gives the camera: a shipped name, or a path to a .toml;"
+        " by default the first shipped one whose camera fits",
+    )
+    ports: Ports = Field(default_factory=Ports, description="ports of level sitl")
+
+    @property
+    def flown_as(self) -> dict[str, Any]:
+        """How the policy is flown at levels sitl and hil, as fields of a scenario."""
+        shared = {*Inference.model_fields, "hold_s", "seed"}
+        limits = {"goal_radius_m": 0.5, "max_speed_m_s": FLOWN_SPEED_M_S}
+        return {**self.model_dump(include=shared), **limits}
