@@ -49,8 +49,7 @@ from airl_mav.report.run_tables import (
     real_time_table,
     setup_rows,
 )
-from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json
-from airl_mav.report.scene_figure import scene_figure
+from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import Picture, montage
 from airl_mav.report.timeline import RULE_WORDS, slowest_table, timeline_figure, timeline_of
@@ -113,8 +112,7 @@ def build_page(
     judged = examine_worst(run, arenas, vehicle)
     shown = _shown(run, arenas)
     flights = _flights(run, arenas, shown, {j.record.index: j.cause for j in judged})
-    solid = scene_figure(shown[0], _top_speed(shown)) if shown else None
-    alone = [overview, timeline, energy, solid]
+    alone = [overview, timeline, energy]
     pictures = [picture for flight in flights for picture in flight.pictures]
     for picture in [*pictures, *(picture for picture in alone if picture)]:
         replace_file(folder / f"{picture.name}.png", picture.png)
@@ -140,11 +138,10 @@ def build_page(
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,
             causes=causes_table(judged, run),
-            scene_picture=solid,
             scene_flights=[(k, flight) for k, flight in enumerate(shown)],
             scene_all=len(everyone),
             scene_data=Markup(scene_json(run, shown, everyone, fov)),  # noqa: S704 - escaped there
-            scene_script=Markup(_script("scene.js")),  # noqa: S704 - our own
+            scene_scripts=[Markup(text) for text in _scripts()] if shown else [],  # noqa: S704 - our own
             energy=energy,
             energy_table=energy_table(energies) if energies else None,
             energy_flights=energy_flights_table(energies, MAX_LISTED) if energies else None,
@@ -177,9 +174,10 @@ def needs_overview(run: LoadedRun) -> bool:
     return many and bool(run.episodes)
 
 
-def _script(name: str) -> str:
-    """Return a script of the page, which travels with the templates."""
-    return (files("airl_mav.report") / "templates" / name).read_text(encoding="utf-8")
+def _scripts() -> list[str]:
+    """Return the scripts of the page: the library, and what shows the views with it."""
+    own = files("airl_mav.report") / "templates" / "scene.js"
+    return [plotly_script(), own.read_text(encoding="utf-8")]
 
 
 def _shown(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[SceneFlight]:
