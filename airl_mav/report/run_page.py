@@ -62,17 +62,11 @@ MAX_LISTED = 200
 
 
 @dataclass(frozen=True)
-class Flight:
-    """One flight as the page shows it."""
+class PicturedFlight:
+    """One flight that the page shows by itself."""
 
-    index: int
-    seed: int
-    outcome: str
-    ended: str
-    """How, for people."""
-    reason: str
+    record: EpisodeRecord
     cause: Cause | None
-    notes: tuple[str, ...]
     pictures: tuple[Picture, ...]
     scene: int | None
     """Its number in the view in three dimensions; None where it has no path."""
@@ -200,7 +194,7 @@ def _flights(
     arenas: Mapping[int, Arena],
     shown: Sequence[SceneFlight],
     causes: Mapping[int, Cause],
-) -> list[Flight]:
+) -> list[PicturedFlight]:
     """Draw the flights that get pictures, the worst first."""
     numbers = {flight.record.index: k for k, flight in enumerate(shown)}
     top_speed = _top_speed(shown)
@@ -211,19 +205,7 @@ def _flights(
         pictures = [map_figure(episode, path, arenas.get(episode.index), top_speed)]
         if path is not None:
             pictures.append(time_figure(episode, path))
-        flights.append(
-            Flight(
-                index=episode.index,
-                seed=episode.seed,
-                outcome=episode.outcome.value,
-                ended=OUTCOME_LABELS[episode.outcome],
-                reason=episode.reason,
-                cause=causes.get(episode.index),
-                notes=episode.notes,
-                pictures=tuple(pictures),
-                scene=number,
-            )
-        )
+        flights.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))
     return flights
 
 

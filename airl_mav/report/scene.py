@@ -341,8 +341,11 @@ def _layout() -> dict[str, Any]:
         {"label": label, "method": "relayout", "args": [{"scene.camera.eye": _eye(eye)}]}
         for label, eye in eyes.items()
     ]
-    low = {"rangemode": "tozero"}
-    titles = (("xaxis", "east [m]", {}), ("yaxis", "north [m]", {}), ("zaxis", "up [m]", low))
+    axes: dict[str, dict[str, Any]] = {
+        "xaxis": {"title": {"text": "east [m]"}},
+        "yaxis": {"title": {"text": "north [m]"}},
+        "zaxis": {"title": {"text": "up [m]"}, "rangemode": "tozero"},
+    }
     return {
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
         "paper_bgcolor": "rgba(0,0,0,0)",
@@ -350,7 +353,7 @@ def _layout() -> dict[str, Any]:
         "legend": {"x": 0.0, "y": 0.0},
         "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#5c646e", "activecolor": "#2f7fc4"},
         "scene": {
-            **{axis: {"title": {"text": text}, **more} for axis, text, more in titles},
+            **axes,
             "aspectmode": "data",
             "camera": {"eye": _eye(next(iter(eyes.values()))), "center": _eye((0.0, 0.0, -0.2))},
         },
