@@ -14,7 +14,6 @@ from airl_mav.experiments.experiment import (
     run_and_compare,
 )
 from airl_mav.policy.registry import find_policy
-from airl_mav.report.comparison.degradation import degradation_recipe
 from airl_mav.scenario.model import Scenario
 
 NATIVE = "native"
@@ -78,6 +77,5 @@ def declare_degradation(
         name=f"{'-'.join(find_policy(name).name for name in names)}",
         facts={"policies": [find_policy(name).name for name in names], **facts},
         cells=tuple(cells),
-        recipe=degradation_recipe,
         roles=roles,
     )

@@ -18,7 +18,6 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult, add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
-from airl_mav.report.comparison.matrix import matrix_recipe
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 
 SHARED = ("level", "vehicle", "computer", "workload", "latency", "ablate", "episodes", "seed")
@@ -69,7 +68,6 @@ def matrix(scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = 
         name=f"{len(policies)}-policies",
         facts=facts,
         cells=cells,
-        recipe=matrix_recipe,
         roles={
             cell.name: entry_of(
                 cell, label=cell.scenario.policy.name, group=cell.scenario.arena_name

@@ -27,7 +27,7 @@ from airl_mav.experiments.store import (
 )
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
-from airl_mav.report.comparison.model import Comparison, ComparisonRecipe, Kind, RunEntry
+from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
 from airl_mav.report.comparison.show import build_comparison, write_comparison
 from airl_mav.report.table import OUTCOME_LABELS
 from airl_mav.scenario.model import Scenario, free_fields
@@ -44,8 +44,6 @@ class Experiment:
     facts: dict[str, Any]
     """What heads the comparison."""
     cells: tuple[Cell, ...]
-    recipe: Callable[[Mapping[str, Any], Sequence[RunEntry]], ComparisonRecipe]
-    """Says which runs are compared with which."""
     roles: Mapping[str, RunEntry] = field(default_factory=dict)
     """What the run of a cell is in the comparison, by the cell's name; its folder is filled in."""
     remarks: tuple[str, ...] = ()
@@ -115,8 +113,7 @@ class ExperimentRun:
             for flown in self.cells
         ]
         experiment = self.experiment
-        recipe = experiment.recipe(experiment.facts, entries)
-        comparison, loaded = build_comparison(self.path, experiment.kind, recipe)
+        comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
         return comparison, loaded, write_comparison(comparison, loaded, self.path)
 
 

@@ -21,7 +21,7 @@ from airl_mav.experiments.experiment import (
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.report.comparison.gap import Role, gap_recipe
+from airl_mav.report.comparison.gap import Role
 from airl_mav.report.comparison.model import RunEntry
 from airl_mav.scenario.model import Scenario
 
@@ -148,7 +148,7 @@ def declare_gap(
         "remarks": list(remarks),
     }
     name = f"{policy.name}-{target.name}"
-    return Experiment("gap", name, facts, tuple(cells), gap_recipe, roles, remarks)
+    return Experiment("gap", name, facts, tuple(cells), roles, remarks)
 
 
 def _cells(

@@ -13,7 +13,6 @@ from airl_mav.experiments.experiment import (
     make_cell,
     run_and_compare,
 )
-from airl_mav.report.comparison.ladder import ladder_recipe
 from airl_mav.scenario.model import LevelName, Scenario
 
 LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
@@ -76,7 +75,6 @@ def declare_ladder(
         name=f"{policy.name}-{arena}",
         facts=facts,
         cells=cells,
-        recipe=ladder_recipe,
         roles={cell.name: entry_of(cell) for cell in cells},
     )
 

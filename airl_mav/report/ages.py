@@ -12,7 +12,14 @@ from airl_mav.latency.coordinated_omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.table import Column, TableView, ms, percentile_cell
+from airl_mav.report.table import (
+    DURATION_COLUMNS,
+    Column,
+    TableView,
+    duration_cells,
+    ms,
+    percentile_cell,
+)
 
 
 def run_ages(run: LoadedRun) -> CommandAges:
@@ -50,20 +57,10 @@ def ages_table(ages: CommandAges, end_to_end: Summary) -> TableView | None:
         return None
     columns = (
         Column("how old the flown command was", number=False),
-        Column("n"),
-        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+        *DURATION_COLUMNS,
     )
-    s = end_to_end
     rows = (
-        (
-            "as it took effect, by decision",
-            f"{s.n:,}",
-            ms(s.mean),
-            ms(s.p50),
-            percentile_cell(s.p90, s.n),
-            percentile_cell(s.p99, s.n),
-            ms(s.max),
-        ),
+        ("as it took effect, by decision", *duration_cells(end_to_end)),
         (
             "at any moment, by time",
             f"{n:,}",

@@ -11,17 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    Picture,
-    label_axes,
-    legend_below,
-    line_style,
-    new_figure,
-    plain_axes,
-    render,
-)
+from airl_mav.report import theme
 
 
 @dataclass(frozen=True)
@@ -43,7 +33,7 @@ class Group:
 
 def bars_picture(
     name: str, title: str, series: Sequence[str], groups: Sequence[Group], unit: str = "success [%]"
-) -> Picture:
+) -> theme.Picture:
     """Draw rates in percent.
 
     Args:
@@ -53,7 +43,7 @@ def bars_picture(
         groups: One or more, from left to right.
         unit: What the bars measure.
     """
-    figure = new_figure(1.4 + 1.5 * len(groups), 3.4)
+    figure = theme.new_figure(1.4 + 1.5 * len(groups), 3.4)
     ax: Axes = figure.subplots()
     width = 0.8 / len(series)
     marked = False
@@ -61,27 +51,29 @@ def bars_picture(
         for i, bar in enumerate(group.bars):
             at = g + (i - 0.5 * (len(series) - 1)) * width
             if bar.rate.value is not None:
-                _draw_bar(ax, at, width, bar.rate, line_style(i).colour)
+                _draw_bar(ax, at, width, bar.rate, theme.line_style(i).colour)
             if bar.paper_percent is not None:
                 marked = True
-                ax.plot(at, bar.paper_percent, marker="D", ms=6, color=MARK, mfc="none", mew=1.5)
+                ax.plot(
+                    at, bar.paper_percent, marker="D", ms=6, color=theme.MARK, mfc="none", mew=1.5
+                )
     ax.set_xticks(np.arange(len(groups)), [group.name for group in groups])
     ax.set_ylim(0, 108)
     ax.set_yticks([0, 25, 50, 75, 100])
-    label_axes(ax, "", unit, title)
-    plain_axes(ax)
+    theme.label_axes(ax, "", unit, title)
+    theme.plain_axes(ax)
     ax.grid(False, axis="x")
-    ax.tick_params(axis="x", labelsize=8.5, labelcolor=INK)
+    ax.tick_params(axis="x", labelsize=8.5, labelcolor=theme.INK)
     handles: list[Patch | Line2D] = [
-        Patch(color=line_style(i).colour, label=text) for i, text in enumerate(series)
+        Patch(color=theme.line_style(i).colour, label=text) for i, text in enumerate(series)
     ]
     if marked:
         handles.append(
-            Line2D([], [], ls="none", marker="D", color=MARK, mfc="none", label="the paper")
+            Line2D([], [], ls="none", marker="D", color=theme.MARK, mfc="none", label="the paper")
         )
-    legend_below(figure, 3, handles=handles)
+    theme.legend_below(figure, 3, handles=handles)
     told = ", ".join(group.name for group in groups)
-    return render(figure, name, f"{title}: {', '.join(series)} in {told}")
+    return theme.render(figure, name, f"{title}: {', '.join(series)} in {told}")
 
 
 def _draw_bar(ax: Axes, at: float, width: float, rate: Estimate, colour: str) -> None:
@@ -89,7 +81,7 @@ def _draw_bar(ax: Axes, at: float, width: float, rate: Estimate, colour: str) ->
     value = 100.0 * (rate.value or 0.0)
     ax.bar(at, value, width=0.9 * width, color=colour)
     if rate.low is not None and rate.high is not None:
-        ax.plot([at, at], [100.0 * rate.low, 100.0 * rate.high], color=INK, lw=1.2)
+        ax.plot([at, at], [100.0 * rate.low, 100.0 * rate.high], color=theme.INK, lw=1.2)
     ax.annotate(
         f"{value:.0f}",
         (at, 100.0 * (rate.high if rate.high is not None else rate.value or 0.0)),
@@ -98,5 +90,5 @@ def _draw_bar(ax: Axes, at: float, width: float, rate: Estimate, colour: str) ->
         ha="center",
         va="bottom",
         fontsize=7.5,
-        color=INK,
+        color=theme.INK,
     )

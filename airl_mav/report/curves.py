@@ -8,16 +8,7 @@ from dataclasses import dataclass
 from matplotlib.axes import Axes
 
 from airl_mav.flight.statistics import Estimate
-from airl_mav.report.theme import (
-    MARK,
-    Picture,
-    label_axes,
-    legend_below,
-    line_style,
-    new_figure,
-    plain_axes,
-    render,
-)
+from airl_mav.report import theme
 
 
 @dataclass(frozen=True)
@@ -35,7 +26,7 @@ def curves_picture(
     labels: tuple[str, str],
     series: Sequence[Series],
     paper: Sequence[tuple[float, float]] = (),
-) -> Picture:
+) -> theme.Picture:
     """Draw series over a common axis.
 
     Args:
@@ -45,10 +36,10 @@ def curves_picture(
         series: The lines; intervals are drawn where they are known.
         paper: Points that the paper has.
     """
-    figure = new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
+    figure = theme.new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
     ax: Axes = figure.subplots()
     for index, line in enumerate(series):
-        colour, dashes = line_style(index)
+        colour, dashes = theme.line_style(index)
         known = [(x, e) for x, e in line.points if e.value is not None]
         x = [at for at, _ in known]
         y = [e.value or 0.0 for _, e in known]
@@ -68,10 +59,12 @@ def curves_picture(
         )
     if paper:
         at, values = zip(*paper, strict=True)
-        ax.plot(at, values, ls="none", marker="D", ms=5, color=MARK, mfc="none", label="the paper")
-    label_axes(ax, *labels, title)
+        ax.plot(
+            at, values, ls="none", marker="D", ms=5, color=theme.MARK, mfc="none", label="the paper"
+        )
+    theme.label_axes(ax, *labels, title)
     ax.set_xlim(left=0.0)
-    plain_axes(ax)
-    legend_below(figure, 1)
+    theme.plain_axes(ax)
+    theme.legend_below(figure, 1)
     told = ", ".join(line.name for line in series)
-    return render(figure, name, f"{title} over {labels[0]}: {told}")
+    return theme.render(figure, name, f"{title} over {labels[0]}: {told}")

@@ -13,19 +13,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import Power
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import theme
 from airl_mav.report.run_tables import failures_first
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    MUTED,
-    SERIES,
-    SERIES_SOFT,
-    Picture,
-    new_figure,
-    plain_axes,
-    render,
-)
 
 ENERGY_NAME = "energy"
 
@@ -42,9 +32,9 @@ HIGH = 2.0
 """Flights with more than this times the 95th percentile would press all others flat: cut off."""
 
 PARTS = (
-    ("hover_j", "hovering", SERIES),
-    ("manoeuvre_j", "manoeuvres", MARK),
-    ("motion_j", "speed", SERIES_SOFT),
+    ("hover_j", "hovering", theme.SERIES),
+    ("manoeuvre_j", "manoeuvres", theme.MARK),
+    ("motion_j", "speed", theme.SERIES_SOFT),
     ("computer_j", "computer", COMPUTER_COLOUR),
 )
 
@@ -164,9 +154,9 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     )
 
 
-def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
+def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     """Draw the energy of each flight (at least one), its parts on top of each other."""
-    figure = new_figure(6.4, 3.4)
+    figure = theme.new_figure(6.4, 3.4)
     ax = figure.subplots()
     many = len(flights) > BARS
     ranked = list(flights)
@@ -178,7 +168,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
     whole = all(f.parts is not None for f in flights)
     x = kept
     above, below = np.zeros(len(ranked)), np.zeros(len(ranked))
-    for name, title, colour in PARTS if whole else (("", "airframe", SERIES), PARTS[-1]):
+    for name, title, colour in PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1]):
         values = np.array([_joules(f, name) for f in ranked]) / 1e3
         # What is below 0 hangs below the axis: the bar above it is longer than the energy drawn.
         base = np.where(values < 0.0, below, above)
@@ -192,10 +182,13 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
         ax.set_ylim(top=top)
         over = sum(f.airframe_j + f.computer_j > 1e3 * top for f in flights)
         ax.set_title(
-            f"{over} above, up to {above.max():,.0f} kJ", loc="right", fontsize=8.5, color=MARK
+            f"{over} above, up to {above.max():,.0f} kJ",
+            loc="right",
+            fontsize=8.5,
+            color=theme.MARK,
         )
-    ax.axhline(0.0, color=MUTED, lw=0.8)
-    ax.set_ylabel("kJ", fontsize=8.5, color=MUTED)
+    ax.axhline(0.0, color=theme.MUTED, lw=0.8)
+    ax.set_ylabel("kJ", fontsize=8.5, color=theme.MUTED)
     if many:
         label = "flights, sorted by their energy"
         ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -204,16 +197,16 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> Picture:
         label = "flight"
         step = -(-len(ranked) // 20)
         ax.set_xticks(x[::step], [f"{f.record.index}" for f in ranked[::step]])
-    ax.set_xlabel(label, fontsize=8.5, color=MUTED)
-    plain_axes(ax)
+    ax.set_xlabel(label, fontsize=8.5, color=theme.MUTED)
+    theme.plain_axes(ax)
     ax.grid(False, axis="x")
     figure.legend(
-        loc="outside upper left", ncols=4, frameon=False, fontsize=8.5, labelcolor=INK,
+        loc="outside upper left", ncols=4, frameon=False, fontsize=8.5, labelcolor=theme.INK,
         handlelength=1.0, handletextpad=0.5, columnspacing=1.4,
     )  # fmt: skip
     titles = ", ".join(title for _, title, _ in PARTS) if whole else "airframe, computer"
     alt = f"Energy of each of {len(flights)} flights by part: {titles}"
-    return render(figure, ENERGY_NAME, alt)
+    return theme.render(figure, ENERGY_NAME, alt)
 
 
 def _joules(flight: FlightEnergy, name: str) -> float:

@@ -21,19 +21,9 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import theme
 from airl_mav.report.run_figures import OUTCOME_COLOURS, OUTCOME_MARKERS
 from airl_mav.report.table import OUTCOME_LABELS
-from airl_mav.report.theme import (
-    INK,
-    MUTED,
-    RULE,
-    Picture,
-    label_axes,
-    legend_below,
-    new_figure,
-    plain_axes,
-    render,
-)
 
 OVERVIEW_NAME = "trajectories"
 
@@ -75,7 +65,7 @@ class _Extent:
         return min(max(tall, 0.45), 1.6)
 
 
-def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[Picture]:
+def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]:
     """Draw every panel by itself; their axes are the same.
 
     Args:
@@ -101,7 +91,7 @@ def write_overview(run: LoadedRun, arenas: Mapping[int, Arena]) -> None:
     replace_file(run.path / f"{picture.name}.png", picture.png)
 
 
-def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> Picture:
+def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Picture:
     """Draw all flights of a run, coloured by how they ended.
 
     Args:
@@ -134,12 +124,14 @@ def _extent(panels: Sequence[Panel]) -> _Extent:
     return _Extent((float(north_min), float(north_max)), (float(east_min), float(east_max)))
 
 
-def _draw_panel(name: str, alt: str, panel: Panel, extent: _Extent, *, width_in: float) -> Picture:
+def _draw_panel(
+    name: str, alt: str, panel: Panel, extent: _Extent, *, width_in: float
+) -> theme.Picture:
     """Draw one panel.
 
     Every seed has its own obstacles, so they are drawn only where all flights have one seed.
     """
-    figure = new_figure(width_in, 1.05 + 0.9 * width_in * extent.tall)
+    figure = theme.new_figure(width_in, 1.05 + 0.9 * width_in * extent.tall)
     ax: Axes = figure.subplots()
     seeds = {flight.arena_seed for flight in panel.episodes}
     if panel.arena is not None and seeds == {panel.arena.seed}:
@@ -159,12 +151,12 @@ def _draw_panel(name: str, alt: str, panel: Panel, extent: _Extent, *, width_in:
     ax.set_anchor("N")
     ax.set_xlim(extent.east)
     ax.set_ylim(extent.north)
-    plain_axes(ax, grid=False)
-    label_axes(ax, "east of the start [m]", "north of the start [m]")
+    theme.plain_axes(ax, grid=False)
+    theme.label_axes(ax, "east of the start [m]", "north of the start [m]")
     if panel.title:
-        figure.suptitle(panel.title, x=0.02, ha="left", fontsize=10.5, color=INK)
-        ax.set_title(panel.detail, loc="left", fontsize=8.5, color=MUTED, pad=6)
-    legend_below(
+        figure.suptitle(panel.title, x=0.02, ha="left", fontsize=10.5, color=theme.INK)
+        ax.set_title(panel.detail, loc="left", fontsize=8.5, color=theme.MUTED, pad=6)
+    theme.legend_below(
         figure,
         4,
         handles=_legend(panel.episodes),
@@ -172,7 +164,7 @@ def _draw_panel(name: str, alt: str, panel: Panel, extent: _Extent, *, width_in:
         handletextpad=0.3,
         columnspacing=0.9,
     )
-    return render(figure, name, alt)
+    return theme.render(figure, name, alt)
 
 
 def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
@@ -181,7 +173,7 @@ def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
         b = bounds
         size = b.east_max - b.east_min, b.north_max - b.north_min
         corner = (b.east_min, b.north_min)
-        ax.add_patch(Rectangle(corner, *size, facecolor=FLOOR_COLOUR, edgecolor=RULE, lw=1.5))
+        ax.add_patch(Rectangle(corner, *size, facecolor=FLOOR_COLOUR, edgecolor=theme.RULE, lw=1.5))
     ax.plot(0.0, 0.0, marker="^", ms=10, color=START_COLOUR, mec="white", mew=0.8, zorder=5)
 
 

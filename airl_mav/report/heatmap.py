@@ -15,17 +15,7 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    MUTED,
-    RULE,
-    Picture,
-    label_axes,
-    new_figure,
-    plain_axes,
-    render,
-)
+from airl_mav.report import theme
 
 CELL_WIDTH_IN, CELL_HEIGHT_IN = 1.12, 0.62
 MARGIN_IN = (1.15, 1.05)
@@ -86,7 +76,7 @@ def colours() -> Colormap:
     return ListedColormap(colormaps["YlGnBu"](np.linspace(0.06, 0.92, 256)), name="fields")
 
 
-def heat_picture(name: str, alt: str, heat: HeatMap) -> Picture:
+def heat_picture(name: str, alt: str, heat: HeatMap) -> theme.Picture:
     """Draw a heat map by itself.
 
     Args:
@@ -94,9 +84,9 @@ def heat_picture(name: str, alt: str, heat: HeatMap) -> Picture:
         alt: What it shows.
         heat: What to draw.
     """
-    figure = new_figure(*heat.size_in)
+    figure = theme.new_figure(*heat.size_in)
     draw_heat_map(figure, heat)
-    return render(figure, name, alt)
+    return theme.render(figure, name, alt)
 
 
 def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
@@ -111,20 +101,28 @@ def draw_heat_map(figure: Figure | SubFigure, heat: HeatMap) -> Axes:
     ax.set_ylim(-0.5, len(heat.rows) - 0.5)
     ax.set_xticks(range(len(heat.columns)), [f"{column}" for column in heat.columns])
     ax.set_yticks(range(len(heat.rows)), [f"{row}" for row in heat.rows])
-    label_axes(ax, heat.column_title, heat.row_title)
-    ax.set_title(heat.title, loc="left", fontsize=10.5, color=INK, pad=16 if heat.note else 6)
+    theme.label_axes(ax, heat.column_title, heat.row_title)
+    ax.set_title(heat.title, loc="left", fontsize=10.5, color=theme.INK, pad=16 if heat.note else 6)
     if heat.note:
-        ax.text(0.0, 1.0, heat.note, transform=ax.transAxes, va="bottom", fontsize=8.5, color=MUTED)
-    plain_axes(ax, grid=False)
-    ax.tick_params(labelsize=9, labelcolor=INK)
+        ax.text(
+            0.0,
+            1.0,
+            heat.note,
+            transform=ax.transAxes,
+            va="bottom",
+            fontsize=8.5,
+            color=theme.MUTED,
+        )
+    theme.plain_axes(ax, grid=False)
+    ax.tick_params(labelsize=9, labelcolor=theme.INK)
     bar = figure.colorbar(ScalarMappable(norm, shades), ax=ax, fraction=0.06, pad=0.02)
     bar.outline.set_visible(False)
-    bar.ax.tick_params(colors=MUTED, labelsize=8, length=0, which="both")
+    bar.ax.tick_params(colors=theme.MUTED, labelsize=8, length=0, which="both")
     if heat.logarithmic:
         bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
         bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    bar.set_label(heat.unit, fontsize=8.5, color=MUTED)
+    bar.set_label(heat.unit, fontsize=8.5, color=theme.MUTED)
     return ax
 
 
@@ -142,7 +140,9 @@ def _draw_field(
     corner = (x - 0.48, y - 0.47)
     if told is None:
         ax.add_patch(
-            Rectangle(corner, 0.96, 0.94, facecolor="none", edgecolor=RULE, hatch="///", lw=0.6)
+            Rectangle(
+                corner, 0.96, 0.94, facecolor="none", edgecolor=theme.RULE, hatch="///", lw=0.6
+            )
         )
         return
     colour = shades(norm(told.value))
@@ -155,7 +155,7 @@ def _draw_field(
                 0.91,
                 0.87,
                 facecolor="none",
-                edgecolor=MARK,
+                edgecolor=theme.MARK,
                 lw=2.2,
                 zorder=3,
             )

@@ -25,20 +25,8 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stages import Samples, Stage
+from airl_mav.report import theme
 from airl_mav.report.table import OUTCOME_LABELS, US_PER_MS, ms
-from airl_mav.report.theme import (
-    HALO,
-    INK,
-    MARK,
-    MUTED,
-    RULE,
-    SERIES,
-    SERIES_SOFT,
-    Picture,
-    new_figure,
-    plain_axes,
-    render,
-)
 
 LONG_TAIL = 30.0
 """A maximum this many times the median: the axis becomes logarithmic."""
@@ -70,22 +58,22 @@ def speed_colours() -> Colormap:
     return ListedColormap(colormaps["viridis"](np.linspace(0.05, 0.9, 256)), name="speed")
 
 
-def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> Picture:
+def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Picture:
     """Draw how one stage's durations (n,) [µs] spread: histogram above, cumulated share below.
 
     Its percentiles are marked on the lower axes.
     """
-    figure = new_figure(4.2, 2.6)
+    figure = theme.new_figure(4.2, 2.6)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.1, 1.0))
     values = np.sort(samples) / US_PER_MS
     edges = _bin_edges(values)
-    top.hist(values, edges, color=SERIES_SOFT, edgecolor=SERIES, linewidth=0.4)
+    top.hist(values, edges, color=theme.SERIES_SOFT, edgecolor=theme.SERIES, linewidth=0.4)
     share = 100.0 * np.arange(1, len(values) + 1) / len(values)
     bottom.step(
         [edges[0], *values, edges[-1]],
         [0.0, *share, 100.0],
         where="post",
-        color=SERIES,
+        color=theme.SERIES,
         linewidth=1.4,
     )
     marks = []
@@ -96,15 +84,17 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> Picture:
     ):
         if at_us is not None:
             marks.append(f"{name} {ms(at_us)}")
-            bottom.plot(at_us / US_PER_MS, level, "o", ms=4, color=MARK, clip_on=False, zorder=3)
-    top.set_title(stage.title, loc="left", fontsize=10.5, color=INK, pad=6)
-    top.set_title("   ".join(marks), loc="right", fontsize=8.5, color=MARK, pad=6)
-    top.set_ylabel("decisions", fontsize=8.5, color=MUTED)
+            bottom.plot(
+                at_us / US_PER_MS, level, "o", ms=4, color=theme.MARK, clip_on=False, zorder=3
+            )
+    top.set_title(stage.title, loc="left", fontsize=10.5, color=theme.INK, pad=6)
+    top.set_title("   ".join(marks), loc="right", fontsize=8.5, color=theme.MARK, pad=6)
+    top.set_ylabel("decisions", fontsize=8.5, color=theme.MUTED)
     top.yaxis.set_major_locator(MaxNLocator(3, integer=True))
-    bottom.set_ylabel("share [%]", fontsize=8.5, color=MUTED)
+    bottom.set_ylabel("share [%]", fontsize=8.5, color=theme.MUTED)
     bottom.set_yticks([0, 50, 100])
     bottom.set_ylim(0, 104)
-    bottom.set_xlabel(f"ms, n = {summary.n:,}", fontsize=8.5, color=MUTED)
+    bottom.set_xlabel(f"ms, n = {summary.n:,}", fontsize=8.5, color=theme.MUTED)
     if long_tail(values):
         bottom.set_xscale("log")
         bottom.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -112,9 +102,9 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> Picture:
     else:
         bottom.xaxis.set_major_locator(MaxNLocator(5))
     for ax in (top, bottom):
-        plain_axes(ax)
+        theme.plain_axes(ax)
     alt = f"Histogram and cumulated distribution of {stage.title}: {stage.meaning}"
-    return render(figure, f"latency-{stage.key.replace('_', '-')}", alt)
+    return theme.render(figure, f"latency-{stage.key.replace('_', '-')}", alt)
 
 
 def long_tail(values: NDArray[np.float64]) -> bool:
@@ -138,7 +128,7 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 
 def map_figure(
     episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
-) -> Picture:
+) -> theme.Picture:
     """Draw a flight from above over its arena, as the arena was when the flight ended.
 
     Args:
@@ -152,7 +142,7 @@ def map_figure(
         b = arena.bounds
         tall = (b.north_max - b.north_min) / (b.east_max - b.east_min)
     # The map takes 4.15 inches across; axis labels and legend about one inch of the height.
-    figure = new_figure(5.2, 1.0 + 4.15 * min(max(tall, 0.5), 1.6))
+    figure = theme.new_figure(5.2, 1.0 + 4.15 * min(max(tall, 0.5), 1.6))
     ax = figure.add_subplot()
     if arena is not None:
         ended_us = episode.ended_us - episode.started_us
@@ -161,9 +151,9 @@ def map_figure(
         _draw_goal(ax, episode)
     if trajectory is not None and len(trajectory) > 1:
         _draw_path(figure, ax, episode, trajectory, top_speed)
-    plain_axes(ax, grid=False)
-    ax.xaxis.label.set(color=MUTED, fontsize=8.5)
-    ax.yaxis.label.set(color=MUTED, fontsize=8.5)
+    theme.plain_axes(ax, grid=False)
+    ax.xaxis.label.set(color=theme.MUTED, fontsize=8.5)
+    ax.yaxis.label.set(color=theme.MUTED, fontsize=8.5)
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(
         handles,
@@ -172,13 +162,13 @@ def map_figure(
         ncols=3,
         frameon=False,
         fontsize=8,
-        labelcolor=INK,
+        labelcolor=theme.INK,
         handletextpad=0.4,
         columnspacing=1.2,
     )
     words = OUTCOME_LABELS[episode.outcome]
     alt = f"Flight {episode.index} from above, coloured by speed: {words}, {episode.reason}"
-    return render(figure, f"flight-{episode.index:03d}-map", alt)
+    return theme.render(figure, f"flight-{episode.index:03d}-map", alt)
 
 
 def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
@@ -189,7 +179,9 @@ def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
         Circle((east, north), episode.goal_radius_m, facecolor="none", edgecolor=colour, lw=1.0)
     )
     ax.plot(east, north, marker="*", ms=15, color=colour, ls="none", label="goal")
-    ax.plot(0.0, 0.0, marker="^", ms=11, color=SERIES, ls="none", label="start, heading north")
+    ax.plot(
+        0.0, 0.0, marker="^", ms=11, color=theme.SERIES, ls="none", label="start, heading north"
+    )
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("east [m]")
     ax.set_ylabel("north [m]")
@@ -206,7 +198,7 @@ def _draw_path(
     speed = trajectory.speed()[keep]
     colours = speed_colours()
     scale = Normalize(0.0, top_speed)
-    ax.plot(*points.T, color=HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
+    ax.plot(*points.T, color=theme.HALO, lw=4.2, zorder=2.5, solid_capstyle="round")
     pieces, levels = coloured_pieces(points, 0.5 * (speed[1:] + speed[:-1]), top_speed)
     path = LineCollection(
         pieces,
@@ -240,8 +232,8 @@ def speed_bar(bar: Colorbar) -> None:
         # 256 colour steps weigh less as pixels than as shapes.
         bar.solids.set_rasterized(True)
     bar.outline.set_visible(False)
-    bar.set_label("speed [m/s]", fontsize=8.5, color=MUTED)
-    bar.ax.tick_params(colors=MUTED, labelsize=8, length=0)
+    bar.set_label("speed [m/s]", fontsize=8.5, color=theme.MUTED)
+    bar.ax.tick_params(colors=theme.MUTED, labelsize=8, length=0)
 
 
 def coloured_pieces(
@@ -265,9 +257,9 @@ def coloured_pieces(
     return pieces, (levels[np.array(starts)] + 0.5) * step
 
 
-def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
+def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture:
     """Draw speed, altitude and power over time, zero where navigation begins."""
-    figure = new_figure(5.2, 4.9)
+    figure = theme.new_figure(5.2, 4.9)
     zero_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
     keep = np.unique(np.linspace(0, len(trajectory) - 1, TIME_POINTS).astype(int))
     # Power is a mean since the sample before: so it stays when samples are left out.
@@ -285,12 +277,12 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
         )
     )
     for ax, label, values in rows:
-        ax.plot(t, values, color=SERIES, lw=1.2)
-        ax.set_ylabel(label, fontsize=8.5, color=MUTED)
+        ax.plot(t, values, color=theme.SERIES, lw=1.2)
+        ax.set_ylabel(label, fontsize=8.5, color=theme.MUTED)
         ax.set_ylim(bottom=min(0.0, float(values.min())))
         if t[0] < 0.0:
-            ax.axvspan(t[0], 0.0, color=RULE, alpha=0.45, lw=0)
-        plain_axes(ax)
+            ax.axvspan(t[0], 0.0, color=theme.RULE, alpha=0.45, lw=0)
+        theme.plain_axes(ax)
         ax.set_xlim(t[0], t[-1])
     if t[0] < 0.0:
         rows[0][0].annotate(
@@ -301,8 +293,10 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> Picture:
             textcoords="offset points",
             va="top",
             fontsize=8,
-            color=MUTED,
+            color=theme.MUTED,
         )
-    rows[-1][0].set_xlabel("time since the start of navigation [s]", fontsize=8.5, color=MUTED)
+    rows[-1][0].set_xlabel(
+        "time since the start of navigation [s]", fontsize=8.5, color=theme.MUTED
+    )
     alt = f"Speed, altitude and power over time, flight {episode.index}"
-    return render(figure, f"flight-{episode.index:03d}-time", alt)
+    return theme.render(figure, f"flight-{episode.index:03d}-time", alt)

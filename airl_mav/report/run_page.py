@@ -49,8 +49,7 @@ from airl_mav.report.run_tables import (
     real_time_table,
     setup_rows,
 )
-from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json
-from airl_mav.report.scene_figure import scene_figure
+from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import Picture, montage
 from airl_mav.report.timeline import RULE_WORDS, slowest_table, timeline_figure, timeline_of
@@ -63,17 +62,11 @@ MAX_LISTED = 200
 
 
 @dataclass(frozen=True)
-class Flight:
-    """One flight as the page shows it."""
+class PicturedFlight:
+    """One flight that the page shows by itself."""
 
-    index: int
-    seed: int
-    outcome: str
-    ended: str
-    """How, for people."""
-    reason: str
+    record: EpisodeRecord
     cause: Cause | None
-    notes: tuple[str, ...]
     pictures: tuple[Picture, ...]
     scene: int | None
     """Its number in the view in three dimensions; None where it has no path."""
@@ -113,8 +106,7 @@ def build_page(
     judged = examine_worst(run, arenas, vehicle)
     shown = _shown(run, arenas)
     flights = _flights(run, arenas, shown, {j.record.index: j.cause for j in judged})
-    solid = scene_figure(shown[0], _top_speed(shown)) if shown else None
-    alone = [overview, timeline, energy, solid]
+    alone = [overview, timeline, energy]
     pictures = [picture for flight in flights for picture in flight.pictures]
     for picture in [*pictures, *(picture for picture in alone if picture)]:
         replace_file(folder / f"{picture.name}.png", picture.png)
@@ -140,11 +132,10 @@ def build_page(
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,
             causes=causes_table(judged, run),
-            scene_picture=solid,
             scene_flights=[(k, flight) for k, flight in enumerate(shown)],
             scene_all=len(everyone),
             scene_data=Markup(scene_json(run, shown, everyone, fov)),  # noqa: S704 - escaped there
-            scene_script=Markup(_script("scene.js")),  # noqa: S704 - our own
+            scene_scripts=[Markup(text) for text in _scripts()] if shown else [],  # noqa: S704 - our own
             energy=energy,
             energy_table=energy_table(energies) if energies else None,
             energy_flights=energy_flights_table(energies, MAX_LISTED) if energies else None,
@@ -177,9 +168,10 @@ def needs_overview(run: LoadedRun) -> bool:
     return many and bool(run.episodes)
 
 
-def _script(name: str) -> str:
-    """Return a script of the page, which travels with the templates."""
-    return (files("airl_mav.report") / "templates" / name).read_text(encoding="utf-8")
+def _scripts() -> list[str]:
+    """Return the scripts of the page: the library, and what shows the views with it."""
+    own = files("airl_mav.report") / "templates" / "scene.js"
+    return [plotly_script(), own.read_text(encoding="utf-8")]
 
 
 def _shown(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[SceneFlight]:
@@ -202,7 +194,7 @@ def _flights(
     arenas: Mapping[int, Arena],
     shown: Sequence[SceneFlight],
     causes: Mapping[int, Cause],
-) -> list[Flight]:
+) -> list[PicturedFlight]:
     """Draw the flights that get pictures, the worst first."""
     numbers = {flight.record.index: k for k, flight in enumerate(shown)}
     top_speed = _top_speed(shown)
@@ -213,19 +205,7 @@ def _flights(
         pictures = [map_figure(episode, path, arenas.get(episode.index), top_speed)]
         if path is not None:
             pictures.append(time_figure(episode, path))
-        flights.append(
-            Flight(
-                index=episode.index,
-                seed=episode.seed,
-                outcome=episode.outcome.value,
-                ended=OUTCOME_LABELS[episode.outcome],
-                reason=episode.reason,
-                cause=causes.get(episode.index),
-                notes=episode.notes,
-                pictures=tuple(pictures),
-                scene=number,
-            )
-        )
+        flights.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))
     return flights
 
 

@@ -5,10 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Aggregate, Estimate, aggregate, median_of
@@ -22,8 +18,7 @@ from airl_mav.latency.stages import (
     pool,
     stage_samples,
 )
-from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.rehearsal.run_folder import TICK_LATENESS, LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun
 
 MODELLED_STAGES = tuple(
     SETPOINT_TO_MOTOR if stage.key == "link" else stage
@@ -37,23 +32,6 @@ MEASURES = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "mea
 
 
 @dataclass(frozen=True)
-class RealTime:
-    """How well a run kept pace with the wall clock."""
-
-    tick_lateness: Summary
-    factor: float | None
-    """Simulated seconds per wall second over all episodes that were not aborted; None where time
-    was not paced."""
-    slipped_us: int
-    """Simulated time given up [µs]."""
-    setpoint_to_motor: Summary
-    setpoints: int
-    """Setpoints sent."""
-    unmatched: int
-    """Setpoints sent that the autopilot's log does not hold."""
-
-
-@dataclass(frozen=True)
 class RunSummary:
     """Everything that a report's tables say."""
 
@@ -64,7 +42,6 @@ class RunSummary:
     quality: Aggregate
     medians: dict[str, Estimate]
     """Of the same flights as the means of `quality`, by its field."""
-    real_time: RealTime
     modelled: bool
     """Times come from a model and were not measured: level gym."""
     timed: bool
@@ -87,7 +64,6 @@ def summarize_run(run: LoadedRun) -> RunSummary:
         samples=samples,
         quality=aggregate(run.episodes),
         medians=_medians(run.episodes),
-        real_time=_real_time(run, stages),
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
     )
@@ -97,22 +73,3 @@ def _medians(episodes: Sequence[EpisodeRecord]) -> dict[str, Estimate]:
     """Return the medians of the flights that reached the goal."""
     good = [e.quality for e in episodes if e.outcome is Outcome.SUCCESS and e.quality is not None]
     return {name: median_of([getattr(quality, name) for quality in good]) for name in MEASURES}
-
-
-def _real_time(run: LoadedRun, stages: dict[str, Summary]) -> RealTime:
-    """Work out how the run kept pace."""
-    nothing: NDArray[np.int64] = np.zeros(0, np.int64)
-    lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
-    accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
-    # An aborted flight ends when its end is noticed: its wall time counts something else.
-    paced = [e for e in run.episodes if e.wall_s and e.outcome is not Outcome.ABORTED]
-    wall_s = sum(episode.wall_s or 0.0 for episode in paced)
-    flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
-    return RealTime(
-        tick_lateness=summarize(np.concatenate([nothing, *lateness])),
-        factor=flown_us / US_PER_S / wall_s if wall_s else None,
-        slipped_us=sum(episode.slipped_us for episode in run.episodes),
-        setpoint_to_motor=stages["setpoint_to_motor"],
-        setpoints=sum(len(stamps) for stamps in accepted),
-        unmatched=sum(int(np.count_nonzero(stamps == NO_STAMP)) for stamps in accepted),
-    )

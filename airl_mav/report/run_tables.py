@@ -4,21 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.setup import Part
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
-from airl_mav.latency.percentiles import Summary
-from airl_mav.rehearsal.run_folder import EPISODES_FILE, LoadedRun
+from airl_mav.latency.percentiles import Summary, summarize
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
 from airl_mav.report.measures import FEW_FLIGHTS, rate_digits
-from airl_mav.report.run_summary import RealTime, RunSummary
+from airl_mav.report.run_summary import RunSummary
 from airl_mav.report.table import (
+    DURATION_COLUMNS,
     NONE,
     OUTCOME_LABELS,
     TOO_FEW_CELL,
     TOO_FEW_NOTE,
     Column,
     TableView,
+    duration_cells,
     ms,
     percentile_cell,
 )
@@ -56,16 +63,13 @@ def latency_table(summary: RunSummary) -> TableView:
     """Return the latencies by stage."""
     columns = (
         Column("stage", number=False),
-        Column("n"),
-        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+        *DURATION_COLUMNS,
         Column("from → to", number=False, page_only=True),
     )
     rows, short = [], False
     for stage in summary.shown_stages:
-        s = summary.stages[stage.key]
-        tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
-        short = short or TOO_FEW_CELL in tail
-        cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
+        cells = duration_cells(summary.stages[stage.key])
+        short = short or TOO_FEW_CELL in cells
         rows.append((stage.title, *cells, stage.meaning))
     notes = ["Milliseconds of simulated time."]
     if summary.modelled:
@@ -186,13 +190,18 @@ def _estimate_row(
 def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
     """Return how the run kept pace with the wall clock."""
     columns = (Column("measure", number=False), Column("value"), Column("n"))
-    rt = summary.real_time
+    nothing: NDArray[np.int64] = np.zeros(0, np.int64)
+    lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
+    accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
+    unmatched = sum(int(np.count_nonzero(stamps == NO_STAMP)) for stamps in accepted)
+    flights = f"{len(run.episodes)}"
+    slipped_us = sum(episode.slipped_us for episode in run.episodes)
     rows = [
-        *_tail_rows("tick lateness", rt.tick_lateness),
-        ("real-time factor", _factor(run, rt), f"{len(run.episodes)}"),
-        ("simulated time given up", f"{ms(rt.slipped_us)} ms", f"{len(run.episodes)}"),
-        *_tail_rows("setpoint → motor", rt.setpoint_to_motor),
-        ("setpoints never accepted", f"{rt.unmatched:,}", f"{rt.setpoints:,}"),
+        *_tail_rows("tick lateness", summarize(np.concatenate([nothing, *lateness]))),
+        ("real-time factor", _real_time_factor(run), flights),
+        ("simulated time given up", f"{ms(slipped_us)} ms", flights),
+        *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
+        ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
     ]
     return TableView("real-time", "Real time", columns, tuple(rows))
 
@@ -210,8 +219,12 @@ def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
     ]
 
 
-def _factor(run: LoadedRun, real_time: RealTime) -> str:
-    """Return the real-time factor beside the one asked for."""
-    if real_time.factor is None or run.info.setup.speed is None:
+def _real_time_factor(run: LoadedRun) -> str:
+    """Return simulated seconds per wall second beside the factor asked for."""
+    # An aborted flight ends when its end is noticed: its wall time counts something else.
+    paced = [e for e in run.episodes if e.wall_s and e.outcome is not Outcome.ABORTED]
+    wall_s = sum(episode.wall_s or 0.0 for episode in paced)
+    if not wall_s or run.info.setup.speed is None:
         return "not paced"
-    return f"{real_time.factor:.3f} (asked {run.info.setup.speed:g})"
+    flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
+    return f"{flown_us / US_PER_S / wall_s:.3f} (asked {run.info.setup.speed:g})"

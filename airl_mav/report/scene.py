@@ -1,26 +1,32 @@
-"""Flights and their arenas in three dimensions, as data for the page's own view of them."""
+"""Flights in three dimensions: figures for the plotly library, which travels inside the page.
+
+Frame of the figures: x east, y north, z up [m] from the start.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
-from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.forensics.camera_view import headings
+from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.table import OUTCOME_LABELS
-from airl_mav.report.theme import DARK
 
 POINTS = 240
 """A path has at most this many points: one a tenth of a second, or what is seen of more."""
@@ -30,6 +36,17 @@ ALL_POINTS = 40
 
 ALL_FLIGHTS = 150
 """At most so many flights are shown together: those that failed first."""
+
+CORNERS = 12
+"""Of a drawn circle."""
+
+VIEW_M = 6.0
+"""Length of the drawn field of view."""
+
+STILL_COLOUR = "#8b97a3"
+
+Floats = NDArray[np.float64]
+Trace = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -48,134 +65,333 @@ def scene_json(
     everyone: Sequence[EpisodeRecord],
     fov_deg: float,
 ) -> str:
-    """Return everything that the view shows, as JSON that may stand inside a script element.
-
-    Frame: east, north, up [m] from the start. Lengths are rounded to a centimetre.
+    """Return all views as JSON that may stand inside a script element.
 
     Args:
         run: The run, for the paths of `everyone`.
         flights: Those that can be looked at one by one, in the order of the list.
-        everyone: Those that are shown together.
+        everyone: Those that are shown together, in the last view; none with fewer than two.
         fov_deg: Horizontal field of view of the camera [deg]; 0 draws none.
     """
-    arenas: dict[tuple[str, int], int] = {}
-    described: list[dict[str, Any]] = []
-    for flight in flights:
-        key = flight.record.arena, flight.record.arena_seed
-        if flight.arena is not None and key not in arenas:
-            arenas[key] = len(described)
-            described.append(describe_arena(flight.arena))
-    top = max((float(flight.path.speed().max()) for flight in flights), default=1.0)
-    data = {
-        "topSpeed": round(top, 2),
-        "fov": fov_deg,
-        "speedColours": [_hex(speed_colours()(i / 15.0)) for i in range(16)],
-        "colours": {
-            "start": _both(START_COLOUR),
-            "goal": _both(GOAL_COLOUR),
-            "still": ["#93a0ac", "#7f8a95"],
-            "moving": _both(MOVING_COLOURS[0]),
-        },
-        "outcomes": {
-            outcome.value: {"words": OUTCOME_LABELS[outcome], "colour": _both(colour)}
-            for outcome, colour in OUTCOME_COLOURS.items()
-        },
-        "arenas": described,
-        "flights": [
-            {
-                **describe_flight(flight.record, flight.path, POINTS),
-                "arena": arenas.get((flight.record.arena, flight.record.arena_seed)),
-            }
-            for flight in flights
-        ],
-        "all": [
-            describe_flight(record, path, ALL_POINTS)
-            for record in everyone
-            if (path := _flown(run.trajectories, record)) is not None
-        ],
-        # All flights around the common start share an arena, or only its walls.
-        "shared": len({(e.arena, e.arena_seed) for e in run.episodes}) == 1,
-    }
-    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    top_speed = max((float(flight.path.speed().max()) for flight in flights), default=1.0) or 1.0
+    views = [flight_view(flight, top_speed, fov_deg) for flight in flights]
+    if len(everyone) > 1:
+        shared = len({(e.arena, e.arena_seed) for e in run.episodes}) == 1
+        arena = next((flight.arena for flight in flights), None)
+        views.append(all_flights_view(run, everyone, arena, shared=shared))
+    text = json.dumps(views, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c")
 
 
-def _flown(paths: Mapping[int, Trajectory], record: EpisodeRecord) -> Trajectory | None:
-    """Return a flight's path up to the verdict, None when there is none to draw."""
-    path = paths.get(record.index)
-    if path is None or not len(path):
-        return None
-    part = path.between(int(path.time_us[0]), record.ended_us)
-    return part if len(part) > 1 else None
+@cache
+def plotly_script() -> str:
+    """Return the library that draws the figures, as one script."""
+    return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
-def describe_flight(record: EpisodeRecord, path: Trajectory, points: int) -> dict[str, Any]:
-    """Return a flight for the view.
+def flight_view(flight: SceneFlight, top_speed: float, fov_deg: float) -> dict[str, Any]:
+    """Return the view of one flight: a figure, and what its time slider moves.
 
     Args:
-        record: The flight.
-        path: Up to the verdict, two samples or more.
-        points: At most so many are kept, evenly in time, first and last included.
+        flight: What to show.
+        top_speed: Upper end of the colour scale [m/s].
+        fov_deg: Horizontal field of view of the camera [deg].
     """
-    keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), points)).round().astype(int))
-    position, attitude = path.position[keep], path.quaternion[keep]
-    w, x, y, z = attitude.T
-    heading = np.degrees(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-    began_us = record.started_us
-    since_us = 0 if record.navigation_us is None else record.navigation_us - began_us
+    record, arena = flight.record, flight.arena
+    path = _thinned(flight.path, POINTS)
+    place, speed = _east_north_up(path.position), path.speed()
+    seconds = (path.time_us - record.started_us) / US_PER_S
+    moving: dict[str, Any] | None = None
+    traces = [] if arena is None else _arena_traces(arena)
+    if arena is not None and arena.tours:
+        centers, count = arena.centers_at(0), arena.n_static
+        bodies = [body_mesh(arena.obstacles, i, centers[i]) for i in range(count, len(centers))]
+        traces += [_mesh(bodies, MOVING_COLOURS[0], "moving obstacle"), *_tour_traces(arena)]
+        moving = {
+            "trace": len(traces) - 1 - len(arena.tours),
+            "corners": [len(corners) for corners, _ in bodies],
+            "tours": [
+                {
+                    "time": _rounded(t.times_s),
+                    "place": _rounded(t.points[:, ::-1] - t.points[0, ::-1]),
+                }
+                for t in arena.tours
+            ],
+        }
+    east, north = record.goal[1], record.goal[0]
+    speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
+    scale = [[i / 15.0, _hex(speed_colours()(i / 15.0))] for i in range(16)]
+    traces += [
+        _line(place * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.05], "#8d969f", "shadow", width=2),
+        {
+            **_line(place, "", "path", width=7),
+            "line": {
+                "color": _rounded(speed),
+                "colorscale": scale,
+                "cmin": 0.0,
+                "cmax": top_speed,
+                "width": 7,
+                "showscale": True,
+                "colorbar": speed_bar,
+            },
+            "customdata": _rounded(np.stack([seconds, speed], axis=1)),
+            "hovertemplate": "%{customdata[0]:.1f} s, %{customdata[1]:.1f} m/s<extra></extra>",
+        },
+        _line(_ring(east, north, record.goal_radius_m), GOAL_COLOUR, "goal", width=4),
+        _marks(np.array([[east, north, 0.1]]), GOAL_COLOUR, "goal", symbol="diamond"),
+        _marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"),
+        _marks(
+            place[-1:],
+            OUTCOME_COLOURS[record.outcome],
+            f"end: {OUTCOME_LABELS[record.outcome]}",
+            symbol="x" if record.outcome is not Outcome.SUCCESS else "circle",
+        ),
+        # The vehicle between the ends of its field of view; the page's script moves it.
+        {
+            **_line(place[[-1, -1, -1]], "#2f7fc4", "vehicle", width=3),
+            "mode": "lines+markers",
+            "marker": {"size": [0, 7, 0], "color": "#2f7fc4"},
+        },
+    ]
+    since_us = 0 if record.navigation_us is None else record.navigation_us - record.started_us
     return {
-        "index": record.index,
-        "outcome": record.outcome.value,
-        "goal": [round(record.goal[1], 2), round(record.goal[0], 2)],
-        "radius": record.goal_radius_m,
+        "figure": {"data": traces, "layout": _layout()},
+        "path": {
+            "time": _rounded(seconds),
+            "place": _rounded(place),
+            "heading": _rounded(headings(path.quaternion)),
+            "speed": _rounded(speed),
+        },
         "navigation": round(since_us / US_PER_S, 2),
-        "time": _list((path.time_us[keep] - began_us) / US_PER_S),
-        "place": _list((position[:, [1, 0, 2]] * [1.0, 1.0, -1.0]).ravel()),
-        "speed": _list(path.speed()[keep]),
-        "heading": [round(angle) for angle in heading.tolist()],
+        "vehicle": len(traces) - 1,
+        "view": [VIEW_M, round(math.radians(fov_deg) / 2.0, 3)],
+        "moving": moving,
     }
 
 
-def describe_arena(arena: Arena) -> dict[str, Any]:
-    """Return an arena for the view; of moving obstacles the last ones, each with its tour."""
-    b, o = arena.bounds, arena.obstacles
+def all_flights_view(
+    run: LoadedRun, everyone: Sequence[EpisodeRecord], arena: Arena | None, *, shared: bool
+) -> dict[str, Any]:
+    """Return the view of many flights together, coloured by how they ended.
+
+    Args:
+        run: The run, for the paths.
+        everyone: The flights.
+        arena: One of their arenas, for the walls.
+        shared: Whether all flights have that arena, and so its obstacles.
+    """
+    traces = [] if arena is None else _arena_traces(arena, obstacles=shared)
+    for outcome in OUTCOME_COLOURS:
+        records = [record for record in everyone if record.outcome is outcome]
+        paths = [
+            path for r in records if (path := flown_path(run, r)) is not None and len(path) > 1
+        ]
+        if not paths:
+            continue
+        thinned = [_east_north_up(_thinned(path, ALL_POINTS).position) for path in paths]
+        # A gap ends each path: one line for all of them.
+        joined = [part for places in thinned for part in (*_rounded(places), [None] * 3)]
+        label = f"{OUTCOME_LABELS[outcome]} ({len(records)})"
+        line = _line(np.zeros((0, 3)), OUTCOME_COLOURS[outcome], label, width=3)
+        line |= {axis: [part[k] for part in joined] for k, axis in enumerate("xyz")}
+        traces.append(line | {"showlegend": True})
+        if outcome is not Outcome.SUCCESS:
+            ends = np.stack([places[-1] for places in thinned])
+            traces.append(_marks(ends, OUTCOME_COLOURS[outcome], label, symbol="x"))
+    traces.append(_marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"))
+    return {"figure": {"data": traces, "layout": _layout()}, "path": None}
+
+
+def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Return an obstacle as a closed mesh.
+
+    Args:
+        obstacles: All of them.
+        i: Which one.
+        center: (3,) where it is, NED [m].
+
+    Returns:
+        Corners (n, 3), east, north, up [m], and the corners of the triangles (m, 3).
+    """
+    half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
+    if obstacles.shape[i] == Shape.BOX:
+        outline = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half[:2]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        rings = [(outline @ np.array([[cos, sin], [-sin, cos]]), z) for z in (-half[2], half[2])]
+    else:
+        turn = np.linspace(0.0, 2.0 * math.pi, CORNERS, endpoint=False)
+        circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        if obstacles.shape[i] == Shape.SPHERE:
+            tilt = np.linspace(-0.5 * math.pi, 0.5 * math.pi, CORNERS // 2 + 1)[1:-1]
+            rings = [(half[0] * math.cos(t) * circle, half[0] * math.sin(t)) for t in tilt]
+        else:
+            rings = [(half[0] * circle, z) for z in (-half[2], half[2])]
+    n, last = len(rings[0][0]), len(rings) * len(rings[0][0])
+    top = float(half[2])
+    corners = np.concatenate(
+        [
+            *(np.column_stack([ring, np.full(n, z)]) for ring, z in rings),
+            [[0.0, 0.0, -top], [0.0, 0.0, top]],
+        ]
+    )
+    triangles = []
+    for k in range(n):
+        after = (k + 1) % n
+        triangles += [(last, after, k), (last + 1, last - n + k, last - n + after)]
+        for below in range(0, last - n, n):
+            a, b = below + k, below + after
+            triangles += [(a, b, b + n), (a, b + n, a + n)]
+    placed = corners * [1.0, 1.0, -1.0] + center
+    return _east_north_up(placed), np.array(triangles)
+
+
+def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
+    """Return floor, walls and the obstacles that stand still."""
+    b = arena.bounds
+    corners = [
+        (b.east_min, b.north_min),
+        (b.east_max, b.north_min),
+        (b.east_max, b.north_max),
+        (b.east_min, b.north_max),
+    ]
+    floor = np.array([(*corner, 0.0) for corner in corners])
+    walls = np.concatenate([floor, floor + np.array([0.0, 0.0, b.height])])
+    faces = [
+        face
+        for k in range(4)
+        for face in ((k, (k + 1) % 4, k + 4), (k + 4, (k + 1) % 4, (k + 1) % 4 + 4))
+    ]
+    red, green, blue = arena.wall_colour
+    traces = [
+        _mesh([(floor, np.array([(0, 1, 2), (0, 2, 3)]))], "#c9cdd2", "floor", opacity=0.45),
+        _mesh([(walls, np.array(faces))], f"rgb({red},{green},{blue})", "wall", opacity=0.12),
+    ]
+    if obstacles and arena.n_static:
+        still = [
+            body_mesh(arena.obstacles, i, arena.obstacles.center[i]) for i in range(arena.n_static)
+        ]
+        traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
+    return traces
+
+
+def _tour_traces(arena: Arena) -> list[Trace]:
+    """Return the ways of the moving obstacles on the floor."""
+    return [
+        _line(
+            np.column_stack([tour.points[:, ::-1], np.full(len(tour.points), 0.05)]),
+            MOVING_COLOURS[0],
+            "way of an obstacle",
+            width=2,
+        )
+        for tour in arena.tours
+    ]
+
+
+def _mesh(
+    bodies: Sequence[tuple[Floats, NDArray[np.int64]]], colour: str, name: str, opacity: float = 1.0
+) -> Trace:
+    """Return several bodies as one trace."""
+    starts = np.cumsum([0, *(len(corners) for corners, _ in bodies)])
+    corners = np.concatenate([corners for corners, _ in bodies])
+    faces = np.concatenate(
+        [faces + start for (_, faces), start in zip(bodies, starts[:-1], strict=True)]
+    )
     return {
-        "bounds": [b.east_min, b.east_max, b.north_min, b.north_max, b.height],
-        "wall": [round(channel / 255.0, 3) for channel in arena.wall_colour],
-        "obstacles": [
-            {
-                "shape": Shape(int(o.shape[i])).name.lower(),
-                "center": _list(o.center[i][[1, 0, 2]] * [1.0, 1.0, -1.0]),
-                "half": _list(o.half_size[i]),
-                "yaw": round(math.degrees(float(o.yaw[i])), 1),
-            }
-            for i in range(len(o))
-        ],
-        "tours": [
-            {"time": _list(tour.times_s), "place": _list(tour.points[:, [1, 0]].ravel())}
-            for tour in arena.tours
-        ],
+        "type": "mesh3d",
+        **dict(zip("xyz", _rounded(corners.T), strict=True)),
+        **dict(zip("ijk", faces.T.tolist(), strict=True)),
+        "color": colour,
+        "opacity": opacity,
+        "flatshading": True,
+        "name": name,
+        "hoverinfo": "name",
     }
 
 
-def _list(values: NDArray[np.float64]) -> list[float]:
-    """Return numbers to a hundredth; whole ones as integers, which are shorter."""
-    rounded = np.round(values, 2) + 0.0
-    return [int(value) if value.is_integer() else value for value in rounded.tolist()]
+def _line(points: Floats, colour: str, name: str, *, width: float) -> Trace:
+    """Return a line through points (n, 3)."""
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        **dict(zip("xyz", _rounded(points.T), strict=True)),
+        "line": {"color": colour, "width": width},
+        "name": name,
+        "hoverinfo": "name",
+        "showlegend": False,
+    }
 
 
-def _both(colour: str) -> list[str]:
-    """Return a colour for light and for dark paper."""
-    return [colour, DARK.get(colour, _DARK_OUTCOMES.get(colour, colour))]
+def _marks(points: Floats, colour: str, name: str, *, symbol: str) -> Trace:
+    """Return markers at points (n, 3)."""
+    return {
+        **_line(points, colour, name, width=1),
+        "mode": "markers",
+        "marker": {"size": 6, "color": colour, "symbol": symbol},
+    }
 
 
-_DARK_OUTCOMES = {
-    OUTCOME_COLOURS[Outcome.SUCCESS]: "#45b36b",
-    OUTCOME_COLOURS[Outcome.COLLISION]: "#f0695c",
-    OUTCOME_COLOURS[Outcome.TIMEOUT]: "#e2ab55",
-    OUTCOME_COLOURS[Outcome.BATTERY]: "#c79be6",
-    OUTCOME_COLOURS[Outcome.ABORTED]: "#9aa3ad",
-}
+def _layout() -> dict[str, Any]:
+    """Return axes and cameras: from behind the start, from above, from the side."""
+    eyes = {
+        "From the start": (0.0, -1.75, 1.2),
+        "From above": (0.0, -0.05, 2.1),
+        "From the side": (1.7, 0.0, 0.7),
+    }
+    buttons = [
+        {"label": label, "method": "relayout", "args": [{"scene.camera.eye": _eye(eye)}]}
+        for label, eye in eyes.items()
+    ]
+    axes: dict[str, dict[str, Any]] = {
+        "xaxis": {"title": {"text": "east [m]"}},
+        "yaxis": {"title": {"text": "north [m]"}},
+        "zaxis": {"title": {"text": "up [m]"}, "rangemode": "tozero"},
+    }
+    return {
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "showlegend": True,
+        "legend": {"x": 0.0, "y": 0.0},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "#5c646e", "activecolor": "#2f7fc4"},
+        "scene": {
+            **axes,
+            "aspectmode": "data",
+            "camera": {"eye": _eye(next(iter(eyes.values()))), "center": _eye((0.0, 0.0, -0.2))},
+        },
+        "updatemenus": [
+            {"type": "buttons", "direction": "right", "x": 0, "y": 1, "yanchor": "top",
+             "xanchor": "left", "bgcolor": "#eef0f2",
+             "font": {"color": "#21262d", "size": 11}, "buttons": buttons}
+        ],
+    }  # fmt: skip
+
+
+def _eye(place: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip("xyz", place, strict=True))
+
+
+def _thinned(path: Trajectory, points: int) -> Trajectory:
+    """Return at most so many samples, evenly in time, the first and the last included."""
+    keep = np.unique(np.linspace(0, len(path) - 1, min(len(path), points)).round().astype(int))
+    return Trajectory.from_arrays({name: array[keep] for name, array in path.arrays().items()})
+
+
+def _ring(east: float, north: float, radius: float) -> Floats:
+    """Return a level circle (n, 3) just above the floor."""
+    turn = np.linspace(0.0, 2.0 * math.pi, 4 * CORNERS + 1)
+    level = [east + radius * np.cos(turn), north + radius * np.sin(turn), np.full(len(turn), 0.05)]
+    return np.stack(level, axis=1)
+
+
+def _east_north_up(points: Floats) -> Floats:
+    """Return points (n, 3) NED as east, north, up."""
+    turned: Floats = points[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+    return turned
+
+
+def _rounded(values: Floats) -> list[Any]:
+    """Return numbers to a hundredth, without -0."""
+    rounded: list[Any] = (np.round(values, 2) + 0.0).tolist()
+    return rounded
 
 
 def _hex(colour: tuple[float, float, float, float]) -> str:

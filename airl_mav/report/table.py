@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.percentiles import MIN_SAMPLES
+from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
 
 US_PER_MS = 1_000.0
 NONE = "–"
@@ -79,6 +79,16 @@ def ms(value_us: float | None, digits: int = 2) -> str:
 def percentile_cell(value_us: float | None, n: int) -> str:
     """Return a percentile [µs] as milliseconds, or that its samples are too few."""
     return TOO_FEW_CELL if value_us is None and n else ms(value_us)
+
+
+DURATION_COLUMNS = (Column("n"), *map(Column, ("mean", "p50", "p90", "p99", "max")))
+"""Columns of `duration_cells`."""
+
+
+def duration_cells(s: Summary) -> tuple[str, ...]:
+    """Return a set of durations [µs] as number, mean, percentiles and maximum [ms]."""
+    tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
+    return (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
 
 
 def stacked(cell: str) -> str:

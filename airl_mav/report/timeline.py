@@ -16,21 +16,9 @@ from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
 from airl_mav.latency.stages import STAGES, Samples, Stage
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import theme
 from airl_mav.report.run_figures import long_tail
 from airl_mav.report.table import US_PER_MS, Column, TableView, ms
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    MUTED,
-    PAPER,
-    RULE,
-    SERIES,
-    SERIES_SOFT,
-    Picture,
-    new_figure,
-    plain_axes,
-    render,
-)
 
 TIMELINE_NAME = "latency-timeline"
 
@@ -100,14 +88,14 @@ def timeline_of(run: LoadedRun) -> Timeline:
     )
 
 
-def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> Picture:
+def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Picture:
     """Draw each stage (at least one) of all decisions, in the order flown.
 
     Args:
         timeline: The decisions.
         stages: Those that have durations.
     """
-    figure = new_figure(10.6, 0.62 + 1.0 * len(stages))
+    figure = theme.new_figure(10.6, 0.62 + 1.0 * len(stages))
     rows = np.atleast_1d(figure.subplots(len(stages), 1, sharex=True))
     band = _draw_bands(rows, timeline)
     for ax, stage in zip(rows, stages, strict=True):
@@ -118,13 +106,13 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> Picture:
     )
     if per > 1:
         label += f"; line: median of {per} decisions, shade: least to greatest"
-    rows[-1].set_xlabel(label, fontsize=8.5, color=MUTED)
+    rows[-1].set_xlabel(label, fontsize=8.5, color=theme.MUTED)
     rows[-1].set_xlim(-0.5, len(timeline) - 0.5)
     rows[-1].xaxis.set_major_locator(MaxNLocator(10, integer=True))
     alt = "Duration of each stage of every decision in the order flown, outliers marked: " + (
         ", ".join(stage.title for stage in stages)
     )
-    return render(figure, TIMELINE_NAME, alt)
+    return theme.render(figure, TIMELINE_NAME, alt)
 
 
 def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
@@ -138,7 +126,9 @@ def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
         edges = np.append(edges, len(timeline))
     for k in range(0, len(edges) - 1, 2):
         for ax in rows:
-            ax.axvspan(edges[k] - 0.5, edges[k + 1] - 0.5, color=RULE, alpha=0.4, lw=0, zorder=0)
+            ax.axvspan(
+                edges[k] - 0.5, edges[k + 1] - 0.5, color=theme.RULE, alpha=0.4, lw=0, zorder=0
+            )
     if count <= NAMED:
         for number, start, end in zip(
             timeline.flights, timeline.starts[:-1], timeline.starts[1:], strict=True
@@ -152,9 +142,9 @@ def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
                 ha="center",
                 va="top",
                 fontsize=7.5,
-                color=MUTED,
+                color=theme.MUTED,
                 zorder=5,
-                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 0.8, "alpha": 0.75},
+                bbox={"facecolor": theme.PAPER, "edgecolor": "none", "pad": 0.8, "alpha": 0.75},
             )
     return per
 
@@ -174,14 +164,14 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     middle /= US_PER_MS
     x = 0.5 * (edges[:-1] + edges[1:] - 1)
     if len(durations) > COLUMNS:
-        ax.fill_between(x, middle[0], middle[2], color=SERIES_SOFT, lw=0, zorder=2)
-    ax.plot(x, middle[1], color=SERIES, lw=0.9, zorder=2.5)
+        ax.fill_between(x, middle[0], middle[2], color=theme.SERIES_SOFT, lw=0, zorder=2)
+    ax.plot(x, middle[1], color=theme.SERIES, lw=0.9, zorder=2.5)
     limit = fence(found)
     _mark_outliers(ax, there, found, limit)
-    ax.set_title(stage.title, loc="left", fontsize=9, color=INK, pad=3)
+    ax.set_title(stage.title, loc="left", fontsize=9, color=theme.INK, pad=3)
     if limit is not None:
-        ax.set_title(_in_words(limit), loc="right", fontsize=8, color=MARK, pad=3)
-    ax.set_ylabel("ms", fontsize=8, color=MUTED)
+        ax.set_title(_in_words(limit), loc="right", fontsize=8, color=theme.MARK, pad=3)
+    ax.set_ylabel("ms", fontsize=8, color=theme.MUTED)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if long_tail(np.sort(found) / US_PER_MS):
         ax.set_yscale("log")
@@ -190,7 +180,7 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     elif np.ptp(found) == 0:
         value = found[0] / US_PER_MS
         ax.set_ylim(0.0, 2.0 * value if value > 0.0 else 1.0)
-    plain_axes(ax)
+    theme.plain_axes(ax)
     ax.grid(False, axis="x")
 
 
@@ -200,7 +190,9 @@ def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fe
         return
     beyond = np.flatnonzero(limit.marks(found))
     longest = beyond[np.argsort(-found[beyond], kind="stable")[:MARKED]]
-    ax.plot(there[longest], found[longest] / US_PER_MS, "o", ms=3.4, color=MARK, mew=0, zorder=4)
+    ax.plot(
+        there[longest], found[longest] / US_PER_MS, "o", ms=3.4, color=theme.MARK, mew=0, zorder=4
+    )
 
 
 def _in_words(limit: Fence) -> str:

@@ -16,7 +16,6 @@ from airl_mav.report.comparison.degradation import (
     build_degradation,
     contrasts_by_key,
     curves_section,
-    degradation_recipe,
     policy_tables,
 )
 from airl_mav.report.comparison.model import Comparison, RunEntry
@@ -121,8 +120,8 @@ def findings(config: DegradationConfig, flown: Mapping[str, Flown]) -> Findings:
         for latency in config.latencies
         for key in (_key(policy, latency),)
     ]
-    recipe = degradation_recipe({"arena": config.arena}, entries)
-    comparison = build_degradation(recipe, {entry.name: flown[entry.name].run for entry in entries})
+    runs = {entry.name: flown[entry.name].run for entry in entries}
+    comparison = build_degradation({"arena": config.arena}, entries, runs)
     fans = {
         Path(policy).name: [
             (_latency_name(latency), flown[_fan_key(policy, latency)])

@@ -12,20 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from rich.console import Console
 
+from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
 from airl_mav.report.table import NONE, Column, TableView, print_facts, print_table
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    PAPER,
-    Picture,
-    label_axes,
-    line_style,
-    new_figure,
-    plain_axes,
-    render,
-)
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.summary import Computer, NetworkSummary, Sweep, estimated_ms, published_best
@@ -289,11 +279,11 @@ def _headline(sweep: Sweep, arena: str) -> Headline:
 # --- figures
 
 
-def _arena_pictures(sweep: Sweep, arena: str) -> list[Picture]:
+def _arena_pictures(sweep: Sweep, arena: str) -> list[theme.Picture]:
     return [success_picture(sweep, arena), cost_picture(sweep, arena)]
 
 
-def success_picture(sweep: Sweep, arena: str) -> Picture:
+def success_picture(sweep: Sweep, arena: str) -> theme.Picture:
     """Draw the mean success rate of each network of an arena, with its standard deviation."""
     best = sweep.best(arena)
     known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
@@ -328,7 +318,7 @@ def _success_text(cell: NetworkSummary) -> str:
     return text
 
 
-def cost_picture(sweep: Sweep, arena: str) -> Picture:
+def cost_picture(sweep: Sweep, arena: str) -> theme.Picture:
     """Draw what each network costs: multiply-accumulates, or the latency estimated from them."""
     cells = sweep.of(arena)
     timed = sweep.computer is not None
@@ -385,9 +375,9 @@ def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
     return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
 
 
-def trade_picture(sweep: Sweep) -> Picture:
+def trade_picture(sweep: Sweep) -> theme.Picture:
     """Draw success against cost: a dot with its interval for each network."""
-    figure = new_figure(7.4, 4.2)
+    figure = theme.new_figure(7.4, 4.2)
     ax: Axes = figure.subplots()
     known = {arena: [c for c in sweep.of(arena) if c.results] for arena in sweep.arenas}
     many = sum(map(len, known.values())) > LABELLED
@@ -407,7 +397,7 @@ def trade_picture(sweep: Sweep) -> Picture:
                     textcoords="offset points",
                     va="center",
                     fontsize=8,
-                    color=INK,
+                    color=theme.INK,
                     zorder=4,
                 )
     ax.set_xscale("log")
@@ -420,19 +410,19 @@ def trade_picture(sweep: Sweep) -> Picture:
     cost = "multiply-accumulates of an inference"
     if sweep.computer is not None:
         cost = f"t2 on {sweep.computer.name}, estimated from multiply-accumulates [ms]"
-    label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
+    theme.label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
     ax.set_ylim(top=101.5)
-    plain_axes(ax)
+    theme.plain_axes(ax)
     if len(sweep.arenas) > 1:
-        ax.legend(frameon=False, fontsize=8.5, labelcolor=INK, loc="lower right")
-    return render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
+        ax.legend(frameon=False, fontsize=8.5, labelcolor=theme.INK, loc="lower right")
+    return theme.render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
 
 
 def _draw_network(
     ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
 ) -> None:
     """Draw one network of the arena with a number."""
-    rate, colour = cell.success_rate, line_style(number).colour
+    rate, colour = cell.success_rate, theme.line_style(number).colour
     if rate.low is not None and rate.high is not None:
         ends = [100.0 * rate.low, 100.0 * rate.high]
         ax.plot([x, x], ends, color=colour, lw=1.4, alpha=0.55)
@@ -442,7 +432,7 @@ def _draw_network(
         MARKERS[number % len(MARKERS)],
         ms=8 if chosen else 6,
         color=colour,
-        mec=MARK if chosen else PAPER,
+        mec=theme.MARK if chosen else theme.PAPER,
         mew=1.8 if chosen else 0.8,
         label=label,
         zorder=3,

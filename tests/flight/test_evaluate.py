@@ -351,10 +351,10 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
     for absent in ("Real time", "tick lateness", "setpoints never accepted", "MAVSDK"):
         assert absent not in page.words
         assert absent not in text
-    # Seven stages and their timeline, energy, all flights, the worst in space; a map and a time
-    # figure for each flight that is pictured.
+    # Seven stages and their timeline, energy, all flights; a map and a time figure for each flight
+    # that is pictured.
     assert run_page.MAX_PICTURED < EPISODES
-    assert page.images == 7 + 4 + 2 * run_page.MAX_PICTURED
+    assert page.images == 7 + 3 + 2 * run_page.MAX_PICTURED
     assert f"Pictures of {run_page.MAX_PICTURED} of {EPISODES} flights" in page.words
     pictured = {int(p.name[7:10]) for p in run_.path.glob("flight-*-map.png")}
     assert pictured >= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
@@ -369,7 +369,6 @@ def test_a_long_table_is_cut_short_and_says_so(
     monkeypatch.setattr(run_page, "MAX_PICTURED", 1)
     shutil.copytree(run_.path, tmp_path / "copy")
     path = write_report(tmp_path / "copy")
-    assert path is not None
     page = Page(path.read_text(encoding="utf-8"))
     assert f"5 of {EPISODES} flights, those that failed first; all: episodes.jsonl." in page.words
     failed = sum(e.outcome is not Outcome.SUCCESS for e in run_.episodes)

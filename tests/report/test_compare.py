@@ -270,11 +270,11 @@ def test_a_table_of_policies_and_arenas_stands_for_its_runs(
     for name in ("fast", "slow"):
         (root / name).symlink_to(runs[name])
     entries = [{"entry": {"name": name, "folder": name}} for name in ("fast", "slow")]
-    held = {"schema": 2, "title": "", "facts": {}, "runs": entries, "contrasts": []}
+    held = {"schema": 2, "facts": {}, "runs": entries}
     (root / "matrix.json").write_text(json.dumps(held))
     assert "workstation" in ask(root, out=tmp_path / "out")
     (root / "matrix.json").write_text('{"schema": 2, "runs": 3}')
-    with pytest.raises(UsageError, match=r"matrix\.json: title: Field required"):
+    with pytest.raises(UsageError, match=r"matrix\.json: facts: Field required"):
         ask(root, runs["fast"], out=tmp_path / "other")
 
 

@@ -32,7 +32,7 @@ from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.report.comparison import show
-from airl_mav.report.comparison.gap import columns_table, gap_recipe, gaps_table, worst_seeds
+from airl_mav.report.comparison.gap import columns_table, gaps_table, worst_seeds
 from airl_mav.report.comparison.model import load_comparison, save_comparison
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
@@ -443,8 +443,8 @@ def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigate
     [
         ("[", "not JSON"),
         ('{"schema": 9}', "schema = 9"),
-        ('{"schema": 2, "title": "", "facts": {}}', "runs: Field required"),
-        ('{"schema": 2, "title": "", "facts": {}, "runs": [], "contrasts": []}', "no run here"),
+        ('{"schema": 2, "facts": {}}', "runs: Field required"),
+        ('{"schema": 2, "facts": {}, "runs": []}', "no run here"),
         pytest.param("[" * 100_000, "nested too deeply", id="nested"),
     ],
 )
@@ -612,7 +612,7 @@ def test_a_card_with_a_wrong_delay_is_one_line(tmp_path: Path) -> None:
 
 def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
     entries = [run.entry for run in load_comparison(whole[0], "gap").runs][:1]
-    gap, runs = build_comparison(whole[0], "gap", gap_recipe({}, entries))
+    gap, runs = build_comparison(whole[0], "gap", {}, entries)
     assert gap.contrasts == gap.answers == ()
     document = show.comparison_to_document(gap, runs, whole[0])
     assert "Hardware gap" not in [section.title for section in document.sections]

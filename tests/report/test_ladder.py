@@ -34,7 +34,7 @@ from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.report import run_page
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.comparison.ladder import ladder_recipe, other_differences, split_table
+from airl_mav.report.comparison.ladder import other_differences, split_table
 from airl_mav.report.comparison.model import Comparison, RunEntry, load_comparison
 from airl_mav.report.comparison.show import build_comparison, write_comparison
 from airl_mav.report.comparison.tables import contrast_table, runs_table
@@ -337,7 +337,7 @@ def test_the_first_level_is_the_reference(whole: tuple[Path, str]) -> None:
 
 
 def ladder_of(root: Path, facts: dict[str, Any], levels: list[RunEntry]) -> Comparison:
-    return build_comparison(root, "ladder", ladder_recipe(facts, levels))[0]
+    return build_comparison(root, "ladder", facts, levels)[0]
 
 
 @pytest.fixture(scope="module")
@@ -508,8 +508,8 @@ def test_a_level_without_any_success_still_has_a_page(
     folder = RunFolder.create(tmp_path / "lockstep", "demo", {}, setup=runs.info.setup)
     reached = load(rehearsed[0] / "lockstep").episodes[0]
     folder.save_episode(reached, runs.trajectories[0], runs.latency[0])
-    recipe = ladder_recipe({}, [RunEntry(n, n, planned=1) for n in ("lockstep", "sitl")])
-    ladder, loaded = build_comparison(tmp_path, "ladder", recipe)
+    entries = [RunEntry(n, n, planned=1) for n in ("lockstep", "sitl")]
+    ladder, loaded = build_comparison(tmp_path, "ladder", {}, entries)
     rows = comparison_tables(ladder)[0].rows[1:]
     assert [row[3:] for row in rows] == [("–", "–", "–", "0")] * 3
     page = write_comparison(ladder, loaded, tmp_path)
@@ -531,13 +531,11 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
         ("{", "not JSON"),
         ('{"schema": 99}', "schema = 99: accepted: 2"),
         (
-            '{"schema": 2, "title": "", "facts": {}, "contrasts": [], '
-            '"runs": [{"entry": {"name": "gym"}}]}',
+            '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym"}}]}',
             "runs.0.entry.folder",
         ),
         (
-            '{"schema": 2, "title": "", "facts": {}, "contrasts": [], '
-            '"runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
+            '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
             "no run here",
         ),
     ],

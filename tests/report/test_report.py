@@ -32,6 +32,7 @@ from airl_mav.report.run_tables import (
     quality_table,
     real_time_table,
 )
+from airl_mav.report.scene import plotly_script
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
@@ -150,18 +151,20 @@ def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:
     assert images
     assert all(ref.startswith("data:image/svg+xml;base64,") for ref in images)
     assert not parsed.tags & {"link", "iframe", "object"}
-    # The view's script and its data are in the page, and ask for nothing.
-    script = page[page.index("<script>") : page.index("</script>", page.index("<script>"))]
+    # The library, what shows the views with it, and their data are in the page, once each.
+    assert page.count("<script") == 3 + plotly_script().count("<script")
+    assert page.count(plotly_script()[:200]) == 1
+    script = page[page.rindex("<script>") :]
     assert not re.search(r"https?:|fetch\(|XMLHttp|import\(|WebSocket|eval\(", script)
     style = page[page.index("<style>") : page.index("</style>")]
     assert "url(" not in style
     assert "@import" not in style
     assert all(image["alt"] for image in parsed.images)
-    # Nine stages and their timeline, energy, one flight in space; two figures for each flight.
-    assert len(parsed.images) == 9 + 3 + 2 * 5
+    # Nine stages and their timeline, energy; two figures for each flight.
+    assert len(parsed.images) == 9 + 2 + 2 * 5
     inside = {ref[1:] for ref in parsed.references if ref.startswith("#")}
     assert inside <= set(re.findall(r'id="([^"]+)"', page))
-    assert len(page) < 2_500_000
+    assert len(page) < len(plotly_script()) + 2_000_000
 
 
 def test_pictures_follow_light_and_dark_and_carry_no_links(page: str) -> None:
@@ -195,7 +198,7 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
     run, _ = demo
     names = {path.name for path in run.path.glob("*.png")}
     expected = {f"flight-{i:03d}-{kind}.png" for i in range(5) for kind in ("map", "time")}
-    alone = {"latency.png", "latency-timeline.png", "energy.png", "flight-3d.png"}
+    alone = {"latency.png", "latency-timeline.png", "energy.png"}
     assert names == expected | alone
     for name in names:
         with Image.open(run.path / name) as image:
@@ -336,7 +339,7 @@ def test_user_text_is_escaped(demo: tuple[LoadedRun, dict[int, Arena]], tmp_path
     text = build_page(spoiled, arenas, tmp_path).read_text(encoding="utf-8")
     parsed = Page(text)
     assert "alert(1)</script>" not in text
-    assert text.count("<script") == 2
+    assert text.count("<script") == 3 + plotly_script().count("<script")
     assert sum(evil in word for word in parsed.words) >= 4
 
 

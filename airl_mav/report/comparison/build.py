@@ -19,7 +19,6 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
-    ComparisonRecipe,
     Contrast,
     ContrastEntry,
     Kind,
@@ -91,18 +90,6 @@ def compare(
 def load_runs(folder: Path, entries: Iterable[RunEntry]) -> dict[str, LoadedRun]:
     """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
     return {entry.name: load_run(folder / entry.folder) for entry in entries}
-
-
-def from_recipe(kind: Kind, recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
-    """Work a comparison out from its recipe."""
-    return compare(
-        runs,
-        recipe.contrasts,
-        kind=kind,
-        title=recipe.title,
-        facts=recipe.facts,
-        entries=recipe.entries,
-    )
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:

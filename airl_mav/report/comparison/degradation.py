@@ -15,7 +15,6 @@ from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
 from airl_mav.report.comparison.model import (
     Comparison,
-    ComparisonRecipe,
     Contrast,
     ContrastEntry,
     RunEntry,
@@ -36,42 +35,38 @@ FEWEST = 10
 """Pairs from which on a step says something."""
 
 
-def degradation_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
-    """Return what a degradation curve is worked out from.
+def build_degradation(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Work out a degradation curve for every policy.
 
     Args:
         facts: What all runs share: `arena`, ...
-        entries: Runs by growing latency, the reference first; their `label` is the latency, their
-            `group` the policy.
+        entries: By policy, then by growing latency, the reference first; their `label` is the
+            latency, their `group` the policy.
+        runs: By name.
+
+    Raises:
+        UsageError: There is no run, or a run holds no flight.
     """
     contrasts: list[ContrastEntry] = []
-    for group in dict.fromkeys(entry.group for entry in entries):
-        line = [entry for entry in entries if entry.group == group]
-        first = line[0]
+    for policy in dict.fromkeys(entry.group for entry in entries):
+        line = [entry for entry in entries if entry.group == policy]
         contrasts += [
-            ContrastEntry(
-                each.name,
-                first.name,
-                AGAINST_FIRST,
-                f"{each.label} against {first.label}",
-            )
-            for each in line[1:]
+            *(
+                ContrastEntry(
+                    b.name, line[0].name, AGAINST_FIRST, f"{b.label} against {line[0].label}"
+                )
+                for b in line[1:]
+            ),
+            *(
+                ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}")
+                for a, b in pairwise(line)
+            ),
         ]
-        contrasts += [
-            ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}") for a, b in pairwise(line)
-        ]
-    return ComparisonRecipe("Degradation by latency", dict(facts), tuple(entries), tuple(contrasts))
-
-
-def build_degradation(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
-    """Work out a curve. Raises UsageError: there is no run, or a run holds no flight."""
+    title = "Degradation by latency"
     comparison = compare(
-        runs,
-        recipe.contrasts,
-        kind="degradation",
-        title=recipe.title,
-        facts=recipe.facts,
-        entries=recipe.entries,
+        runs, contrasts, kind="degradation", title=title, facts=facts, entries=entries
     )
     told = [line for policy in comparison.groups for line in _verdict(comparison, policy)]
     return replace(comparison, answers=tuple(told))

@@ -16,6 +16,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import theme
 from airl_mav.report.comparison.build import tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import letters_of, published_change
@@ -24,22 +25,6 @@ from airl_mav.report.loading import arena_of
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
 from airl_mav.report.table import NONE, OUTCOME_LABELS, US_PER_MS
-from airl_mav.report.theme import (
-    INK,
-    MARK,
-    MUTED,
-    PAPER,
-    RULE,
-    SERIES,
-    SERIES_SOFT,
-    Picture,
-    label_axes,
-    legend_below,
-    line_style,
-    new_figure,
-    plain_axes,
-    render,
-)
 
 ROW_IN = 0.5
 """Height of a contrast in a figure."""
@@ -62,7 +47,7 @@ def contrast_pictures(
     contrasts: Sequence[Contrast],
     *,
     medians: bool = False,
-) -> list[Picture]:
+) -> list[theme.Picture]:
     """Draw contrasts with their intervals, one picture a measure, published ones beside them.
 
     Args:
@@ -74,24 +59,26 @@ def contrast_pictures(
     names = [f"{letters_of(comparison, each)}\n{each.entry.short}".rstrip() for each in contrasts]
     pictures = []
     for measure in MEASURES:
-        figure = new_figure(4.4, 1.05 + ROW_IN * len(contrasts))
+        figure = theme.new_figure(4.4, 1.05 + ROW_IN * len(contrasts))
         ax: Axes = figure.subplots()
         ends: list[float] = [0.0]
         for row, contrast in enumerate(contrasts):
             change = measure.change(contrast.paired)
             if (told := published_change(contrast, measure)) is not None:
                 ends.append(told)
-                ax.plot(told, row, "x", ms=6, mew=1.6, color=MARK, zorder=2)
+                ax.plot(told, row, "x", ms=6, mew=1.6, color=theme.MARK, zorder=2)
             median = change.median
             if medians and median is not None and median.value is not None:
                 ends.append(median.value)
-                ax.plot(median.value, row, "D", ms=5, color="none", mec=SERIES, mew=1.1, zorder=3)
+                ax.plot(
+                    median.value, row, "D", ms=5, color="none", mec=theme.SERIES, mew=1.1, zorder=3
+                )
             ends += _draw_estimate(ax, row, change.difference)
         _finish_rows(ax, names, ends)
         unit = "percentage points" if measure.difference_unit == "points" else "%"
-        label_axes(ax, f"difference [{unit}]", title=measure.title)
+        theme.label_axes(ax, f"difference [{unit}]", title=measure.title)
         alt = f"Difference in {measure.title} with intervals: {', '.join(names)}"
-        pictures.append(render(figure, f"{prefix}-{measure.key.replace('_', '-')}", alt))
+        pictures.append(theme.render(figure, f"{prefix}-{measure.key.replace('_', '-')}", alt))
     return pictures
 
 
@@ -105,36 +92,36 @@ def _draw_estimate(ax: Axes, row: int, estimate: Estimate) -> list[float]:
         ha="right",
         va="bottom",
         fontsize=8,
-        color=MARK,
+        color=theme.MARK,
     )
     if estimate.value is None:
         return []
     ends = [estimate.value]
     if estimate.low is not None and estimate.high is not None:
         ends += [estimate.low, estimate.high]
-        ax.plot(ends[1:], [row, row], color=SERIES, lw=2.2, solid_capstyle="butt")
-    ax.plot(estimate.value, row, "o", ms=6, color=SERIES, mec=PAPER, mew=1.0, zorder=4)
+        ax.plot(ends[1:], [row, row], color=theme.SERIES, lw=2.2, solid_capstyle="butt")
+    ax.plot(estimate.value, row, "o", ms=6, color=theme.SERIES, mec=theme.PAPER, mew=1.0, zorder=4)
     return ends
 
 
 def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
     """Set up the axis of rows: names from top to bottom, zero as a line, all ends inside."""
-    ax.axvline(0.0, color=MUTED, lw=1.0, zorder=1)
+    ax.axvline(0.0, color=theme.MUTED, lw=1.0, zorder=1)
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.5, -0.65)
     # A row without any difference still has an axis.
     room = 0.08 * (max(ends) - min(ends)) or 1.0
     ax.set_xlim(min(ends) - room, max(ends) + room)
-    plain_axes(ax)
+    theme.plain_axes(ax)
     ax.grid(False, axis="y")
-    ax.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
-    ax.spines["bottom"].set_color(RULE)
+    ax.tick_params(axis="y", labelsize=8.5, labelcolor=theme.INK)
+    ax.spines["bottom"].set_color(theme.RULE)
 
 
 # --- latency
 
 
-def latency_pictures(comparison: Comparison, runs: Runs) -> list[Picture]:
+def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
     """Draw the cumulated distributions of all runs, one picture a stage that has samples."""
     pooled = {name: _samples(run) for name, run in runs.items()}
     pictures = []
@@ -142,14 +129,14 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[Picture]:
         having = [run for run in comparison.runs if pooled[run.name][stage.key].size]
         if not having:
             continue
-        figure = new_figure(5.2, 3.2 + 0.2 * len(having))
+        figure = theme.new_figure(5.2, 3.2 + 0.2 * len(having))
         ax: Axes = figure.subplots()
         medians, ends = [], []
         for number, run in enumerate(comparison.runs):
             if run not in having:
                 continue
             at_ms, share = cumulated(pooled[run.name][stage.key])
-            colour, dashes = line_style(number)
+            colour, dashes = theme.line_style(number)
             n = run.stages[stage.key].n
             label = f"{run.heading} (n = {n:,})"
             ax.step(at_ms, share, where="post", color=colour, ls=dashes, lw=1.6, label=label)
@@ -163,13 +150,13 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[Picture]:
             ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 104.0)
         ax.set_yticks([0, 25, 50, 75, 100])
-        label_axes(ax, "ms", "decisions that took no longer [%]", stage.title)
-        plain_axes(ax)
-        legend_below(figure, 1, handlelength=3)
+        theme.label_axes(ax, "ms", "decisions that took no longer [%]", stage.title)
+        theme.plain_axes(ax)
+        theme.legend_below(figure, 1, handlelength=3)
         told = ", ".join(run.heading for run in having)
         alt = f"Cumulated distributions of {stage.title}: {told}"
         name = f"{comparison.kind}-{stage.key.replace('_', '-')}"
-        pictures.append(render(figure, name, alt))
+        pictures.append(theme.render(figure, name, alt))
     return pictures
 
 
@@ -192,18 +179,18 @@ def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64
 # --- energy
 
 
-def energy_picture(comparison: Comparison) -> Picture:
+def energy_picture(comparison: Comparison) -> theme.Picture:
     """Draw the mean energy of a successful flight, split into airframe and computer."""
     runs = [run for run in comparison.runs if run.quality.energy_j.value is not None]
-    figure = new_figure(6.4, 1.3 + 0.55 * len(runs))
+    figure = theme.new_figure(6.4, 1.3 + 0.55 * len(runs))
     ax: Axes = figure.subplots()
     airframe, computer = (
         [measure.scale * (measure.of(run.quality).value or 0.0) for run in runs]
         for measure in (ENERGY, COMPUTER_ENERGY)
     )
     rows = np.arange(len(runs))
-    ax.barh(rows, airframe, height=0.55, color=SERIES, label="airframe")
-    ax.barh(rows, computer, left=airframe, height=0.55, color=SERIES_SOFT, label="computer")
+    ax.barh(rows, airframe, height=0.55, color=theme.SERIES, label="airframe")
+    ax.barh(rows, computer, left=airframe, height=0.55, color=theme.SERIES_SOFT, label="computer")
     for row, (a, c) in enumerate(zip(airframe, computer, strict=True)):
         share = 100.0 * c / (a + c) if a + c else 0.0
         ax.annotate(
@@ -213,21 +200,23 @@ def energy_picture(comparison: Comparison) -> Picture:
             textcoords="offset points",
             va="center",
             fontsize=8,
-            color=INK,
+            color=theme.INK,
         )
     names = ["\n".join(textwrap.wrap(run.heading, NAME_COLUMNS)) for run in runs]
     ax.set_yticks(rows, names)
     ax.set_ylim(len(runs) - 0.5, -0.5)
     widest = max((a + c for a, c in zip(airframe, computer, strict=True)), default=1.0)
     ax.set_xlim(0.0, 1.55 * widest)
-    label_axes(ax, "mean energy of a flight that reached the goal [kJ]")
-    plain_axes(ax)
+    theme.label_axes(ax, "mean energy of a flight that reached the goal [kJ]")
+    theme.plain_axes(ax)
     ax.grid(False, axis="y")
-    ax.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
-    ax.spines["bottom"].set_color(RULE)
-    legend_below(figure, 2)
+    ax.tick_params(axis="y", labelsize=8.5, labelcolor=theme.INK)
+    ax.spines["bottom"].set_color(theme.RULE)
+    theme.legend_below(figure, 2)
     told = ", ".join(run.heading for run in runs)
-    return render(figure, f"{comparison.kind}-energy", f"Energy of airframe and computer: {told}")
+    return theme.render(
+        figure, f"{comparison.kind}-energy", f"Energy of airframe and computer: {told}"
+    )
 
 
 # --- flights
@@ -258,14 +247,16 @@ def flight_panels(
 
 def seed_pictures(
     prefix: str, compared: Sequence[ComparedRun], runs: Runs, seeds: Sequence[int]
-) -> list[Picture]:
+) -> list[theme.Picture]:
     """Draw the flights of several runs from above, one picture a seed."""
     return [_seed_picture(f"{prefix}-{seed}", compared, runs, seed) for seed in seeds]
 
 
-def _seed_picture(name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int) -> Picture:
+def _seed_picture(
+    name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int
+) -> theme.Picture:
     """Draw the flights of one seed over their arena, as it was when they began."""
-    figure = new_figure(4.2, 4.6)
+    figure = theme.new_figure(4.2, 4.6)
     ax: Axes = figure.subplots()
     flights = [
         (number, figures, flight)
@@ -278,7 +269,7 @@ def _seed_picture(name: str, compared: Sequence[ComparedRun], runs: Runs, seed: 
         run = runs[figures.name]
         if not handles and (arena := arena_of(run, flight)) is not None:
             draw_arena(arena, ax, goal_radius_m=flight.goal_radius_m)
-        style, path = line_style(number), run.trajectories.get(flight.index)
+        style, path = theme.line_style(number), run.trajectories.get(flight.index)
         told = OUTCOME_LABELS[flight.outcome]
         if flight.outcome is Outcome.SUCCESS and flight.quality is not None:
             told = f"{flight.quality.flight_time_s:.1f} s"
@@ -294,9 +285,11 @@ def _seed_picture(name: str, compared: Sequence[ComparedRun], runs: Runs, seed: 
         handles.append(line)
         if len(points):
             marker = OUTCOME_MARKERS[flight.outcome]
-            ax.plot(*points[-1], marker, ms=7, color=style.colour, mec=PAPER, mew=0.8, zorder=5)
-    plain_axes(ax, grid=False)
-    label_axes(ax, "east of the start [m]", "north of the start [m]", f"seed {seed}")
-    legend_below(figure, 3, handles=handles, columnspacing=1.0)
+            ax.plot(
+                *points[-1], marker, ms=7, color=style.colour, mec=theme.PAPER, mew=0.8, zorder=5
+            )
+    theme.plain_axes(ax, grid=False)
+    theme.label_axes(ax, "east of the start [m]", "north of the start [m]", f"seed {seed}")
+    theme.legend_below(figure, 3, handles=handles, columnspacing=1.0)
     told = ", ".join(figures.label for _, figures, _ in flights)
-    return render(figure, name, f"The flights of seed {seed} from above: {told}")
+    return theme.render(figure, name, f"The flights of seed {seed} from above: {told}")

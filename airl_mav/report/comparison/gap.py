@@ -24,7 +24,6 @@ from airl_mav.report.comparison.figures import (
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
-    ComparisonRecipe,
     Contrast,
     ContrastEntry,
     RunEntry,
@@ -106,14 +105,19 @@ GAP_KINDS = (
 )
 
 
-def gap_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
-    """Return what the hardware gap of runs is worked out from.
+def build_gap(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
 
     Args:
         facts: What was asked for: `policy`, `computer`, `reference`, `latency`, ...
         entries: The runs, each with its `role`; their group is the arena.
+        runs: By name.
+
+    Raises:
+        UsageError: There is no run, or a run holds no flight.
     """
-    where = facts.get("latency") or facts.get("computer")
     contrasts = [
         ContrastEntry(target.name, reference.name, kind.key, kind.title, kind.short)
         for group in dict.fromkeys(entry.group for entry in entries)
@@ -123,24 +127,9 @@ def gap_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> Compari
         if target.group == reference.group == group
         and (target.role, reference.role) == (kind.target, kind.reference)
     ]
-    title = f"{facts.get('policy')} on {Path(str(where)).name}"
-    return ComparisonRecipe(title, dict(facts), tuple(entries), tuple(contrasts))
-
-
-def build_gap(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
-    """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
-    """
-    comparison = compare(
-        runs,
-        recipe.contrasts,
-        kind="gap",
-        title=recipe.title,
-        facts=recipe.facts,
-        entries=recipe.entries,
-    )
+    where = Path(str(facts.get("latency") or facts.get("computer"))).name
+    title = f"{facts.get('policy')} on {where}"
+    comparison = compare(runs, contrasts, kind="gap", title=title, facts=facts, entries=entries)
     tables: dict[str, str] = {}
     published: dict[str, PublishedRun] = {}
     worst: dict[str, list[int]] = {}

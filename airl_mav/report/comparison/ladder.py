@@ -18,9 +18,7 @@ from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
-    ComparisonRecipe,
     Contrast,
-    ContrastEntry,
     RunEntry,
 )
 from airl_mav.report.comparison.tables import (
@@ -42,32 +40,21 @@ WIDEST = 3
 """Pairs that are named for differing most."""
 
 
-def ladder_recipe(facts: Mapping[str, Any], levels: Sequence[RunEntry]) -> ComparisonRecipe:
-    """Return what a ladder is worked out from.
+def build_ladder(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Work out a ladder.
 
     Args:
         facts: What all levels share: `policy`, `arena`, ...
-        levels: The levels, two or more, the reference first.
+        entries: The levels, the reference first.
+        runs: By name.
+
+    Raises:
+        UsageError: There is no run, or a run holds no flight.
     """
-    first = levels[0].name
-    contrasts = tuple(
-        ContrastEntry(level.name, first, title=f"{level.name} against {first}")
-        for level in levels[1:]
-    )
     title = f"{facts.get('policy')} in {facts.get('arena')}"
-    return ComparisonRecipe(title, dict(facts), tuple(levels), contrasts)
-
-
-def build_ladder(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
-    """Work out a ladder. Raises UsageError: there is no run, or a run holds no flight."""
-    comparison = compare(
-        runs,
-        recipe.contrasts,
-        kind="ladder",
-        title=recipe.title,
-        facts=recipe.facts,
-        entries=recipe.entries,
-    )
+    comparison = compare(runs, kind="ladder", title=title, facts=facts, entries=entries)
     widest = {
         contrast.entry.target: _widest(runs[contrast.entry.reference], runs[contrast.entry.target])
         for contrast in comparison.contrasts

@@ -12,7 +12,6 @@ from airl_mav.report.comparison.documents import comparison_document
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
-    ComparisonRecipe,
     RunEntry,
 )
 from airl_mav.report.comparison.tables import plain_facts
@@ -22,26 +21,21 @@ from airl_mav.report.measures import MEASURES, SUCCESS_RATE, Measure
 from airl_mav.report.table import NONE, Column, TableView
 
 
-def matrix_recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
-    """Return what a table of policies x arenas is worked out from.
+def build_matrix(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Work out a table of policies x arenas.
 
     Args:
         facts: What all cells share: level, seed, episodes, vehicle, computer.
         entries: One for each cell: its `label` is the policy, its `group` the arena.
+        runs: By name.
+
+    Raises:
+        UsageError: There is no run, or a run holds no flight.
     """
-    return ComparisonRecipe("Policies by arenas", dict(facts), tuple(entries))
-
-
-def build_matrix(recipe: ComparisonRecipe, runs: Mapping[str, LoadedRun]) -> Comparison:
-    """Work out a table. Raises UsageError: there is no run, or a run holds no flight."""
-    return compare(
-        runs,
-        (),
-        kind="matrix",
-        title=recipe.title,
-        facts=recipe.facts,
-        entries=recipe.entries,
-    )
+    title = "Policies by arenas"
+    return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)
 
 
 def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:

@@ -210,37 +210,20 @@ class Comparison:
 
 
 @dataclass(frozen=True)
-class ComparisonRecipe:
-    """What a comparison is worked out from, besides its runs."""
-
-    title: str
-    facts: dict[str, Any]
-    entries: tuple[RunEntry, ...]
-    contrasts: tuple[ContrastEntry, ...] = ()
-
-
-@dataclass(frozen=True)
-class _StoredEntry:
+class _StoredRun:
     entry: RunEntry
 
 
 @dataclass(frozen=True)
-class _StoredContrast:
-    entry: ContrastEntry
+class _StoredQuestion:
+    """The part of a file that all else is worked out from again, with the runs."""
 
-
-@dataclass(frozen=True)
-class _StoredRecipe:
-    """The part of a file that a recipe needs: all else is worked out again."""
-
-    title: str
     facts: dict[str, Any]
-    runs: tuple[_StoredEntry, ...]
-    contrasts: tuple[_StoredContrast, ...]
+    runs: tuple[_StoredRun, ...]
 
 
 _COMPARISON = TypeAdapter(Comparison)
-_RECIPE = TypeAdapter(_StoredRecipe)
+_QUESTION = TypeAdapter(_StoredQuestion)
 
 KIND_NAMES: dict[Kind, str] = {
     "compare": "comparison",
@@ -274,15 +257,10 @@ def load_comparison(folder: Path, kind: Kind) -> Comparison:
     return _read(folder, kind, _COMPARISON)
 
 
-def load_recipe(folder: Path, kind: Kind) -> ComparisonRecipe:
-    """Read what a comparison is worked out from. Raises UsageError."""
-    held = _read(folder, kind, _RECIPE)
-    return ComparisonRecipe(
-        held.title,
-        held.facts,
-        tuple(run.entry for run in held.runs),
-        tuple(contrast.entry for contrast in held.contrasts),
-    )
+def load_entries(folder: Path, kind: Kind) -> tuple[dict[str, Any], tuple[RunEntry, ...]]:
+    """Read what a comparison is worked out from: its facts, and its runs. Raises UsageError."""
+    held = _read(folder, kind, _QUESTION)
+    return held.facts, tuple(run.entry for run in held.runs)
 
 
 def _read(folder: Path, kind: Kind, adapter: TypeAdapter[T]) -> T:

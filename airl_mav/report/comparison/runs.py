@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -15,7 +16,7 @@ from airl_mav.report.comparison.figures import (
     flight_panels,
     latency_pictures,
 )
-from airl_mav.report.comparison.model import Comparison, RunEntry, kind_of, load_recipe
+from airl_mav.report.comparison.model import Comparison, RunEntry, kind_of, load_entries
 from airl_mav.report.comparison.tables import (
     contrast_table,
     facts_table,
@@ -58,9 +59,15 @@ def compare_folders(
         raise UsageError(f"{twice[0]}: twice; accepted: each run once")
     loaded = [load_run(folder) for folder in folders]
     runs = dict(zip(_checked(names, loaded), loaded, strict=True))
-    title = f"{len(runs)} runs compared"
     entries = [RunEntry(name, str(run.path.resolve())) for name, run in runs.items()]
-    return compare(runs, title=title, entries=entries), runs
+    return build_runs({}, entries, runs), runs
+
+
+def build_runs(
+    facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
+) -> Comparison:
+    """Compare all other runs with the first. Raises UsageError: a run holds no flight."""
+    return compare(runs, title=f"{len(runs)} runs compared", facts=facts, entries=entries)
 
 
 def run_folders(path: Path) -> list[Path]:
@@ -68,7 +75,7 @@ def run_folders(path: Path) -> list[Path]:
     kind = kind_of(path)
     if kind is None:
         return [path]
-    return [path / entry.folder for entry in load_recipe(path, kind).entries]
+    return [path / entry.folder for entry in load_entries(path, kind)[1]]
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:

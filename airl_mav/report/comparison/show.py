@@ -2,68 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, runs
-from airl_mav.report.comparison.build import from_recipe, load_runs
+from airl_mav.report.comparison.build import load_runs
 from airl_mav.report.comparison.model import (
     KIND_NAMES,
     Comparison,
-    ComparisonRecipe,
     Kind,
+    RunEntry,
     kind_of,
-    load_recipe,
+    load_entries,
     save_comparison,
 )
 from airl_mav.report.document import Document, print_document, write_document
 
 Runs = Mapping[str, LoadedRun]
 
+_BUILD: dict[Kind, Callable[[Mapping[str, Any], Sequence[RunEntry], Runs], Comparison]] = {
+    "compare": runs.build_runs,
+    "gap": gap.build_gap,
+    "ladder": ladder.build_ladder,
+    "matrix": matrix.build_matrix,
+    "degradation": degradation.build_degradation,
+}
 
-@dataclass(frozen=True)
-class _Presentation:
-    """How a kind of comparison is worked out and shown."""
-
-    build: Callable[[ComparisonRecipe, Runs], Comparison]
-    document: Callable[[Comparison, Runs, Path], Document]
-
-
-_PRESENTATIONS: dict[Kind, _Presentation] = {
-    "compare": _Presentation(
-        lambda recipe, loaded: from_recipe("compare", recipe, loaded), runs.document_of
-    ),
-    "gap": _Presentation(gap.build_gap, gap.document_of),
-    "ladder": _Presentation(ladder.build_ladder, ladder.document_of),
-    "matrix": _Presentation(matrix.build_matrix, matrix.document_of),
-    "degradation": _Presentation(degradation.build_degradation, degradation.document_of),
+_DOCUMENT: dict[Kind, Callable[[Comparison, Runs, Path], Document]] = {
+    "compare": runs.document_of,
+    "gap": gap.document_of,
+    "ladder": ladder.document_of,
+    "matrix": matrix.document_of,
+    "degradation": degradation.document_of,
 }
 
 
 def build_comparison(
-    folder: Path, kind: Kind, recipe: ComparisonRecipe
+    folder: Path, kind: Kind, facts: Mapping[str, Any], entries: Sequence[RunEntry]
 ) -> tuple[Comparison, dict[str, LoadedRun]]:
-    """Read the runs of a recipe and work the comparison out.
+    """Read runs and compare them as a kind of comparison does.
 
     Args:
         folder: Of the comparison: the runs lie in it.
-        kind: Which comparison.
-        recipe: Its runs and contrasts; `gap_recipe`, `ladder_recipe`, `matrix_recipe` and
-            `degradation_recipe` make one.
+        kind: Which comparison; its module says what it asks of facts and entries.
+        facts: What was asked for.
+        entries: The runs, in the order of the tables.
 
     Returns:
         The comparison, and its runs by name.
 
     Raises:
-        UsageError: A run cannot be read, or holds no flight.
+        UsageError: There is no run, one cannot be read, or holds no flight.
     """
-    loaded = load_runs(folder, recipe.entries)
-    return _PRESENTATIONS[kind].build(recipe, loaded), loaded
+    loaded = load_runs(folder, entries)
+    return _BUILD[kind](facts, entries, loaded), loaded
 
 
 def rebuild_comparison(folder: Path) -> tuple[Comparison, dict[str, LoadedRun]]:
@@ -72,7 +69,7 @@ def rebuild_comparison(folder: Path) -> tuple[Comparison, dict[str, LoadedRun]]:
     if kind is None:
         accepted = ", ".join(KIND_NAMES.values())
         raise UsageError(f"{folder}: no comparison here; accepted: the folder of a {accepted}")
-    return build_comparison(folder, kind, load_recipe(folder, kind))
+    return build_comparison(folder, kind, *load_entries(folder, kind))
 
 
 def write_comparison(comparison: Comparison, loaded: Runs, folder: Path) -> Path:
@@ -98,7 +95,7 @@ def write_comparison(comparison: Comparison, loaded: Runs, folder: Path) -> Path
 
 def comparison_to_document(comparison: Comparison, loaded: Runs, folder: Path) -> Document:
     """Return everything that a comparison says; nothing is drawn yet."""
-    return _PRESENTATIONS[comparison.kind].document(comparison, loaded, folder)
+    return _DOCUMENT[comparison.kind](comparison, loaded, folder)
 
 
 def print_comparison(comparison: Comparison, loaded: Runs, console: Console, page: Path) -> None:

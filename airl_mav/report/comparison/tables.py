@@ -17,13 +17,13 @@ from airl_mav.report.measures import (
     with_interval,
 )
 from airl_mav.report.table import (
+    DURATION_COLUMNS,
     NONE,
     TOO_FEW_CELL,
     TOO_FEW_NOTE,
     Column,
     TableView,
-    ms,
-    percentile_cell,
+    duration_cells,
 )
 
 SIDE_BY_SIDE = 4
@@ -131,8 +131,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> TableView:
     columns = (
         Column("stage", number=False),
         Column("run", number=False),
-        Column("n"),
-        *(Column(title) for title in ("mean", "p50", "p90", "p99", "max")),
+        *DURATION_COLUMNS,
     )
     rows: list[tuple[str, ...]] = []
     mixed = any(run.modelled for run in runs)
@@ -141,10 +140,8 @@ def stages_table(runs: Sequence[ComparedRun]) -> TableView:
         joint = mixed and stage == SETPOINT_TO_MOTOR
         having = [r for r in runs if r.has_stage(stage) or (joint and r.stages[stage.key].n)]
         for number, run in enumerate(having):
-            s = run.stages[stage.key]
-            tail = (percentile_cell(s.p90, s.n), percentile_cell(s.p99, s.n))
-            cells = (f"{s.n:,}", ms(s.mean), ms(s.p50), *tail, ms(s.max))
-            rows.append((stage.title if number == 0 else "", run.mark, *cells))
+            title = stage.title if number == 0 else ""
+            rows.append((title, run.mark, *duration_cells(run.stages[stage.key])))
     notes = ["Milliseconds of simulated time."]
     labels = {run.mark: run.setup.injection.label for run in runs}
     if len(set(labels.values())) == 1:

@@ -69,6 +69,14 @@ def heading_rad(quaternion: Floats) -> float:
     return math.atan2(sin, cos)
 
 
+def headings(quaternions: Floats) -> Floats:
+    """Return the headings (n,) [rad] of attitudes (n, 4), without jumps."""
+    w, x, y, z = quaternions.T
+    angle = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    unwrapped: Floats = np.unwrap(angle)
+    return unwrapped
+
+
 def bearing(quaternion: Floats, offset: Floats) -> float:
     """Return where a thing lies [rad]: from the heading, positive to the right, -pi to pi.
 

@@ -15,6 +15,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.forensics.camera_view import headings
 from airl_mav.report.forensics.evidence import (
     HALF_WIDTH_M,
     NO_CAUSE,
@@ -114,8 +115,7 @@ def _swinging(swing: Swing | None, start_us: int) -> Cause | None:
 
 def _circling(part: Trajectory) -> Cause | None:
     """Say that the vehicle turned round and round."""
-    w, x, y, z = part.quaternion.T
-    heading = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    heading = headings(part.quaternion)
     turns = float(heading[-1] - heading[0]) / (2.0 * math.pi)
     if abs(turns) < CIRCLES:
         return None
