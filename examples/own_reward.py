@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-from airl_mav.training.sb3_export import export_sb3
-from airl_mav.training.spec import NetworkSpec
 from stable_baselines3 import PPO
 
 import airl_mav.envs.registration  # noqa: F401 (registers the id)
@@ -16,6 +14,8 @@ from airl_mav import Scenario, rehearse
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import PolicyFacts
 from airl_mav.policy.layouts import ObservationSpec
+from airl_mav.training.config import NetworkSpec
+from airl_mav.training.export import export_sb3
 from airl_mav.training.networks import policy_arguments
 
 STEPS = 512

@@ -25,7 +25,7 @@ def output_of(name: str, folder: Path, *arguments: str) -> str:
 
 def numbers_after(pattern: str, text: str) -> list[float]:
     """Return the numbers in the groups of every match."""
-    return [float(group) for match in re.finditer(pattern, text) for group in match.groups()]
+    return [float(group) for match in re.finditer(pattern, text, re.M) for group in match.groups()]
 
 
 def test_every_example_is_flown() -> None:
@@ -74,7 +74,9 @@ def test_latency_curve_rises(tmp_path: Path) -> None:
 
 def test_compare_runs(tmp_path: Path) -> None:
     text = output_of("compare_runs.py", tmp_path)
-    assert re.search(r"[123] pairs: the wind costs [+-]\d+\.\d% of flight time", text)
+    changes = numbers_after(r"^\w+ +([+-][\d.]+) %  \[[+-].*\]  over ([1-5]) pairs$", text)
+    assert len(changes) == 6
+    assert max(abs(change) for change in changes[::2]) < 50.0
 
 
 def test_gymnasium_loop(tmp_path: Path) -> None:
