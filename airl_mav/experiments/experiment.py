@@ -22,7 +22,6 @@ from airl_mav.experiments.store import (
     CampaignStore,
     Declaration,
     DeclaredCell,
-    DeclaredComparison,
     open_campaign,
 )
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -58,7 +57,6 @@ class Experiment:
     def declaration(self) -> Declaration:
         """What the folder says of it."""
         shared = shared_flights(self.cells)
-        recipe = self.recipe(self.facts, [self.roles[cell.name] for cell in self.cells])
         return Declaration(
             kind=self.kind,
             settings={},
@@ -67,13 +65,11 @@ class Experiment:
                     title=cell.title,
                     settings=cell.scenario.config,
                     folder=None if shared[cell.name] is cell else shared[cell.name].name,
+                    role=self.roles[cell.name].role,
+                    group=self.roles[cell.name].group,
                 )
                 for cell in self.cells
             },
-            comparisons=tuple(
-                DeclaredComparison(each.reference, each.target, each.title)
-                for each in recipe.contrasts
-            ),
         )
 
 

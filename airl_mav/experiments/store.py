@@ -43,15 +43,10 @@ class DeclaredCell:
     """What is done; a cell with other settings is another one."""
     folder: str | None = None
     """The cell that has the same flights; None: it has its own."""
-
-
-@dataclass(frozen=True)
-class DeclaredComparison:
-    """Two cells that are compared flight by flight."""
-
-    baseline: str
-    candidate: str
-    title: str = ""
+    role: str = ""
+    """What it is in the comparison: `reference`, `target`, a latency, a level."""
+    group: str = ""
+    """Cells of one group are compared with each other."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +59,12 @@ class Declaration:
     """What all cells have in common."""
     cells: dict[str, DeclaredCell]
     """By name: that of the cell's folder."""
-    comparisons: tuple[DeclaredComparison, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a name that cannot be a folder's, or a comparison of no cells."""
+        """Raise ValueError for a name that cannot be a folder's."""
         for name in self.cells:
             if Path(name).name != name or name in ("", "..", CAMPAIGN_FILE):
                 raise ValueError(f"cell {name!r}: accepted: the name of a folder")
-        for each in self.comparisons:
-            for name in (each.baseline, each.candidate):
-                if name not in self.cells:
-                    raise ValueError(f"comparison of {name!r}: accepted: {', '.join(self.cells)}")
 
 
 @dataclass(frozen=True)

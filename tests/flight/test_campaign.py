@@ -20,7 +20,6 @@ from airl_mav.experiments.store import (
     CAMPAIGN_FILE,
     Declaration,
     DeclaredCell,
-    DeclaredComparison,
     load_campaign,
     open_campaign,
 )
@@ -196,7 +195,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
     tmp_path: Path,
 ) -> None:
     flown = cells()
-    asked = replace(declared(flown), comparisons=(DeclaredComparison("a", "b", "shorter hold"),))
+    asked = declared(flown)
     with open_campaign(tmp_path, asked, command="the first command") as store:
         held = load_campaign(tmp_path)
         assert held == store.campaign
