@@ -269,8 +269,3 @@ def test_a_campaign_belongs_to_one_process_at_a_time(
 def test_a_cell_is_named_as_a_folder_can_be(name: str) -> None:
     with pytest.raises(ValueError, match="the name of a folder"):
         Declaration("test", {}, {name: DeclaredCell("")})
-
-
-def test_only_declared_cells_are_compared() -> None:
-    with pytest.raises(ValueError, match=r"comparison of 'b': accepted: a"):
-        Declaration("test", {}, {"a": DeclaredCell("")}, (DeclaredComparison("a", "b"),))

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(
     p for top in ("airl_mav", "firmware_sim", "companion") for p in (ROOT / top).rglob("*.py")
 )
-CLOCK = ROOT / "airl_mav" / "clock.py"
+CLOCK = ROOT / "airl_mav" / "core" / "clock.py"
 CLOCK_CALLS = {"os.times", "asyncio.sleep", "loop.time", "datetime.now", "date.today"}
 SEEDED = {"Generator", "default_rng", "SeedSequence"}
 S_NS, S_US = 1_000_000_000, 1_000_000
