@@ -472,10 +472,10 @@ def test_ardupilot_is_started_with_its_parameters_in_a_file(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("asked", "level", "words"),
     [
-        ({"firmware": "px4"}, "sitl", "firmware px4: accepted: with px4_dir or px4_connect"),
+        ({"firmware": "px4"}, "sitl", "firmware 'px4': accepted: with px4_dir or px4_connect"),
         ({"firmware": "px4", "px4_connect": True, "px4_dir": "x"}, "sitl", "with px4_dir or px4_c"),
         ({"px4_connect": True}, "sitl", "real.px4_connect True: accepted: with firmware px4"),
-        ({"firmware": "px4-hitl"}, "sitl", "firmware px4-hitl: accepted: with serial"),
+        ({"firmware": "px4-hitl"}, "sitl", "firmware 'px4-hitl': accepted: with serial"),
         ({"px4_connect": True, "instance": 10}, "sitl", "real.instance 10: accepted: 0 <= value"),
         (
             {"px4_connect": True, "firmware_timeout": math.inf},

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import io
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import prepare
 from numpy.typing import NDArray
-from rich.console import Console
 
+from airl_mav import rehearse
 from airl_mav.core.constants import TICK_US
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.scenario.model import LevelName, Scenario
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT
 
@@ -34,19 +32,18 @@ def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def fly(level: str, trace: Path, out: Path, draw: int = 0) -> LoadedRun:
-    command = EvaluateCommand(
-        (POLICY,),
-        arena=(ARENA,),
+def fly(level: LevelName, trace: Path, out: Path, draw: int = 0) -> LoadedRun:
+    scenario = Scenario(
+        policy=POLICY,
+        arena=ARENA,
         episodes=EPISODES,
         seed=SEED,
-        level=level,  # type: ignore[arg-type]
+        level=level,
         latency=str(trace),
         latency_seed=draw,
-        workers=1 if level == "lockstep" else None,
+        workers=1,
     )
-    result = prepare(command, POLICY, ARENA).fly(out, Console(file=io.StringIO()))
-    assert result.code == 0
+    rehearse(scenario, out=out)
     return load(out)
 
 

@@ -11,9 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from airl_mav.cli.common import run_command
 
-from airl_mav.cli import entry
+from airl_mav.cli import entry, listing
 from airl_mav.profiles.loading import list_profiles, profiles_dir
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
@@ -244,12 +243,16 @@ def test_report_of_a_damaged_run(refuse: Run, tmp_path: Path, damage: str) -> No
     assert str(info if damage == "nested" else latency) in line
 
 
-def test_a_full_disk_is_the_machines_failure(capsys: pytest.CaptureFixture[str]) -> None:
-    def command() -> int:
+def test_a_full_disk_is_the_machines_failure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(_: object) -> int:
         raise OSError(errno.ENOSPC, "No space left on device", "run/latency.npz")
 
+    monkeypatch.setattr(listing, "run", full)
+    monkeypatch.setattr(sys, "argv", ["airl", "list"])
     with pytest.raises(SystemExit) as end:
-        run_command(command)
+        entry.airl()
     assert end.value.code == 1
     assert capsys.readouterr().err == "error: run/latency.npz: No space left on device\n"
 
