@@ -28,7 +28,6 @@ class CompanionOptions(StandAloneCompanion):
 
 
 OPTIONS = CompanionOptions
-EXTRAS = ()
 
 
 def run(options: CompanionOptions, console: Console | None = None) -> int:

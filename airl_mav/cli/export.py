@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
@@ -101,7 +101,6 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
     Nothing was written then.
     """
     console = console or Console()
-    check_installed("train")
     facts = _facts(options)
     # Imported late: torch takes seconds, and a wrong option is found without it.
     from airl_mav.training.export import export

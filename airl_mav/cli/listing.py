@@ -39,7 +39,6 @@ class ListOptions(BaseModel):
 
 
 OPTIONS = ListOptions
-EXTRAS = ()
 
 
 def run(options: ListOptions, console: Console | None = None) -> int:

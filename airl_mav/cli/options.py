@@ -196,9 +196,9 @@ def _help(field: FieldInfo) -> str:
 def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> NoReturn:
     """Run the command of a module and exit with its status.
 
-    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`; and where it
-    differs from the usual, `RENAMED_OPTIONS` and `EXTRAS`, the extras without which it does
-    nothing. Usage errors become one line and exit status 2, a machine that fails one line and 1.
+    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`; and where
+    there are any, `RENAMED_OPTIONS` and `EXTRAS`, what it needs beside the simulator. Usage errors
+    become one line and exit status 2, a machine that fails one line and 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
@@ -230,10 +230,13 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
         UsageError: The input cannot be used; a message about a field names its option.
         SystemExit: tyro has printed the help, or what is wrong with the words.
     """
+    if module.rpartition(".")[2] not in LIGHT:
+        # Before the import: it would fail for want of them.
+        check_installed("sim")
     command = importlib.import_module(module)
-    check_installed(*getattr(command, "EXTRAS", ("sim",)))
     renamed = getattr(command, "RENAMED_OPTIONS", RENAMED)
     options = read_options(command.OPTIONS, prog, words, renamed=renamed)
+    check_installed(*getattr(command, "EXTRAS", ()))
     try:
         return int(command.run(options, **more))
     except FieldError as error:
@@ -260,6 +263,9 @@ EXTRAS = {
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
 }
 """What the extras install, by their names in pyproject.toml."""
+
+LIGHT = ("companion", "conformance", "export", "listing", "profile", "train")
+"""Commands whose modules need no simulator; those of the others cannot be imported without."""
 
 
 def check_installed(*extras: str) -> None:

@@ -38,7 +38,6 @@ class ProfileOptions(ProfileRequest):
 
 
 OPTIONS = ProfileOptions
-EXTRAS = ()
 RENAMED_OPTIONS = {**RENAMED, "--price": ("--price-usd",)}
 
 

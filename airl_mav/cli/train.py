@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import BaseModel, Field
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.errors import EXIT_INTERRUPTED
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.loading import load_profile
@@ -108,7 +108,6 @@ def run(
         max_acceleration_m_s2=options.max_acceleration_m_s2,
     )
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
-    check_installed("train")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
     from airl_mav.training.run import train

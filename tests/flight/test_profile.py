@@ -277,7 +277,7 @@ def test_light_installation_measures(tmp_path: Path) -> None:
 
 
 def test_light_installation_has_help(tmp_path: Path) -> None:
-    for words in ([], ["profile"], ["evaluate"], ["train"]):
+    for words in ([], ["profile"], ["companion"], ["list"], ["train"]):
         done = in_light_install(tmp_path, *words, "--help")
         assert done.returncode == 0, done.stderr
 
@@ -287,6 +287,7 @@ def test_light_installation_has_help(tmp_path: Path) -> None:
     [
         (["evaluate", "static-obstacles"], "sim"),
         (["arena"], "sim"),
+        (["evaluate", "--help"], "sim"),
         (["profile", "--network", "2x4"], "profile"),
         (["profile", "--level", "sitl"], "sim"),
     ],
