@@ -89,7 +89,7 @@ def unit_of(field: FieldInfo) -> str | None:
 def range_of(field: FieldInfo) -> str:
     """Return the accepted range of a field as text: "0 < value <= 10 kg", or "" when unbounded."""
     low = high = ""
-    for bound in field.metadata:
+    for bound in (*field.metadata, *_branch_metadata(field.annotation)):
         for sign, name in (("<", "gt"), ("<=", "ge")):
             if getattr(bound, name, None) is not None:
                 low = f"{shown(getattr(bound, name))} {sign} "
@@ -100,6 +100,14 @@ def range_of(field: FieldInfo) -> str:
     if not low and not high:
         return ""
     return f"{low}value{high}" + (f" {unit}" if unit and unit != "1" else "")
+
+
+def _branch_metadata(annotation: Any) -> list[Any]:
+    """Return what the branches of a union are annotated with: Annotated[float, Field(gt=0)]."""
+    if get_origin(annotation) not in (Union, UnionType):
+        return []
+    marks = [mark for each in get_args(annotation) for mark in getattr(each, "__metadata__", ())]
+    return [b for mark in marks for b in (mark.metadata if isinstance(mark, FieldInfo) else [mark])]
 
 
 def validated(model: type[Model], data: object, source: object = None) -> Model:

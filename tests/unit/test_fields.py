@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field, ValidationError
@@ -23,6 +23,8 @@ class Outer(ProfileModel):
     level: Literal["gym", "sitl"] = "gym"
     name: str = "x"
     inner: Inner = Field(default_factory=Inner)
+    speed: Annotated[float, Field(gt=0, le=100)] | Literal["max"] = 1.0
+    places: tuple[float, float] = (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -35,12 +37,15 @@ class Outer(ProfileModel):
         ({"seed": 10**6000}, "seed a number of too many digits: accepted: 0 <= value <= 2**31"),
         ({}, "seed: missing"),
         ({"seed": 1, "sed": 1}, "sed: unknown field; did you mean 'seed'?"),
-        ({"seed": 1, "q": 1}, "q: unknown field; fields: seed, level, name, inner"),
+        ({"seed": 1, "q": 1}, "q: unknown field; fields: seed, level, name, inner, speed, places"),
         ({"seed": 1, "level": "hil"}, "level 'hil': accepted: 'gym' or 'sitl'"),
         ({"seed": 1, "name": 3}, "name 3: accepted: a text"),
         ({"seed": 1, "inner": 3}, "inner 3: accepted: a table with the fields share, limit_s"),
         ({"seed": 1, "inner": {"share": math.nan}}, "inner.share nan: accepted: 0 <= value <= 1"),
         ({"seed": 1, "inner": {"limit_s": 0.0}}, "inner.limit_s 0: accepted: 0 < value <= 2**31 s"),
+        ({"seed": 1, "speed": 0.0}, "speed 0: accepted: 0 < value <= 100 or 'max'"),
+        ({"seed": 1, "speed": "fast"}, "speed 'fast': accepted: 0 < value <= 100 or 'max'"),
+        ({"seed": 1, "places": [1.0, "x"]}, "places.1 'x': accepted: a number"),
         ({"seed": -1, "level": "x"}, "seed -1: accepted: 0 <= value <= 2147483648 (and 1 more)"),
     ],
     ids=lambda value: "" if isinstance(value, dict) else value[:40],
