@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import prepare
-from airl_mav.cli.report_command import ReportCommand
 from PIL import Image
 from rich.console import Console
 
-from airl_mav.cli.report import run
+from airl_mav import Scenario, rehearse
+from airl_mav.cli import report
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder
@@ -37,13 +35,12 @@ from tests.report.test_report import Page
 from tests.support.run_demo import demo_setup, write_demo_run
 
 EPISODES = 24
-QUIET = Console(file=io.StringIO())
 
 
 def fly(out: Path, **options: Any) -> Path:
-    given: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "seed": 20}
-    command = EvaluateCommand(("greedy",), **(given | options))
-    return prepare(command, "greedy", command.arena[0]).fly(out, QUIET).path
+    given: dict[str, Any] = {"arena": "dense-obstacles", "episodes": EPISODES, "seed": 20}
+    scenario = Scenario(level="gym", policy="greedy", **(given | options))
+    return rehearse(scenario, out=out).path
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +52,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "fast": fly(root / "fast"),
         "slow": fly(root / "slow", **slow),
         "later": fly(root / "later", seed=34, episodes=20),
-        "elsewhere": fly(root / "elsewhere", arena=("no-obstacles",), episodes=4),
+        "elsewhere": fly(root / "elsewhere", arena="no-obstacles", episodes=4),
         "apart": fly(root / "apart", seed=500, episodes=3),
     }
 
@@ -248,7 +245,7 @@ def test_it_is_the_same_when_it_is_made_again(
 
 def ask(*paths: Path, **options: Any) -> str:
     console = Console(record=True, width=100, file=io.StringIO())
-    assert run(ReportCommand(paths[0], tuple(paths[1:]), **options), console) == 0
+    assert report.run(report.ReportOptions(runs=paths, **options), console) == 0
     return console.export_text()
 
 
@@ -274,7 +271,7 @@ def test_a_table_of_policies_and_arenas_stands_for_its_runs(
     (root / "matrix.json").write_text(json.dumps(held))
     assert "workstation" in ask(root, out=tmp_path / "out")
     (root / "matrix.json").write_text('{"schema": 2, "runs": 3}')
-    with pytest.raises(UsageError, match=r"matrix\.json: facts: Field required"):
+    with pytest.raises(UsageError, match=r"matrix\.json: facts: missing"):
         ask(root, runs["fast"], out=tmp_path / "other")
 
 
@@ -284,7 +281,7 @@ def test_what_cannot_be_compared_is_refused(runs: dict[str, Path], tmp_path: Pat
         ask(fast, fast, out=tmp_path / "out")
     with pytest.raises(UsageError, match="no run here"):
         ask(fast, tmp_path, out=tmp_path / "out")
-    with pytest.raises(UsageError, match="--names: 1 for 2 runs"):
+    with pytest.raises(UsageError, match="names: 1 for 2 runs"):
         ask(fast, slow, names=("one",), out=tmp_path / "out")
     with pytest.raises(UsageError, match="--names 'a': accepted"):
         ask(fast, slow, names=("a", "a"), out=tmp_path / "out")

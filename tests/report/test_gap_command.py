@@ -19,15 +19,15 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from airl_mav.cli.gap_command import DEFAULT_MITIGATED, GapCommand
-from airl_mav.cli.gap_plan import TRAINING_LATENCY_SEED, plan_gap
-from airl_mav.cli.report_command import ReportCommand
 from PIL import Image
 from rich.console import Console
 
-from airl_mav.cli import gap_plan, report
-from airl_mav.cli.gap import run
+from airl_mav.cli import report
+from airl_mav.cli.gap import OPTIONS
+from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments import gap as gap_experiment
+from airl_mav.experiments.gap import DEFAULT_MITIGATED, TRAINING_LATENCY_SEED, declare_gap
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
@@ -37,6 +37,7 @@ from airl_mav.report.comparison.model import load_comparison, save_comparison
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES
+from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
 
 GAP_FILE = "gap.json"
 EPISODES = 24
@@ -72,14 +73,23 @@ def measure(mitigated: str, *, page: bool = False, **options: Any) -> tuple[int,
     Pages take longer than flights: without `page` none is made.
     """
     console = Console(record=True, width=80, file=io.StringIO())
-    words: dict[str, Any] = {"mitigated": mitigated, "episodes": EPISODES}
+    given: dict[str, Any] = {"mitigated": mitigated, "episodes": EPISODES}
     with (
         nullcontext()
         if page
         else patch.object(show, "write_document", lambda _, folder: folder / "gap.html")
     ):
-        code = run(GapCommand(**(words | options)), console)
+        code = carry_out("airl gap", "airl_mav.cli.gap", words_of(given | options), console=console)
     return code, console.export_text()
+
+
+def words_of(options: dict[str, Any]) -> list[str]:
+    """Return options as words of a command line."""
+    words = []
+    for name, value in options.items():
+        many = value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *(f"{each}" for each in many)]
+    return words
 
 
 @pytest.fixture(scope="module")
@@ -407,45 +417,28 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     before = (out / GAP_FILE).read_bytes()
     console = Console(record=True, width=80, file=io.StringIO())
     with patch.object(show, "write_document", lambda _, folder: folder / "gap.html"):
-        assert report.run(ReportCommand(out), console) == 0
+        assert report.run(report.ReportOptions(runs=(out,)), console) == 0
     assert (out / GAP_FILE).read_bytes() == before
     assert console.export_text().strip() in text
 
 
-def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigated: str) -> None:
-    """A gap that was stopped after its second column has one gap already."""
-    for role in ("reference", "target"):
-        name = f"static-obstacles-{role}"
-        shutil.copytree(whole[0] / name, tmp_path / "root" / name)
-    from airl_mav.cli import cells
-
-    real = cells._fly
-
-    def stopped(root: Path, cell: Any, *rest: Any) -> Any:
-        if cell.key.endswith("-mitigated"):
-            raise KeyboardInterrupt
-        return real(root, cell, *rest)
-
-    with patch.object(cells, "_fly", stopped):
-        code, text = measure(mitigated, out=tmp_path / "root")
-    assert code == 130
-    assert "goes on" in text
-    data = data_of(tmp_path / "root")
-    assert [gap["entry"]["key"] for gap in data["contrasts"]] == ["without-mitigation"]
-    assert gap_of(data, "without-mitigation") == gap_of(data_of(whole[0]), "without-mitigation")
-    code, _ = measure(mitigated, out=tmp_path / "root")
-    assert code == 0
-    assert data_of(tmp_path / "root") == data_of(whole[0])
+def test_a_part_of_it_is_shown(whole: tuple[Path, str]) -> None:
+    """A gap that was stopped after its second run has one gap already."""
+    gap = load_comparison(whole[0], "gap")
+    entries = [run.entry for run in gap.runs if run.entry.role in ("reference", "target")]
+    part, _ = build_comparison(whole[0], "gap", gap.facts, entries)
+    assert [contrast.entry.key for contrast in part.contrasts] == ["without-mitigation"]
+    assert part.contrasts[0] == gap.contrasts[0]
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[", "not JSON"),
+        ("[", "JSON"),
         ('{"schema": 9}', "schema = 9"),
-        ('{"schema": 2, "facts": {}}', "runs: Field required"),
+        ('{"schema": 2, "facts": {}}', "runs: missing"),
         ('{"schema": 2, "facts": {}, "runs": []}', "no run here"),
-        pytest.param("[" * 100_000, "nested too deeply", id="nested"),
+        pytest.param("[" * 100_000, "nested", id="nested"),
     ],
 )
 def test_a_damaged_file_is_one_line(tmp_path: Path, text: str, words: str) -> None:
@@ -504,20 +497,22 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
 
 
 def test_defaults_are_those_of_the_package() -> None:
-    command = GapCommand()
+    command = OPTIONS()
     assert command.policy == DEFAULT_POLICY
     assert command.mitigated == DEFAULT_MITIGATED
 
 
 def test_a_missing_mitigated_policy_is_one_clear_line() -> None:
     with (
-        patch.object(gap_plan, "find_policy", side_effect=_unknown),
-        pytest.raises(UsageError, match="not among the shipped policies; accepted: the folder"),
+        patch.object(gap_experiment, "find_policy", side_effect=_unknown),
+        pytest.raises(
+            UsageError, match=r"accepted: the folder of a policy .* not among the shipped"
+        ),
     ):
-        gap_plan._mitigated(DEFAULT_MITIGATED)
+        gap_experiment._mitigated(DEFAULT_MITIGATED)
     with pytest.raises(UsageError, match="no such policy"):
-        gap_plan._mitigated("somebody")
-    assert gap_plan._mitigated("none") is None
+        gap_experiment._mitigated("somebody")
+    assert gap_experiment._mitigated("none") is None
 
 
 def _unknown(name: str) -> PolicyInfo:
@@ -529,17 +524,18 @@ def _unknown(name: str) -> PolicyInfo:
     [
         ({"episodes": 0}, "--episodes 0"),
         ({"seed": -1}, "--seed -1"),
-        ({"workers": 2}, "--workers 2 with --level gym"),
-        ({"latency": "150ms", "workload": "template-5x32"}, "accepted: one of them"),
+        (
+            {"latency": "150ms", "workload": "template-5x32"},
+            "--latency '150ms': accepted: without a workload",
+        ),
         ({"latency": "late"}, "--latency late"),
         ({"workload": "template-1x1"}, "template-1x1"),
         ({"reference_workload": "template-1x1"}, "template-1x1"),
         ({"computer": "abacus"}, "abacus"),
         ({"reference": "abacus"}, "abacus"),
         ({"policy": "nobody"}, "nobody"),
-        ({"mitigated": DEFAULT_POLICY}, "the same name as --policy"),
-        ({"arena": ("no-obstacles", "no-obstacles")}, "each once"),
-        ({"arena": ()}, "one or more"),
+        ({"mitigated": DEFAULT_POLICY}, "accepted: another policy, or none"),
+        ({"arena": ("no-obstacles", "no-obstacles")}, "each arena once"),
         ({"arena": ("nowhere",)}, "nowhere"),
     ],
 )
@@ -555,36 +551,41 @@ def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str
 # --- how the conditions of a training are read
 
 
-def training_of(folder: Path, **options: Any) -> tuple[list[Any], tuple[str, ...]]:
-    plan = plan_gap(GapCommand(mitigated=str(folder), **options))
-    return [p.cell for p in plan.cells if p.role == "training"], plan.remarks
+def training_of(folder: Path) -> tuple[list[Any], tuple[str, ...]]:
+    scenario = Scenario(level="gym", policy=DEFAULT_POLICY, computer="ras-pi-4", episodes=EPISODES)
+    gap = declare_gap(scenario, mitigated=str(folder))
+    cells = [cell for cell in gap.cells if gap.roles[cell.name].role == "training"]
+    return cells, gap.remarks
 
 
 def test_training_without_delay_is_flown_without(tmp_path: Path) -> None:
     folder = make_policy(tmp_path / "m", {"computer": "workstation", "native_ms": 2.0})
     (cell,), _ = training_of(folder)
-    assert cell.command.latency == "2ms"
-    assert cell.command.workload is None
-    assert cell.command.computer == "ras-pi-4"
+    assert cell.scenario.scenario.latency == "2ms"
+    assert cell.scenario.scenario.workload is None
+    assert cell.scenario.scenario.computer == "ras-pi-4"
 
 
 def test_training_on_several_latencies_gives_a_column_for_each(tmp_path: Path) -> None:
     sources = ["lognormal:396ms,20ms", "150ms"]
     folder = make_policy(tmp_path / "m", {"latency": sources})
     cells, _ = training_of(folder)
-    assert [cell.command.latency for cell in cells] == sources
-    assert [cell.key for cell in cells] == [
+    assert [cell.scenario.scenario.latency for cell in cells] == sources
+    assert [cell.name for cell in cells] == [
         "static-obstacles-training",
         "static-obstacles-training-2",
     ]
-    assert {cell.command.latency_seed for cell in cells} == {TRAINING_LATENCY_SEED}
+    assert {cell.scenario.scenario.latency_seed for cell in cells} == {TRAINING_LATENCY_SEED}
     assert "150ms" in cells[1].title
 
 
 def test_an_estimate_stays_one(tmp_path: Path) -> None:
     folder = make_policy(tmp_path / "m", {"computer": "ras-pi-4", "workload": "estimate"})
     (cell,), _ = training_of(folder)
-    assert (cell.command.computer, cell.command.workload) == ("ras-pi-4", "estimate")
+    assert (cell.scenario.scenario.computer, cell.scenario.scenario.workload) == (
+        "ras-pi-4",
+        "estimate",
+    )
 
 
 def test_what_the_column_lacks_is_said(tmp_path: Path) -> None:

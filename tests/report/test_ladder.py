@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
-from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -18,20 +17,18 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.evaluate_task import Result, Task
-from airl_mav.cli.ladder_command import LadderCommand
 from PIL import Image
 from rich.console import Console
 
-from airl_mav.cli import evaluate_task, ladder_levels, main, report
-from airl_mav.cli.ladder import run
+from airl_mav.cli import main, report
+from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import gym_flier
+from airl_mav.experiments import ladder as ladder_experiment
+from airl_mav.experiments.campaign import Cell
+from airl_mav.experiments.experiment import make_cell
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
 from airl_mav.rehearsal.run_folder import RunFolder, load
-from airl_mav.report import run_page
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.ladder import other_differences, split_table
@@ -40,6 +37,7 @@ from airl_mav.report.comparison.show import build_comparison, write_comparison
 from airl_mav.report.comparison.tables import contrast_table, runs_table
 from airl_mav.report.measures import MEASURES
 from airl_mav.report.table import TableView
+from airl_mav.scenario.model import Scenario
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
 
 LADDER_FILE = "ladder.json"
@@ -51,55 +49,20 @@ SLOW: dict[str, Any] = {"computer": "ras-pi-4", "workload": "template-5x32"}
 """Decides some 400 ms later."""
 
 
-class StandIns:
-    """Levels lockstep and sitl flown by the twin on a slow computer: the command is under test.
+def stand_in(name: str, title: str, scenario: Scenario) -> Cell:
+    """Make a cell of levels lockstep and sitl that the twin flies on a slow computer.
 
-    Level sitl is cut short where `cut` says after how many episodes.
+    The ladder is under test, not its levels.
     """
-
-    def __init__(self) -> None:
-        self.cut: list[int] = []
-        self.flown: list[tuple[str, int]] = []
-        """Level, and number of new episodes."""
-
-    def prepare(self, command: EvaluateCommand, policy: str, arena: str) -> Task:
-        twin = replace(command, level="gym", speed=None, workers=None)
-        if command.level != "gym":
-            twin = replace(twin, **SLOW)
-        task = evaluate_task.prepare(twin, policy, arena)
-        return replace(task, fly=partial(self._fly, command, task))
-
-    def _fly(
-        self, command: EvaluateCommand, task: Task, out: Path | None, console: Console
-    ) -> Result:
-        result = task.fly(out, console)
-        if command.level == "sitl" and self.cut:
-            result = cut_short(result, self.cut.pop(0))
-        self.flown.append((command.level, result.new))
-        return result
-
-
-def cut_short(result: Result, keep: int) -> Result:
-    """Return a run as Ctrl-C would have left it after some new episodes."""
-    path = result.path / "episodes.jsonl"
-    there = path.read_text().splitlines(keepends=True)
-    there = there[: len(there) - result.new + keep]
-    path.write_text("".join(there))
-    return Result(result.path, 130, load(result.path).episodes, keep)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _no_pictures() -> Iterator[None]:
-    """Pictures take longer than flights."""
-    with patch.object(run_page, "MAX_PICTURED", 1), patch.object(ladder_levels, "write_report"):
-        yield
+    if scenario.level != "gym":
+        scenario = scenario.model_copy(update={"level": "gym", "speed": None, **SLOW})
+    return make_cell(name, title, scenario)
 
 
 @pytest.fixture(scope="module")
-def stand_ins() -> Iterator[StandIns]:
-    stand_ins = StandIns()
-    with patch.object(ladder_levels, "prepare", stand_ins.prepare):
-        yield stand_ins
+def _twins() -> Iterator[None]:
+    with patch.object(ladder_experiment, "make_cell", stand_in):
+        yield
 
 
 def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
@@ -108,18 +71,22 @@ def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
     Pages take longer than flights: without `page` none is made.
     """
     console = Console(record=True, width=100, file=io.StringIO())
-    command = LadderCommand("greedy", **(WORDS | {"sitl_episodes": SITL_EPISODES} | options))
+    given = WORDS | {"sitl_episodes": SITL_EPISODES} | options
+    words = ["greedy"]
+    for name, value in given.items():
+        many = value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *(f"{each}" for each in many)]
     with (
         nullcontext()
         if page
         else patch.object(show, "write_document", lambda _, folder: folder / "ladder.html")
     ):
-        code = run(command, console)
+        code = carry_out("airl ladder", "airl_mav.cli.ladder", words, console=console)
     return code, console.export_text()
 
 
 @pytest.fixture(scope="module")
-def whole(stand_ins: StandIns, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def whole(_twins: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """A ladder without any trouble: its folder, and what was printed."""
     out = tmp_path_factory.mktemp("whole") / "ladder"
     code, text = climb(out=out, page=True)
@@ -157,22 +124,14 @@ def comparison_tables(ladder: Comparison) -> list[TableView]:
 # --- what it flies
 
 
-def test_every_level_flies_the_same_seeds(whole: tuple[Path, str], stand_ins: StandIns) -> None:
+def test_every_level_flies_the_same_seeds(whole: tuple[Path, str]) -> None:
     out, _ = whole
-    assert stand_ins.flown[:3] == [("gym", 24), ("lockstep", 24), ("sitl", 6)]
     flights = {level: lines(out / level) for level in ("gym", "lockstep", "sitl")}
     assert list(flights["gym"]) != list(flights["sitl"])
     assert sorted(flights["gym"]) == sorted(flights["lockstep"]) == list(range(20, 44))
     assert sorted(flights["sitl"]) == list(range(20, 26))
     for seed, episode in flights["sitl"].items():
         assert episode["goal"] == flights["gym"][seed]["goal"] == flights["lockstep"][seed]["goal"]
-
-
-def test_level_sitl_flies_fewer_unless_asked() -> None:
-    assert LadderCommand("greedy").episodes_at("sitl") == 10
-    assert LadderCommand("greedy", episodes=4).episodes_at("sitl") == 4
-    assert LadderCommand("greedy", sitl_episodes=30).episodes_at("sitl") == 30
-    assert LadderCommand("greedy", sitl_episodes=30).episodes_at("gym") == 100
 
 
 @pytest.mark.slow
@@ -184,7 +143,7 @@ def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
         "workers": 1,
     }
     levels = ("gym", "lockstep")
-    with patch.object(ladder_levels, "prepare", evaluate_task.prepare):
+    with patch.object(ladder_experiment, "make_cell", make_cell):
         assert climb(out=tmp_path / "one", levels=levels, page=True, **options)[0] == 0
         # The other way round it is flown again, and flies the same.
         assert climb(out=tmp_path / "two", levels=levels[::-1], **options)[0] == 0
@@ -520,7 +479,7 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     out, text = whole
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
     console = Console(record=True, width=100, file=io.StringIO())
-    assert report.run(report.ReportCommand(out), console) == 0
+    assert report.run(report.ReportOptions(runs=(out,)), console) == 0
     assert text.endswith(console.export_text())
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
@@ -532,7 +491,7 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
         ('{"schema": 99}', "schema = 99: accepted: 2"),
         (
             '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym"}}]}',
-            "runs.0.entry.folder",
+            "folder: missing",
         ),
         (
             '{"schema": 2, "facts": {}, "runs": [{"entry": {"name": "gym", "folder": "gym"}}]}',
@@ -543,60 +502,19 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
 def test_a_broken_ladder_gets_one_line(content: str, named: str, tmp_path: Path) -> None:
     (tmp_path / LADDER_FILE).write_text(content)
     with pytest.raises(UsageError, match=re.escape(named)) as error:
-        report.run(report.ReportCommand(tmp_path))
+        report.run(report.ReportOptions(runs=(tmp_path,)))
     assert "\n" not in str(error.value)
 
 
 # --- what it survives
 
 
-def test_an_interrupted_ladder_goes_on(
-    whole: tuple[Path, str], stand_ins: StandIns, tmp_path: Path
-) -> None:
-    out = tmp_path / "ladder"
-    stand_ins.cut[:] = [2, 0]
-    stand_ins.flown.clear()
-    code, text = climb(out=out)
-    assert code == 130
-    assert f"the same command with --out {out} goes on" in text
-    assert "2 of 6 at sitl" in text
-    assert contrasts_of(data_of(out))[1]["success_rate"]["difference"]["n"] == 2
-    # Cut again before anything was flown, then to the end.
-    assert climb(out=out)[0] == 130
-    code, text = climb(out=out)
-    assert code == 0
-    assert "2 of 6 episodes are there" in text
-    assert [part for part in stand_ins.flown if part[1]] == [
-        ("gym", 24),
-        ("lockstep", 24),
-        ("sitl", 2),
-        ("sitl", 4),
-    ]
-    assert data_of(out) == data_of(whole[0])
-
-
-def test_an_interrupted_first_level(stand_ins: StandIns, tmp_path: Path) -> None:
-    def stopped(*_: Any, **__: Any) -> Result:
-        return Result(tmp_path / "ladder" / "gym", 130, (), 0)
-
-    (tmp_path / "ladder" / "gym").mkdir(parents=True)
-    RunFolder.create(tmp_path / "ladder" / "gym", "x", {}, setup=demo_setup())
-    with patch.object(StandIns, "_fly", stopped):
-        code, text = climb(out=tmp_path / "ladder", levels=("gym", "lockstep"))
-    assert code == 130
-    assert "goes on" in text
-    assert not (tmp_path / "ladder" / LADDER_FILE).exists()
-
-
-def test_what_is_finished_is_shown_again_and_not_flown(
-    whole: tuple[Path, str], stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_finished_is_shown_again_and_not_flown(whole: tuple[Path, str]) -> None:
     out, text = whole
-    monkeypatch.setattr(gym_flier, "fly_seeds", None)
-    stand_ins.flown.clear()
+    flown = {path: path.read_bytes() for path in out.rglob("episodes.jsonl")}
     code, again = climb(out=out)
     assert code == 0
-    assert not [part for part in stand_ins.flown if part[1]]
+    assert {path: path.read_bytes() for path in out.rglob("episodes.jsonl")} == flown
     tables = [shown.partition("policy ")[2].partition("ladder  ")[0] for shown in (text, again)]
     assert tables[0] == tables[1] != ""
 
@@ -607,15 +525,15 @@ def test_what_is_finished_is_shown_again_and_not_flown(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"levels": ("gym",)}, "--levels gym: accepted: two or more"),
-        ({"levels": ()}, "--levels nothing"),
-        ({"levels": ("gym", "sitl", "gym")}, "--levels gym sitl gym"),
+        ({"levels": ("gym",)}, "--levels 'gym': accepted: two or more"),
+        ({"levels": ()}, "--levels 'none'"),
+        ({"levels": ("gym", "sitl", "gym")}, "--levels 'gym sitl gym'"),
         ({"episodes": 0}, "--episodes 0"),
         ({"seed": -1}, "--seed -1"),
         ({"sitl_episodes": 25}, "--sitl-episodes 25: accepted: 1 <= value <= 24"),
         ({"sitl_episodes": 0}, "--sitl-episodes 0"),
         ({"workers": 0}, "--workers 0"),
-        ({"speed": 100.0}, "--speed 100"),
+        ({"speed": 100.0}, "--speed '100'"),
         ({"arena": "moon"}, "'moon'"),
         ({"computer": "abacus"}, "'abacus'"),
     ],
@@ -624,7 +542,7 @@ def test_what_cannot_be_used_is_refused_before_anything_flies(
     options: dict[str, Any], named: str, tmp_path: Path
 ) -> None:
     with (
-        patch.object(ladder_levels, "prepare", evaluate_task.prepare),
+        patch.object(ladder_experiment, "make_cell", make_cell),
         pytest.raises(UsageError, match=re.escape(named)) as error,
     ):
         climb(out=tmp_path / "ladder", **{"levels": ("gym", "sitl")} | options)
@@ -632,14 +550,12 @@ def test_what_cannot_be_used_is_refused_before_anything_flies(
     assert not (tmp_path / "ladder").exists()
 
 
-def test_another_run_is_not_mixed_in(whole: tuple[Path, str], stand_ins: StandIns) -> None:
+def test_another_run_is_not_mixed_in(whole: tuple[Path, str]) -> None:
     out, _ = whole
     before = data_of(out)
-    with pytest.raises(UsageError, match=r"gym: holds a run with .*seed = 20, not 21"):
+    with pytest.raises(UsageError, match=r"another cell gym: seed = 20, not 21"):
         climb(out=out, seed=21)
-    with pytest.raises(UsageError, match=r"sitl: holds a run with .*seed = 20, not 21"):
-        climb(out=out, seed=21, levels=("sitl", "gym"))
-    with pytest.raises(UsageError, match="holds a single run"):
+    with pytest.raises(UsageError, match=r"holds a single run|holds a run"):
         climb(out=out / "gym")
     assert data_of(out) == before
 
