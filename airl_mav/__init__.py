@@ -23,6 +23,7 @@ _EXPORTS = {
     "gap": "airl_mav.experiments.gap",
     "ladder": "airl_mav.experiments.ladder",
     "load_run": "airl_mav.experiments.run",
+    "profile": "airl_mav.profiling.profile",
     "rehearse": "airl_mav.experiments.fly",
 }
 """Public names, and the modules that define them."""
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from airl_mav.experiments.gap import gap
     from airl_mav.experiments.ladder import ladder
     from airl_mav.experiments.run import Run, load_run
+    from airl_mav.profiling.profile import profile
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
@@ -46,6 +48,7 @@ __all__ = [
     "gap",
     "ladder",
     "load_run",
+    "profile",
     "rehearse",
 ]
 

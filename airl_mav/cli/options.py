@@ -181,8 +181,10 @@ def _default(field: FieldInfo, held: Any) -> Any:
 
 
 def _metavar(name: str, kind: Any) -> str:
-    word = name.removesuffix("s").upper() if "tuple" in str(kind) else name.upper()
-    return f"[{word} ...]" if "tuple" in str(kind) else word
+    if "tuple" not in str(kind):
+        return name.upper()
+    one = f"{name[:-3]}y" if name.endswith("ies") else name.removesuffix("s")
+    return f"[{one.upper()} ...]"
 
 
 def _help(field: FieldInfo) -> str:

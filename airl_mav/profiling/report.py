@@ -124,7 +124,8 @@ def _time_table(measured: ComputerMeasurement) -> TableView:
             f"{flown}. t2 corrected: with the decisions that were due every {hold_s:g} s "
             "meanwhile.",
             "The loop is closed: a decision begins when the last one has ended, so a slow one "
-            "keeps others from being counted. This table corrects for that: see docs/how-to/profile.md.",
+            "keeps others from being counted. This table corrects for that: see "
+            "docs/how-to/profile.md.",
         ),
     )
 

@@ -11,7 +11,7 @@ import pytest
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT, running
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("examples"), pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("examples"), pytest.mark.timeout(600)]
 
 EXAMPLES = ROOT / "examples"
 
@@ -19,7 +19,7 @@ EXAMPLES = ROOT / "examples"
 def output_of(name: str, folder: Path, *arguments: str) -> str:
     """Return what an example prints, run in an empty folder."""
     with running([str(EXAMPLES / name), *arguments], folder) as program:
-        assert program.wait() == 0, program.text()
+        assert program.wait(280.0) == 0, program.text()
         return program.text()
 
 
