@@ -16,6 +16,7 @@ __version__ = "0.2.0"
 
 _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",
+    "ProfileRequest": "airl_mav.profiling.request",
     "Run": "airl_mav.experiments.run",
     "Scenario": "airl_mav.scenario.model",
     "degrade": "airl_mav.experiments.degrade",
@@ -37,10 +38,13 @@ if TYPE_CHECKING:
     from airl_mav.experiments.ladder import ladder
     from airl_mav.experiments.run import Run, load_run
     from airl_mav.profiling.profile import profile
+    from airl_mav.profiling.request import ProfileRequest
+    from airl_mav.profiling.profile import profile
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
     "ExperimentResult",
+    "ProfileRequest",
     "Run",
     "Scenario",
     "degrade",
