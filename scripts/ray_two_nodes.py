@@ -31,7 +31,8 @@ from rich.console import Console
 
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
-from airl_mav.experiments.executors import ExecutorSettings, open_executor
+from airl_mav.experiments.executors import ExecutorSettings
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.policy.card import read_card
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

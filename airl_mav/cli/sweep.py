@@ -14,7 +14,8 @@ from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.fields import quantity, validated
 from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.executors import ExecutorSettings, open_executor
+from airl_mav.experiments.executors import ExecutorSettings
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile

@@ -6,16 +6,14 @@ The same job gives the same results whoever carries it out: this process, worker
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
 
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import quantity
-from airl_mav.core.provenance import usable_cores
-from airl_mav.scenario.model import GREATEST_WORKERS, Workers
+from airl_mav.scenario.model import Workers
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -125,33 +123,6 @@ class ExecutorSettings(Workers):
     """Who carries out the jobs of an experiment, and what a job takes."""
 
     ray_gpus: float = quantity("share of a GPU for each job", "1", ge=0.0, le=8.0, default=0.0)
-
-
-@contextmanager
-def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> Iterator[Executor]:
-    """Give the executor that was asked for.
-
-    Args:
-        settings: What was asked for.
-        in_process: Whether one worker may be this process; one is then the default, too.
-
-    Raises:
-        UsageError: Ray is not installed, or not to be reached.
-    """
-    cores = min(usable_cores(), GREATEST_WORKERS)
-    if settings.executor == "ray":
-        from airl_mav.experiments.ray_executor import connected
-
-        with connected(settings, cores) as executor:
-            yield executor
-        return
-    workers = settings.workers or (1 if in_process else cores)
-    if in_process and workers == 1:
-        yield InProcessExecutor()
-        return
-    from airl_mav.experiments.process_executor import ProcessExecutor
-
-    yield ProcessExecutor(workers)
 
 
 # --- what the executors with workers have in common

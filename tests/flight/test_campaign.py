@@ -15,7 +15,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import SilentProgress
 from airl_mav.experiments import campaign
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
-from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor, open_executor
+from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import (
     CAMPAIGN_FILE,
     Declaration,

@@ -21,8 +21,8 @@ from airl_mav.experiments.executors import (
     ExecutorSettings,
     InProcessExecutor,
     WorkerError,
-    open_executor,
 )
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.process_executor import ProcessExecutor
 from tests.support import worker_jobs
 from tests.support.processes import ROOT, is_running, running, wait_until

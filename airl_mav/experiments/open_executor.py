@@ -1,0 +1,37 @@
+"""Which executor is asked for: this process, worker processes, or Ray."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from airl_mav.core.provenance import usable_cores
+from airl_mav.experiments.executors import Executor, ExecutorSettings, InProcessExecutor
+from airl_mav.experiments.process_executor import ProcessExecutor
+from airl_mav.scenario.model import GREATEST_WORKERS
+
+
+@contextmanager
+def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> Iterator[Executor]:
+    """Give the executor that was asked for.
+
+    Args:
+        settings: What was asked for.
+        in_process: Whether one worker may be this process; one is then the default, too.
+
+    Raises:
+        UsageError: Ray is not installed, or not to be reached.
+    """
+    cores = min(usable_cores(), GREATEST_WORKERS)
+    if settings.executor == "ray":
+        # Imported here: Ray is an extra.
+        from airl_mav.experiments.ray_executor import connected
+
+        with connected(settings, cores) as executor:
+            yield executor
+        return
+    workers = settings.workers or (1 if in_process else cores)
+    if in_process and workers == 1:
+        yield InProcessExecutor()
+        return
+    yield ProcessExecutor(workers)
