@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from airl_mav.experiments.run import Run, load_run
     from airl_mav.profiling.profile import profile
     from airl_mav.profiling.request import ProfileRequest
-    from airl_mav.profiling.profile import profile
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
