@@ -68,6 +68,7 @@ class GapOptions(Flights, Lateness, Decisions, Aircraft):
     )
     arena: tuple[str, ...] = Field(
         default=(DEFAULT_ARENA,),
+        min_length=1,
         description="arena profiles: shipped names, or paths; of several, each gets its tables",
     )
     level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)

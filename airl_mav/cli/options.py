@@ -86,7 +86,7 @@ def read_options(
     try:
         return validated(model, dataclasses.asdict(parsed))
     except FieldError as error:
-        raise UsageError(told(error, words, file)) from None
+        raise UsageError(told(error, words, file, _positionals(model))) from None
 
 
 def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
@@ -100,8 +100,15 @@ def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
     return Scenario(**{name: value for name, value in given.items() if value is not None})
 
 
-def told(error: FieldError, words: Sequence[str], file: Path | None = None) -> str:
+def told(
+    error: FieldError,
+    words: Sequence[str],
+    file: Path | None = None,
+    positionals: Sequence[str] = (),
+) -> str:
     """Return an error about a field in one line that names the option, or the line of the file."""
+    if error.field in positionals:
+        return error.line(error.field.upper())
     option = option_of(error.field)
     given = any(word == option or word.startswith(f"{option}=") for word in words)
     if file is not None and not given:
@@ -242,7 +249,9 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     try:
         return int(command.run(options, **more))
     except FieldError as error:
-        raise UsageError(told(error, words, _scenario_file(type(options), words))) from None
+        options_model = type(options)
+        file = _scenario_file(options_model, words)
+        raise UsageError(told(error, words, file, _positionals(options_model))) from None
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:

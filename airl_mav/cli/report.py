@@ -58,7 +58,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     """
     console = console or Console()
     if not options.runs:
-        raise FieldError("runs", "()", "one run folder or more")
+        raise FieldError("runs", accepted="one run folder or more")
     first = options.runs[0]
     if len(options.runs) > 1 or kind_of(first) == "matrix":
         return _compare(options, console)

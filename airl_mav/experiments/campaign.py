@@ -43,6 +43,11 @@ class Cell:
     """One line for people."""
     scenario: ResolvedScenario
 
+    def __post_init__(self) -> None:
+        """Raise UsageError if the level's own environment cannot fly the scenario."""
+        if self.scenario.scenario.level in FLIERS:
+            _ = self.flier
+
     @property
     def flier(self) -> Flier:
         """How its episodes are flown."""

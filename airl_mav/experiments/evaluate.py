@@ -86,7 +86,7 @@ def evaluation_cells(
         UsageError: A policy or an arena cannot be flown, or two would share a row or a column.
     """
     if not policies:
-        raise FieldError("policies", "()", "one or more names or folders")
+        raise FieldError("policies", accepted="one or more names or folders")
     found = [find_policy(name) for name in policies]
     _check_names("policies", [policy.name for policy in found])
     if not arenas:

@@ -83,6 +83,10 @@ class GymFlier:
 
     scenario: ResolvedScenario
 
+    def __post_init__(self) -> None:
+        """Raise UsageError for rules that the batch twin cannot fly by."""
+        environment_of(self.scenario)
+
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return how many episodes make a job; see `fliers.Flier`."""
         return max(

@@ -20,17 +20,11 @@ from pydantic import TypeAdapter
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, write_json
 from airl_mav.core.provenance import provenance
-from airl_mav.rehearsal.evaluation import another_config
+from airl_mav.rehearsal.evaluation import CAMPAIGN_FILE, another_config, check_folder
 from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.run_folder import RUN_FILE
 
 SCHEMA = 1
 """Version of `campaign.json`."""
-
-CAMPAIGN_FILE = "campaign.json"
-
-OTHERS = {RUN_FILE: "a single run", "train.json": "a training"}
-"""Files by which a folder is known that holds no campaign."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +122,7 @@ def open_campaign(
 
 def _declare(path: Path, declaration: Declaration, command: str, free: Collection[str]) -> Campaign:
     """Write the declaration, unless it contradicts the one that is there."""
-    for file, what in OTHERS.items():
-        if (path / file).exists():
-            raise UsageError(f"--out {path}: holds {what}; accepted: another folder")
+    check_folder(path, CAMPAIGN_FILE)
     if not (path / CAMPAIGN_FILE).exists():
         campaign = Campaign(declaration, provenance(command))
     else:

@@ -14,6 +14,25 @@ from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
 from airl_mav.scenario.model import free_fields
 from airl_mav.scenario.resolved import ResolvedScenario
 
+CAMPAIGN_FILE = "campaign.json"
+
+FOLDER_KINDS = {
+    RUN_FILE: "a single run",
+    CAMPAIGN_FILE: "a campaign",
+    "train.json": "a training",
+    **dict.fromkeys(("gap.json", "ladder.json", "matrix.json"), "runs of an earlier version"),
+}
+"""What a folder holds, by the first of these files that is found in it."""
+
+
+def check_folder(path: Path, wanted: str) -> None:
+    """Raise UsageError if a folder holds something else than the file by which ours is known."""
+    for file, what in FOLDER_KINDS.items():
+        if file == wanted and (path / file).exists():
+            return
+        if (path / file).exists():
+            raise UsageError(f"--out {path}: holds {what}; accepted: another folder")
+
 
 def open_folder(
     out: Path | None, name: str, scenario: ResolvedScenario
@@ -31,9 +50,11 @@ def open_folder(
         The folder, and the episodes that it holds.
 
     Raises:
-        UsageError: It holds another run.
+        UsageError: It holds something else, or another run.
     """
     config, seeds = scenario.config, scenario.seeds
+    if out is not None:
+        check_folder(out, RUN_FILE)
     if out is None or not (out / RUN_FILE).exists():
         folder = RunFolder.create(out, name, config, setup=scenario.setup, seeds=seeds)
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)

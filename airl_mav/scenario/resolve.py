@@ -41,7 +41,9 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle = load_vehicle(scenario.vehicle)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
-        raise FieldError("policy", scenario.policy, f"one that fits {scenario.vehicle}; {reason}")
+        raise FieldError(
+            "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
+        )
     arena = load_profile("arenas", scenario.arena, ArenaSpec)
     first = scenario.arena_seed_of(scenario.seed)
     generate(arena, first, name=scenario.arena, vehicle_width_m=vehicle.body.width_m)

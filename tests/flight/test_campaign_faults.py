@@ -97,7 +97,7 @@ class Campaign:
 
     def options(self, ports: TestPorts) -> list[str]:
         return [
-            *("--policy", "greedy", "--arena", str(self.arena), "--altitude", "1.5"),
+            *("--policy", "greedy", "--arena", str(self.arena), "--altitude-m", "1.5"),
             *("--episodes", str(self.episodes), "--seed", str(SEED), "--speed", str(SPEED)),
             *("--out", str(self.out), *ports.options()),
         ]
@@ -105,7 +105,7 @@ class Campaign:
     @contextmanager
     def flying(self, script: str = "") -> Iterator[Running]:
         """Run the command; other ports every time, as they decide nothing."""
-        code = f"{NO_REPORT}\n{script}\nsitl.main()"
+        code = f"{NO_REPORT}\n{script}\nfrom airl_mav.cli import entry\nentry.sitl()"
         with running(["-c", code, *self.options(choose_ports())], self.folder) as process:
             yield process
             self.look(process)
@@ -263,17 +263,18 @@ def test_killed_while_a_flight_is_saved(tmp_path: Path) -> None:
     campaign.nobody_left()
     campaign.check_whole()
     # Finished: nothing flies any more.
-    with campaign.flying("sitl.Rehearsal = None") as run:
+    with campaign.flying("from airl_mav.experiments import fly\nfly.Rehearsal = None") as run:
         assert run.wait() == 0, run.text()
 
 
 FORKS = """
 import json, os, sys
-from airl_mav.cli import evaluate_task, main, report
+from airl_mav.cli import evaluate, main
 from airl_mav.rehearsal import episode_saver
 from airl_mav.report import run_page
 
-episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE, run_page.MAX_PICTURED = 0.02, 0.0, 1
+episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.02, 0.0
+run_page.MAX_PICTURED = 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:
         exec(script)
@@ -285,7 +286,7 @@ for script in json.loads(sys.argv.pop(1)):
 """
 """Runs one command line again and again, each time in a new process, without loading it anew."""
 
-NO_TABLES = "report.run = lambda *_: 0"
+NO_TABLES = "evaluate.show_report = lambda *_: None"
 
 
 def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:

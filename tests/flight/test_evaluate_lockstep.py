@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import random
@@ -18,39 +17,40 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
-from airl_mav.cli.evaluate_command import EvaluateCommand
-from airl_mav.cli.sitl_command import SitlCommand
-from rich.console import Console
 
-from airl_mav.cli import evaluate_task, sitl
-from airl_mav.cli.evaluate import run
 from airl_mav.core.errors import UsageError
+from airl_mav.core.progress import SilentProgress
+from airl_mav.experiments import campaign
+from airl_mav.experiments.fly import fly_live
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card
-from airl_mav.rehearsal.evaluation import Evaluation
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
 from airl_mav.report import run_page
-from tests.flight.test_evaluate import Page, same_runs
+from airl_mav.report.comparison import show
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from tests.flight.test_evaluate import Page
+from tests.support.campaign_kit import same_runs
+from tests.support.command_line import airl, option_words
 from tests.support.linear_policy import write_linear
 from tests.support.processes import Running, is_running, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("lockstep-evaluation")]
 
-ARENA, EPISODES, SEED = "no-obstacles", 5, 40
+ARENA, EPISODES, SEED = "no-obstacles", 4, 40
 
 
 def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple[int, str]:
     """Run the command in this process; return exit status and output."""
-    console = Console(record=True, width=100, file=io.StringIO())
-    settings = {"arena": (ARENA,), "episodes": EPISODES, "seed": SEED, "level": "lockstep"}
-    command = EvaluateCommand(tuple(str(p) for p in policies), **(settings | options))
+    settings = {"arena": ARENA, "episodes": EPISODES, "seed": SEED, "level": "lockstep"}
     with ExitStack() as stack:
         if not page:
-            stack.enter_context(patch("airl_mav.cli.report.run"))
-            stack.enter_context(patch("airl_mav.report.run_report.write_report"))
-        code = run(command, console)
-    return code, console.export_text()
+            stack.enter_context(patch("airl_mav.cli.evaluate.show_report"))
+            stack.enter_context(
+                patch.object(show, "write_document", lambda _, folder: folder / "matrix.html")
+            )
+        return airl("evaluate", *map(str, policies), *option_words(**(settings | options)))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -82,20 +82,10 @@ def test_one_worker_or_two_or_the_rehearsal_fly_the_same(
     code, again = evaluate("greedy", workers=2, out=tmp_path / "two")
     assert code == 0
     assert same_runs(load(tmp_path / "two"), one)
-    rehearsal = SitlCommand(
-        policy="greedy",
-        arena=ARENA,
-        episodes=EPISODES,
-        seed=SEED,
-        lockstep=True,
-        out=tmp_path / "sitl",
+    rehearsal = Scenario(
+        level="lockstep", policy="greedy", arena=ARENA, episodes=EPISODES, seed=SEED
     )
-    handler = signal.getsignal(signal.SIGTERM)
-    try:
-        with patch.object(sitl, "conclude"):
-            assert sitl.run(rehearsal, Console(file=io.StringIO())) == 0
-    finally:
-        signal.signal(signal.SIGTERM, handler)
+    assert fly_live(resolve(rehearsal), tmp_path / "sitl", SilentProgress()).ended == "complete"
     assert same_runs(load(tmp_path / "sitl"), one)
     # One line says the same of whole runs; by hand, as a shell would do it.
     lines = (tmp_path / "two" / "episodes.jsonl").read_text().splitlines()
@@ -138,7 +128,7 @@ def test_a_learned_policy_without_an_input_and_its_card_and_logs(tmp_path: Path)
     assert (result.level, result.arena, result.episodes) == ("lockstep", ARENA, 1)
     assert result.success_rate == 1.0
     # Without the goal it flies straight on.
-    evaluate(folder, ablate="goal", time_limit=10.0, out=blind, **options)
+    evaluate(folder, ablate="goal", time_limit_s=10.0, out=blind, **options)
     assert [e.outcome for e in load(blind).episodes] == [Outcome.TIMEOUT]
     assert "'goal' made zero" in load(blind).info.setup.policy.description
 
@@ -150,17 +140,18 @@ def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> 
     told = json.loads((tmp_path / "m" / "matrix.json").read_text())
     assert told["facts"]["level"] == "lockstep"
     assert [r["quality"]["success_rate"]["n"] for r in told["runs"]] == [1, 1]
-    assert len(re.findall(r"sha256 of the flights  [0-9a-f]{64}\n", text)) == 2
+    assert [len(r["sha256"]) for r in told["runs"]] == [64, 64]
+    assert f"{ARENA}: 1 goal reached" in text
     assert load(tmp_path / "m" / f"greedy-{ARENA}").episodes == reference[0].episodes[:1]
 
 
 # --- what it survives
 
 SCRIPT = """
-from airl_mav.cli import main, report
+from airl_mav.cli import evaluate, main
 from airl_mav.rehearsal import episode_saver
 episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.05, 0.0
-report.run = lambda *_: 0  # takes longer than the flights
+evaluate.show_report = lambda *_: None  # takes longer than the flights
 main.main()
 """
 
@@ -338,11 +329,11 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     ("change", "named"),
     [
         ({"seed": 41}, "seed = 40, not 41"),
-        ({"hold": 0.6}, "pilot.hold_s = 0.5, not 0.6"),
-        ({"time_limit": 60.0}, "time_limit_s = 120.0, not 60.0"),
+        ({"hold_s": 0.6}, "hold_s = None, not 0.6"),
+        ({"time_limit_s": 60.0}, "time_limit_s = 120.0, not 60.0"),
         ({"computer": "ras-pi-4"}, "computer = 'workstation', not 'ras-pi-4'"),
-        ({"hover_after": 0.1}, "watchdog.hover_after_s = None, not 0.1"),
-        ({"level": "gym", "workers": None}, "not None"),
+        ({"hover_after_s": 0.1}, "watchdog.hover_after_s = None, not 0.1"),
+        ({"level": "gym"}, "level = 'lockstep', not 'gym'"),
     ],
 )
 def test_another_run_is_not_mixed_in(
@@ -366,14 +357,8 @@ def test_a_flight_that_kills_its_workers_ends_the_run_with_one_line(
         e.index: FlownEpisode(replace(e, notes=()), one.trajectories[e.index], one.latency[e.index])
         for e in one.episodes
     }
-    evaluation = Evaluation(one.info.setup, one.info.seeds, one.info.config)
     paper = PaperFlier(flown, deadly or -1)
-    real = evaluate_task.plan_lockstep
-
-    def plan(*words: Any) -> Any:
-        return evaluation, paper, real(*words)[2]
-
-    with patch.object(evaluate_task, "plan_lockstep", plan):
+    with patch.dict(campaign.FLIERS, {"lockstep": lambda _: paper}):
         code, text = evaluate("greedy", workers=1, out=tmp_path / "run")
     held = load(tmp_path / "run")
     if deadly is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 from rich.console import Console
 
@@ -15,3 +16,19 @@ def airl(name: str, *words: str, width: int = 200) -> tuple[int, str]:
     console = Console(file=out, width=width, soft_wrap=True)
     code = carry_out(f"airl {name}", f"airl_mav.cli.{name}", words, console=console)
     return code, out.getvalue()
+
+
+def option_words(**options: Any) -> list[str]:
+    """Return options as words: `hold_s=0.4` is `--hold-s 0.4`, a tuple several values, True a flag.
+
+    None and False leave an option out.
+    """
+    words: list[str] = []
+    for name, value in options.items():
+        if value is None or value is False:
+            continue
+        words.append("--" + name.replace("_", "-"))
+        if value is not True:
+            values = value if isinstance(value, tuple) else (value,)
+            words += [str(each) for each in values]
+    return words

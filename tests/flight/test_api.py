@@ -1,0 +1,238 @@
+"""`from airl_mav import ...`: the Python API gives what the commands give, and prints nothing."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import airl_mav
+from airl_mav import Run, Scenario, degrade, evaluate, load_run, rehearse
+from airl_mav.core.errors import UsageError
+from airl_mav.experiments.degrade import LATENCIES
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal.rehearsal import RehearsalError
+from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.report import run_page
+from airl_mav.report.comparison import show
+from tests.support.campaign_kit import same_runs
+from tests.support.command_line import airl, option_words
+
+GYM: dict[str, Any] = {"policy": "greedy", "arena": "no-obstacles", "seed": 20}
+
+
+def asked(**changes: Any) -> Scenario:
+    return Scenario(**({"level": "gym", "episodes": 6} | GYM | changes))
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    scenario = asked(computer="ras-pi-4", workload="template-5x32")
+    return rehearse(scenario, out=tmp_path_factory.mktemp("api") / "run")
+
+
+def test_all_public_names_are_there() -> None:
+    assert set(airl_mav.__all__) <= set(dir(airl_mav))
+    assert all(callable(getattr(airl_mav, name)) for name in airl_mav.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'fly'"):
+        _ = airl_mav.fly  # type: ignore[attr-defined]
+
+
+def test_a_run_says_all_that_was_flown(flown: Run) -> None:
+    assert flown.complete
+    assert [(e.index, e.seed) for e in flown.episodes] == [(i, 20 + i) for i in range(6)]
+    assert flown.info.config["policy"] == "greedy"
+    reached = np.mean([e.outcome == "success" for e in flown.episodes])
+    assert flown.quality.success_rate.value == pytest.approx(reached)
+    # t2 in microseconds: the paper's network on its Raspberry Pi takes 396 ms.
+    assert flown.latency["t2"].mean() == pytest.approx(396_000, rel=0.02)
+    stamps = flown.stamps
+    each = [s["action_ready_us"] - s["infer_start_us"] for s in stamps.values()]
+    ended = [s["action_ready_us"] >= 0 for s in stamps.values()]
+    by_hand = np.concatenate([t2[done] for t2, done in zip(each, ended, strict=True)])
+    assert sorted(flown.latency["t2"]) == sorted(by_hand)
+    assert list(flown.trajectories) == list(range(6))
+    path = flown.trajectories[0]
+    assert isinstance(path, Trajectory)
+    assert path.position.shape == (len(path.time_us), 3)
+    assert path.time_us[-1] == flown.episodes[0].ended_us
+
+
+def test_a_run_is_read_again(flown: Run, tmp_path: Path) -> None:
+    again = load_run(str(flown.path))
+    assert again.sha256 == flown.sha256 is not None
+    assert again.episodes == flown.episodes
+    with pytest.raises(UsageError, match="no run here"):
+        load_run(tmp_path)
+
+
+def test_its_report_is_a_page(
+    flown: Run, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run_page, "MAX_PICTURED", 0)
+    page = flown.report()
+    assert page == flown.path / "report.html"
+    assert page.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("level", ["gym", "lockstep"])
+def test_it_flies_what_the_command_flies_and_is_silent(
+    level: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scenario = asked(level=level, episodes=1, workers=1)
+    run = rehearse(scenario, out=tmp_path / "api")
+    assert capfd.readouterr() == ("", "")
+    monkeypatch.setattr("airl_mav.cli.evaluate.show_report", lambda *_: None)
+    words = option_words(level=level, arena="no-obstacles", episodes=1, seed=20, workers=1)
+    code, text = airl("evaluate", "greedy", *words, "--out", str(tmp_path / "command"))
+    assert code == 0
+    assert run.sha256 is not None
+    assert f"sha256 of the flights  {run.sha256}" in text
+    if level == "lockstep":
+        assert {"t1", "t2", "t3", "link", "control", "end_to_end"} <= set(run.latency)
+        assert set(run.latency["t2"]) == {1_000}
+
+
+def test_with_progress_it_draws_on_standard_error_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rehearse(asked(episodes=1), out=tmp_path / "run", progress=True)
+    rehearse(asked(episodes=1), out=tmp_path / "run", progress=True)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert "1 of 1 episodes are there" in err
+
+
+def test_ctrl_c_is_raised_and_the_same_folder_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = rehearse(asked(), out=tmp_path / "whole")
+    real, seen = EpisodeSaver.add, []
+
+    def interrupted(saver: EpisodeSaver, episode: FlownEpisode) -> None:
+        real(saver, episode)
+        seen.append(episode)
+        if len(seen) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    before = signal.getsignal(signal.SIGINT)
+    with monkeypatch.context() as patched:
+        patched.setattr(EpisodeSaver, "add", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            rehearse(asked(slots=1), out=tmp_path / "run")
+    assert signal.getsignal(signal.SIGINT) is before
+    held = load_run(tmp_path / "run")
+    assert not held.complete
+    assert held.episodes == whole.episodes[:2]
+    run = rehearse(asked(), out=tmp_path / "run")
+    assert same_runs(run._loaded, whole._loaded)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"policy": "telepathy"}, "policy 'telepathy'"),
+        ({"level": "gym", "speed": 2.0}, "speed 2: accepted: at level lockstep or sitl"),
+        ({"hold_s": 0.01}, "hold_s 0.01"),
+        ({"latency": "soon"}, "soon"),
+    ],
+)
+def test_what_cannot_be_flown_is_one_line(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match=message) as error:
+        rehearse(asked(**changes), out=tmp_path / "run")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_another_run_is_not_mixed_in(flown: Run) -> None:
+    with pytest.raises(UsageError, match="holds a run with computer"):
+        rehearse(asked(), out=flown.path)
+
+
+def test_it_flies_in_a_thread(tmp_path: Path) -> None:
+    """Where Python delivers no signals: in a notebook's executor, behind a server."""
+    found: dict[str, Any] = {}
+
+    def work() -> None:
+        for level in ("gym", "lockstep"):
+            try:
+                found[level] = rehearse(asked(level=level, episodes=1), out=tmp_path / level)
+            except BaseException as error:
+                found[level] = error
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    for level in ("gym", "lockstep"):
+        assert isinstance(found[level], Run), found[level]
+        assert found[level].sha256 == rehearse(asked(level=level, episodes=1)).sha256
+
+
+def test_a_run_that_was_broken_off_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from airl_mav.experiments import campaign
+    from tests.support.worker_jobs import PaperFlier
+
+    monkeypatch.setitem(campaign.FLIERS, "gym", lambda _: PaperFlier({}, deadly=20))
+    with pytest.raises(RehearsalError, match=r"seeds? 20.*lost 3 workers"):
+        rehearse(asked(workers=2), out=tmp_path / "run")
+
+
+def test_policies_in_arenas(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    arenas = ("no-obstacles", "static-obstacles")
+    found = evaluate(asked(episodes=2), ("greedy",), arenas, out=tmp_path / "table")
+    assert capfd.readouterr() == ("", "")
+    assert list(found.runs) == [f"greedy-{arena}" for arena in arenas]
+    assert found.page.exists()
+    assert [run.quality.success_rate.n for run in found.comparison.runs] == [2, 2]
+    alone = rehearse(asked(episodes=2), out=tmp_path / "alone")
+    assert found.runs["greedy-no-obstacles"].sha256 == alone.sha256
+
+
+def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = {"arena": "no-obstacles", "episodes": 3, "seed": 20, "out": tmp_path / "curve"}
+    words = option_words(latencies=("native", "150ms", "400ms"), **options)
+    code, text = airl("degrade", "greedy", *words, width=160)
+    assert code == 0
+    for name in ("degradation.json", "degradation.html", "degradation.md"):
+        assert (tmp_path / "curve" / name).stat().st_size > 1000
+    assert str(tmp_path / "curve" / "degradation.html") in text
+    # The same figures from Python, with nothing flown again; a longer curve goes on.
+    monkeypatch.setattr(show, "write_document", lambda _, folder: folder / "none.html")
+    found = degrade(
+        asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=options["out"]
+    )
+    assert list(found.runs) == [f"greedy-{name}" for name in ("native", "150ms", "400ms", "950ms")]
+    means = [run.latency["t2"].mean() / 1e3 for run in found.runs.values()]
+    assert means == pytest.approx([1.0, 150.0, 400.0, 950.0], abs=1.0)
+    references = {contrast.entry.reference for contrast in found.comparison.contrasts}
+    assert references == {"greedy-native"}
+    assert [contrast.pairs for contrast in found.comparison.contrasts] == [3, 3, 3]
+    assert LATENCIES[0] == "native"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--latencies", "native"), "--latencies 'native': accepted: two or more"),
+        (("--latencies", "native", "native"), "accepted: two or more, each once"),
+        (("--latencies", "native", "late"), "--latency late"),
+        (("--policies", "nobody"), "nobody"),
+        (("--episodes", "0"), "--episodes 0"),
+    ],
+)
+def test_a_curve_that_cannot_be_flown(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    if words[0] == "--policies":
+        words = words[1:]
+    with pytest.raises(UsageError, match=message):
+        airl("degrade", *words, "--out", str(tmp_path / "curve"))
+    assert not (tmp_path / "curve").exists()
