@@ -166,8 +166,8 @@ def map_figure(
         handletextpad=0.4,
         columnspacing=1.2,
     )
-    words = OUTCOME_LABELS[episode.outcome]
-    alt = f"Flight {episode.index} from above, coloured by speed: {words}, {episode.reason}"
+    label = OUTCOME_LABELS[episode.outcome]
+    alt = f"Flight {episode.index} from above, coloured by speed: {label}, {episode.reason}"
     return theme.render(figure, f"flight-{episode.index:03d}-map", alt)
 
 

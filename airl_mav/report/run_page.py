@@ -52,7 +52,7 @@ from airl_mav.report.run_tables import (
 from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import Picture, montage
-from airl_mav.report.timeline import RULE_WORDS, slowest_table, timeline_figure, timeline_of
+from airl_mav.report.timeline import OUTLIER_NOTE, slowest_table, timeline_figure, timeline_of
 
 MAX_PICTURED = 12
 """Flights with pictures: the worst."""
@@ -143,7 +143,7 @@ def build_page(
             ages=ages_table(run_ages(run), summary.stages["end_to_end"]),
             latency_pictures=latency_pictures,
             timeline=timeline,
-            timeline_rule=RULE_WORDS,
+            timeline_rule=OUTLIER_NOTE,
             slowest=slowest_table(decisions, measured) if len(decisions) else None,
             episodes=episodes_table(run, MAX_LISTED),
             flights=flights,

@@ -134,8 +134,8 @@ def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
     battery = episode.battery_remaining
     left = NONE if battery is None else f"{100.0 * battery:.1f}"
     why = "; ".join([episode.reason, *episode.notes])
-    words = OUTCOME_LABELS[episode.outcome]
-    return (f"{episode.index}", f"{episode.seed}", words, *figures, left, why)
+    label = OUTCOME_LABELS[episode.outcome]
+    return (f"{episode.index}", f"{episode.seed}", label, *figures, left, why)
 
 
 def quality_table(summary: RunSummary) -> TableView:

@@ -74,7 +74,7 @@ class Picture:
     name: str
     """File name without suffix."""
     alt: str
-    """What it shows, in words."""
+    """What it shows, for those who do not see it."""
     svg: str
     png: bytes
 

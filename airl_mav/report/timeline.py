@@ -37,7 +37,7 @@ NAMED = 16
 SLOWEST = 8
 """Rows of the table of decisions that stand out."""
 
-RULE_WORDS = (
+OUTLIER_NOTE = (
     f"Marked: above the third quartile by more than {FENCE_RANGES:g} times the interquartile range "
     "(Tukey's outer fence, Exploratory Data Analysis, 1977). A stage of which more than 5 % lie "
     "above it has two kinds of decisions, and no marks."
@@ -170,7 +170,7 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     _mark_outliers(ax, there, found, limit)
     ax.set_title(stage.title, loc="left", fontsize=9, color=theme.INK, pad=3)
     if limit is not None:
-        ax.set_title(_in_words(limit), loc="right", fontsize=8, color=theme.MARK, pad=3)
+        ax.set_title(_outlier_text(limit), loc="right", fontsize=8, color=theme.MARK, pad=3)
     ax.set_ylabel("ms", fontsize=8, color=theme.MUTED)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if long_tail(np.sort(found) / US_PER_MS):
@@ -195,7 +195,7 @@ def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fe
     )
 
 
-def _in_words(limit: Fence) -> str:
+def _outlier_text(limit: Fence) -> str:
     """Say how many lie beyond the fence."""
     where = f"above {ms(limit.limit_us)} ms"
     if limit.second_kind:

@@ -526,7 +526,7 @@ def _unknown(name: str) -> PolicyInfo:
         ({"seed": -1}, "--seed -1"),
         (
             {"latency": "150ms", "workload": "template-5x32"},
-            "--latency '150ms': accepted: without a workload",
+            "--latency 150ms: accepted: without a workload",
         ),
         ({"latency": "late"}, "--latency late"),
         ({"workload": "template-1x1"}, "template-1x1"),

@@ -23,21 +23,26 @@ from airl_mav.report.forensics.camera_view import (
     view_wall,
 )
 from airl_mav.report.forensics.causes import USUAL, cause_of
-from airl_mav.report.forensics.collisions import acting, examine, hit_number
+from airl_mav.report.forensics.collisions import decisions_in_effect, examine_collision, hit_number
 from airl_mav.report.forensics.evidence import (
     NO_CAUSE,
     Evidence,
-    Standard,
+    UsualFlight,
     path_excess,
-    standard_of,
     straight_m,
     time_lost_s,
+    usual_flight,
 )
-from airl_mav.report.forensics.swings import MIN_TURNS, SPOT_M, longest_swing, stretches
+from airl_mav.report.forensics.limit_cycles import (
+    MIN_TURNS,
+    SPOT_M,
+    longest_limit_cycle,
+    swinging_stretches,
+)
 
 CAMERA = load_vehicle("quad").camera
 SIGHT = PolicyCamera.of(CAMERA)
-USUAL_RUN = Standard(pace_s_m=0.4, stretch=1.05, speed_m_s=2.5)
+USUAL_RUN = UsualFlight(pace_s_m=0.4, path_ratio=1.05, speed_m_s=2.5)
 
 
 def arena_of(
@@ -281,9 +286,11 @@ def test_decisions_act_when_the_motors_answer() -> None:
         "sent_us": np.array([5, 15, 25, 35]),
         "motor_us": np.array([7, 17, -1, 40]),
     }
-    assert acting(stamps, 36).tolist() == [0, 1]
-    assert acting({k: v for k, v in stamps.items() if k != "motor_us"}, 36).tolist() == [0, 1, 2, 3]
-    assert acting({}, 36).size == 0
+    assert decisions_in_effect(stamps, 36).tolist() == [0, 1]
+    assert decisions_in_effect(
+        {k: v for k, v in stamps.items() if k != "motor_us"}, 36
+    ).tolist() == [0, 1, 2, 3]
+    assert decisions_in_effect({}, 36).size == 0
 
 
 # --- Flights that never arrive, or take long ---
@@ -293,7 +300,7 @@ def test_swinging_is_found_counted_and_timed() -> None:
     left_right = [1.26, 1.26, -1.26, -1.26]
     spin = flight_of([(0.0, 0.0, 0.0), (4.0, 12.0, 0.0), (60.0, 12.5, 0.0)])
     stamps = stamps_of(spin, yaw=left_right)
-    swing = longest_swing(stamps, spin, int(spin.time_us[-1]))
+    swing = longest_limit_cycle(stamps, spin, int(spin.time_us[-1]))
     assert swing is not None
     assert swing.on_the_spot
     # Every second decision turns; it stays within SPOT_M of the end from 3.5 s on.
@@ -309,12 +316,12 @@ def test_swinging_is_found_counted_and_timed() -> None:
 
 def test_an_evasion_is_no_swinging() -> None:
     few = np.array([0.0, 1.0, 1.0, -1.0, 0.0, 1.0, -1.0, 0.0, 0.0])
-    assert stretches(few) == []
+    assert swinging_stretches(few) == []
     apart = np.zeros(80)
     apart[::8] = np.resize([1.0, -1.0], 10)
-    assert stretches(apart) == []
+    assert swinging_stretches(apart) == []
     many = np.resize([0.0, 1.0, -1.0], 3 * MIN_TURNS)
-    (run,) = stretches(many)
+    (run,) = swinging_stretches(many)
     # From + to - and, over the zero, back again.
     assert len(run) == 2 * MIN_TURNS - 1
     assert run[0] == 2
@@ -386,24 +393,24 @@ def test_what_is_usual_and_what_was_lost() -> None:
     slow = flight_of([(0.0, 0.0, 0.0), (9.0, 18.0, 0.0)])
     records = tuple(record_of(p, Outcome.SUCCESS, "") for p in (fast, fast, slow))
     assert straight_m(records[0]) == 18.0
-    usual = standard_of(records)
+    usual = usual_flight(records)
     assert usual.pace_s_m == pytest.approx(6.0 / 18.0)
     assert time_lost_s(records[2], usual) == pytest.approx(3.0)
     assert path_excess(records[2]) == pytest.approx(0.0, abs=1e-9)
     failed = record_of(slow, Outcome.TIMEOUT, "")
-    assert standard_of((failed,)) == Standard(None, None, None)
-    assert time_lost_s(failed, standard_of((failed,))) is None
+    assert usual_flight((failed,)) == UsualFlight(None, None, None)
+    assert time_lost_s(failed, usual_flight((failed,))) is None
 
 
 def test_a_collision_taken_apart_and_one_that_was_none() -> None:
     box = arena_of((Shape.BOX, 9.3, 0.0, 1.0, 0.0))
     record = record_of(AHEAD, Outcome.COLLISION, "hit static-box-0")
-    found = examine(record, AHEAD, stamps_of(AHEAD), box, SIGHT)
+    found = examine_collision(record, AHEAD, stamps_of(AHEAD), box, SIGHT)
     assert found is not None
     assert found.what == "static-box-0"
     assert found.answer_m_s == pytest.approx(2.0)
     good = replace(record, outcome=Outcome.SUCCESS)
-    assert examine(good, AHEAD, stamps_of(AHEAD), box, SIGHT) is None
+    assert examine_collision(good, AHEAD, stamps_of(AHEAD), box, SIGHT) is None
 
 
 def test_the_brakes_are_the_tilt_limit_of_the_vehicle() -> None:

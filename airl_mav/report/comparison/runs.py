@@ -137,7 +137,7 @@ def _checked(names: Sequence[str], runs: Sequence[LoadedRun]) -> list[str]:
         raise UsageError(f"--names: {len(names)} for {len(runs)} runs; accepted: one a run")
     for name in names:
         if not name.strip() or list(names).count(name) > 1:
-            raise UsageError(f"--names {name!r}: accepted: words, each name once")
+            raise UsageError(f"--names {name!r}: accepted: not empty, each name once")
     return list(names)
 
 

@@ -1,4 +1,4 @@
-"""What the camera had of an obstacle when a frame was taken, and where the obstacle lay."""
+"""How much of an obstacle a frame of the camera shows, and where the obstacle lies."""
 
 from __future__ import annotations
 

@@ -7,18 +7,18 @@ import math
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.report.forensics.camera_view import ObstacleView, PolicyCamera
-from airl_mav.report.forensics.collisions import SEEN_SHARE, Collision, examine
+from airl_mav.report.forensics.collisions import SEEN_SHARE, Collision, examine_collision
 from airl_mav.report.forensics.evidence import (
     HALF_WIDTH_M,
     NO_CAUSE,
     Cause,
     Evidence,
-    Standard,
+    UsualFlight,
     path_excess,
     straight_m,
     time_lost_s,
 )
-from airl_mav.report.forensics.wandering import of_wandering
+from airl_mav.report.forensics.long_flights import cause_of_long_flight
 
 SLOW_EXCESS = 0.25
 """A flight is slow, or long, when it takes this much more than the run's usual one."""
@@ -30,31 +30,33 @@ answered, nothing of the decision shows in its path."""
 USUAL = "as usual"
 
 
-def cause_of(flight: Evidence, standard: Standard) -> Cause:
+def cause_of(flight: Evidence, usual: UsualFlight) -> Cause:
     """Return the cause of a failure, or of a flight that took longer than is usual."""
     outcome = flight.record.outcome
     if outcome is Outcome.ABORTED:
         return Cause("aborted", (f"{flight.record.reason}.",))
     if outcome is Outcome.COLLISION:
-        crash = examine(flight.record, flight.path, flight.stamps, flight.arena, flight.camera)
-        return Cause(NO_CAUSE, ()) if crash is None else _of_collision(flight, crash)
+        crash = examine_collision(
+            flight.record, flight.path, flight.stamps, flight.arena, flight.camera
+        )
+        return Cause(NO_CAUSE, ()) if crash is None else _cause_of_collision(flight, crash)
     if not len(flight.path):
         return Cause(NO_CAUSE, ())
-    if outcome is Outcome.SUCCESS and not _slow(flight.record, standard):
+    if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
         return Cause(USUAL, ())
-    return of_wandering(flight, standard)
+    return cause_of_long_flight(flight, usual)
 
 
-def _slow(record: EpisodeRecord, standard: Standard) -> bool:
+def _slow(record: EpisodeRecord, usual: UsualFlight) -> bool:
     """Return whether a flight took clearly longer, or a longer way, than is usual."""
-    lost, excess = time_lost_s(record, standard), path_excess(record)
-    if lost is None or excess is None or standard.pace_s_m is None or standard.stretch is None:
+    lost, excess = time_lost_s(record, usual), path_excess(record)
+    if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
         return False
-    slow = lost > SLOW_EXCESS * standard.pace_s_m * straight_m(record)
-    return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * standard.stretch
+    slow = lost > SLOW_EXCESS * usual.pace_s_m * straight_m(record)
+    return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
 
 
-def _of_collision(flight: Evidence, crash: Collision) -> Cause:
+def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
     """Return why something was hit."""
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
         return Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))

@@ -64,7 +64,7 @@ class Collision:
     """Whether the obstacle was in the picture in each of the last frames decided on, old to new."""
 
 
-def acting(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
+def decisions_in_effect(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
     """Return the numbers of the decisions that moved the motors before a time [µs].
 
     Where nothing says when the motors answered, a decision acts when it is sent.
@@ -88,7 +88,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine(
+def examine_collision(
     record: EpisodeRecord,
     path: Trajectory,
     stamps: Mapping[str, NDArray[Any]],
@@ -103,7 +103,7 @@ def examine(
     number = hit_number(record.reason, arena)
     before_s = blind_m = lag_s = lag_m = answer_m_s = view = None
     seen: tuple[bool, ...] = ()
-    decisions = acting(stamps, hit_us)
+    decisions = decisions_in_effect(stamps, hit_us)
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
         frame_us = int(frames[-1])

@@ -1,4 +1,4 @@
-"""What is known of one flight and of its run: the ground that causes are worked out on."""
+"""What is known of one flight and of its run: causes are worked out from it."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Standard:
-    """What is usual in a run: medians over the flights that reached the goal."""
+class UsualFlight:
+    """Medians of a run over the flights that reached the goal."""
 
     pace_s_m: float | None
     """Flight time by metre of the straight way to the goal's edge."""
-    stretch: float | None
+    path_ratio: float | None
     """Distance flown by the length of that way."""
     speed_m_s: float | None
     """Mean speed of a flight."""
@@ -51,7 +51,7 @@ class Standard:
 
 @dataclass(frozen=True)
 class Cause:
-    """Why."""
+    """Why a flight failed, or took long."""
 
     kind: str
     """A few words, the same for all flights with this cause."""
@@ -64,23 +64,23 @@ def straight_m(record: EpisodeRecord) -> float:
     return max(0.1, math.hypot(*record.goal) - record.goal_radius_m)
 
 
-def standard_of(records: tuple[EpisodeRecord, ...]) -> Standard:
-    """Return what is usual in a run."""
+def usual_flight(records: tuple[EpisodeRecord, ...]) -> UsualFlight:
+    """Return the medians of a run; None where no flight reached the goal."""
     good = [(r, r.quality) for r in records if r.outcome is Outcome.SUCCESS and r.quality]
     if not good:
-        return Standard(None, None, None)
-    return Standard(
+        return UsualFlight(None, None, None)
+    return UsualFlight(
         float(np.median([q.flight_time_s / straight_m(r) for r, q in good])),
         float(np.median([q.distance_m / straight_m(r) for r, q in good])),
         float(np.median([q.mean_speed_m_s for _, q in good])),
     )
 
 
-def time_lost_s(record: EpisodeRecord, standard: Standard) -> float | None:
+def time_lost_s(record: EpisodeRecord, usual: UsualFlight) -> float | None:
     """Return how much longer a flight took than its way takes at the run's median pace [s]."""
-    if record.quality is None or standard.pace_s_m is None:
+    if record.quality is None or usual.pace_s_m is None:
         return None
-    return record.quality.flight_time_s - standard.pace_s_m * straight_m(record)
+    return record.quality.flight_time_s - usual.pace_s_m * straight_m(record)
 
 
 def path_excess(record: EpisodeRecord) -> float | None:

@@ -22,8 +22,8 @@ from airl_mav.report.forensics.evidence import (
     Cause,
     Evidence,
     path_excess,
-    standard_of,
     time_lost_s,
+    usual_flight,
 )
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
 
@@ -59,11 +59,11 @@ def ranked(run: LoadedRun) -> list[EpisodeRecord]:
     Those that failed come first, then aborted ones, then those that reached the goal; each by the
     time they lost, or took where no flight reached the goal.
     """
-    standard = standard_of(run.episodes)
+    usual = usual_flight(run.episodes)
     order = {Outcome.SUCCESS: 2, Outcome.ABORTED: 1}
 
     def key(e: EpisodeRecord) -> tuple[int, float, int]:
-        lost_s = time_lost_s(e, standard)
+        lost_s = time_lost_s(e, usual)
         if lost_s is None:
             lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
         return (order.get(e.outcome, 0), -lost_s, e.index)
@@ -89,14 +89,14 @@ def examine_worst(
         arenas: Arenas by episode index; where one is missing the cause says less.
         vehicle: What flew; None says less too.
     """
-    standard = standard_of(run.episodes)
+    usual = usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else max_acceleration(vehicle)
     return [
         ExaminedFlight(
             record,
-            cause_of(_evidence(run, record, arenas, camera, brake), standard),
-            time_lost_s(record, standard),
+            cause_of(_evidence(run, record, arenas, camera, brake), usual),
+            time_lost_s(record, usual),
             path_excess(record),
         )
         for record in ranked(run)[:EXAMINED]

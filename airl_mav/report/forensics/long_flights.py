@@ -21,11 +21,11 @@ from airl_mav.report.forensics.evidence import (
     NO_CAUSE,
     Cause,
     Evidence,
-    Standard,
+    UsualFlight,
     path_excess,
     straight_m,
 )
-from airl_mav.report.forensics.swings import SPOT_M, Swing, longest_swing
+from airl_mav.report.forensics.limit_cycles import SPOT_M, LimitCycle, longest_limit_cycle
 
 STILL_M_S = 0.2
 """Slower than this the vehicle stands."""
@@ -52,24 +52,24 @@ DETOUR_EXCESS = 0.25
 """A way that is longer than the straight one by this much of it is a detour."""
 
 
-def of_wandering(flight: Evidence, standard: Standard) -> Cause:
+def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
     """Return why a flight took long, or never arrived."""
     record, path = flight.record, flight.path
     start_us = record.started_us if record.navigation_us is None else record.navigation_us
     part = path.between(start_us, record.ended_us)
     if len(part) < 2:
         return Cause(NO_CAUSE, ())
-    swing = longest_swing(flight.stamps, part, record.ended_us)
+    swing = longest_limit_cycle(flight.stamps, part, record.ended_us)
     failed = record.outcome is not Outcome.SUCCESS
     findings = [
         _swinging(swing, start_us),
         _circling(part),
         _standing(part),
-        _pausing(flight.stamps, start_us, record.ended_us),
-        _missing(record, part, start_us),
+        _late_decision(flight.stamps, start_us, record.ended_us),
+        _passed_goal(record, part, start_us),
         None if failed else _detour(flight),
-        None if failed else _dawdling(record, standard),
-        _hurried(record, standard),
+        None if failed else _slow_flight(record, usual),
+        _time_limit_too_short(record, usual),
     ]
     found = [finding for finding in findings if finding is not None]
     sentences = [sentence for cause in found for sentence in cause.sentences]
@@ -99,7 +99,7 @@ def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
     )
 
 
-def _swinging(swing: Swing | None, start_us: int) -> Cause | None:
+def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
     """Say that the commands swung left and right on the spot."""
     if swing is None or not swing.on_the_spot:
         return None
@@ -133,7 +133,9 @@ def _standing(part: Trajectory) -> Cause | None:
     return Cause("stood still", (f"It stood still for {stood_s:.1f} s, {share:.0%} of the time.",))
 
 
-def _pausing(stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int) -> Cause | None:
+def _late_decision(
+    stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int
+) -> Cause | None:
     """Say that a command was long in coming."""
     sent = stamps.get("sent_us", np.zeros(0, np.int64))
     times = sent[(sent != NO_STAMP) & (sent <= ended_us)]
@@ -147,7 +149,7 @@ def _pausing(stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int) -
     return Cause("a decision was late", (sentences,))
 
 
-def _missing(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
+def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
     """Say that the vehicle passed the goal closely and left again."""
     away = _goal_distance(record, part)
     # What is still to come of the greatest distance: a pass is a dip before it.
@@ -179,22 +181,22 @@ def _detour(flight: Evidence) -> Cause | None:
     return Cause("a detour round obstacles", (f"{way}, which obstacles barred.",))
 
 
-def _dawdling(record: EpisodeRecord, standard: Standard) -> Cause | None:
+def _slow_flight(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
     """Say that the vehicle flew slowly."""
-    if record.quality is None or standard.speed_m_s is None:
+    if record.quality is None or usual.speed_m_s is None:
         return None
     speed = record.quality.mean_speed_m_s
-    if speed > (1.0 - SLOW_SHARE) * standard.speed_m_s:
+    if speed > (1.0 - SLOW_SHARE) * usual.speed_m_s:
         return None
-    sentences = f"Mean speed {speed:.1f} m/s; usual in this run: {standard.speed_m_s:.1f} m/s."
+    sentences = f"Mean speed {speed:.1f} m/s; usual in this run: {usual.speed_m_s:.1f} m/s."
     return Cause("flew slowly", (sentences,))
 
 
-def _hurried(record: EpisodeRecord, standard: Standard) -> Cause | None:
+def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
     """Say that no usual flight would have arrived within the time limit."""
-    if record.outcome is not Outcome.TIMEOUT or standard.pace_s_m is None:
+    if record.outcome is not Outcome.TIMEOUT or usual.pace_s_m is None:
         return None
-    needs_s = standard.pace_s_m * straight_m(record)
+    needs_s = usual.pace_s_m * straight_m(record)
     if needs_s <= record.time_limit_s:
         return None
     limit = f"the limit is {record.time_limit_s:g} s"
