@@ -1,5 +1,6 @@
 """The documentation: the site builds without a network, and what it names exists."""
 
+import importlib
 import importlib.util
 import os
 import re
@@ -86,6 +87,33 @@ def test_paths_in_the_pages_exist() -> None:
     for path in TEXTS:
         for name in re.findall(rf"`((?:{ROOMS})/[\w./-]*)`", path.read_text(encoding="utf-8")):
             assert (ROOT / name).exists() or name == "airl_mav/_profiles", f"{path.name}: {name}"
+
+
+def test_names_in_the_pages_exist() -> None:
+    """A dotted name between backticks, `airl_mav.core.clock.Clock`, can be imported."""
+    for path in TEXTS:
+        text = path.read_text(encoding="utf-8")
+        for name in re.findall(
+            r"`((?:airl_mav|companion|firmware_sim)(?:\.\w+)+)(?:\(.*?\))?`", text
+        ):
+            assert resolves(name) or name.endswith(".log"), f"{path.name}: {name}"
+
+
+def resolves(name: str) -> bool:
+    """Return whether a dotted name leads to a module, or to an attribute of one."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        module = ".".join(parts[:length])
+        try:
+            found = importlib.import_module(module)
+        except ModuleNotFoundError:
+            continue
+        for attribute in parts[length:]:
+            if not hasattr(found, attribute):
+                return False
+            found = getattr(found, attribute)
+        return True
+    return False
 
 
 def test_readme_links_lead_somewhere() -> None:
