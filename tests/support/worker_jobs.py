@@ -157,5 +157,8 @@ class PaperFlier:
 
 
 if __name__ == "__main__":
-    for _ in ProcessExecutor(2).run(range(4), partial(sleeps, Path(sys.argv[1]))):
+    # Workers do not see the program that started them, only what can be imported.
+    from tests.support import worker_jobs
+
+    for _ in ProcessExecutor(2).run(range(4), partial(worker_jobs.sleeps, Path(sys.argv[1]))):
         pass
