@@ -71,7 +71,7 @@ def test_reference_shows_every_field_of_a_vehicle(site: Path) -> None:
 
 
 def test_files_that_the_sources_name_exist() -> None:
-    """Docstrings, messages and pages name pages as docs/NAME.md."""
+    """Docstrings, messages and pages name pages by their path from the root."""
     places = ("airl_mav", "companion", "firmware_sim", "scripts", "examples", "tests")
     sources = [path for place in places for path in (ROOT / place).rglob("*.py")]
     for path in [*sources, *TEXTS, ROOT / "Makefile", ROOT / "mkdocs.yml"]:
