@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.flight.setup import Part
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.run_report import write_report
 from tests.support.run_demo import write_demo_run
 
@@ -79,11 +79,13 @@ def test_a_damaged_run_among_others_is_named(run: Path, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_vehicle_that_cannot_hover_gets_one_line(run: Path) -> None:
-    vehicle = load_vehicle("quad")
-    heavy = vehicle.model_copy(update={"body": vehicle.body.model_copy(update={"mass_kg": 90.0})})
-    with pytest.raises(UsageError, match=r"vehicle quad: .*accepted: one that can hover") as caught:
-        examine_worst(load(run), {}, heavy)
+def test_a_vehicle_that_cannot_hover_gets_one_line(run: Path, tmp_path: Path) -> None:
+    heavy = tmp_path / "heavy.toml"
+    heavy.write_text('base = "quad"\n[body]\nmass_kg = 90.0\n')
+    flown = load(run)
+    setup = replace(flown.info.setup, vehicle=Part(str(heavy)))
+    with pytest.raises(UsageError, match="heavy") as caught:
+        write_report(replace(flown, info=replace(flown.info, setup=setup)))
     assert "\n" not in str(caught.value)
 
 
