@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.text import Text
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.forensics.worst import EXAMINED, ranked
-from airl_mav.report.loading import arenas_of, load_run, vehicle_of
 from airl_mav.report.run_page import build_page, pictured
 from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import (
@@ -41,7 +41,7 @@ def write_report(run: LoadedRun | Path, out: Path | None = None) -> Path:
             found or used any more.
     """
     if isinstance(run, Path):
-        run = load_run(run)
+        run = load(run)
     vehicle = vehicle_of(run.info)
     arenas = arenas_of([*ranked(run)[:EXAMINED], *pictured(run)], vehicle)
     return build_page(run, arenas, out, vehicle=vehicle)
@@ -78,7 +78,7 @@ def show_report(path: Path, console: Console) -> LoadedRun:
     Raises:
         UsageError: See `write_report`.
     """
-    run = load_run(path)
+    run = load(path)
     print_report(run, console, write_report(run) if run.episodes else None)
     return run
 

@@ -19,7 +19,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.report.document import Document, Facts, RunLink, Section, provenance_facts
 from airl_mav.report.flights_above import Panel, flight_pictures
-from airl_mav.report.loading import arena_of
+from airl_mav.report.arenas import arena_of
 from airl_mav.report.measures import rate_with_interval, with_interval
 from airl_mav.report.table import NONE, Column, TableView
 from airl_mav.studies.findings import Findings

@@ -15,7 +15,7 @@ from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
 from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
@@ -25,7 +25,6 @@ from airl_mav.report.comparison.model import (
     NavigationStart,
     RunEntry,
 )
-from airl_mav.report.loading import load_run
 from airl_mav.report.run_tables import setup_rows
 
 SHORT_NAME = 14
@@ -89,7 +88,7 @@ def compare(
 
 def load_runs(folder: Path, entries: Iterable[RunEntry]) -> dict[str, LoadedRun]:
     """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
-    return {entry.name: load_run(folder / entry.folder) for entry in entries}
+    return {entry.name: load(folder / entry.folder) for entry in entries}
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:

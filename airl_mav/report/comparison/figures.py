@@ -17,11 +17,11 @@ from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
+from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison.build import tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import letters_of, published_change
 from airl_mav.report.flights_above import Panel, path_points
-from airl_mav.report.loading import arena_of
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
 from airl_mav.report.table import NONE, OUTCOME_LABELS, US_PER_MS

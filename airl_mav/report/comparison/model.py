@@ -8,7 +8,6 @@ from typing import Any, Literal, TypeVar, get_args
 
 from pydantic import TypeAdapter
 
-from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.paired import PairedComparison
 from airl_mav.flight.setup import Setup
@@ -264,8 +263,4 @@ def load_entries(folder: Path, kind: Kind) -> tuple[dict[str, Any], tuple[RunEnt
 
 
 def _read(folder: Path, kind: Kind, adapter: TypeAdapter[T]) -> T:
-    file = comparison_file(folder, kind)
-    try:
-        return read_typed(file, adapter, SCHEMA, KIND_NAMES[kind])
-    except RecursionError:
-        raise UsageError(f"{file}: nested too deeply: damaged") from None
+    return read_typed(comparison_file(folder, kind), adapter, SCHEMA, KIND_NAMES[kind])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
 from airl_mav.report.comparison.figures import (
@@ -26,7 +26,6 @@ from airl_mav.report.comparison.tables import (
 )
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
-from airl_mav.report.loading import load_run
 
 NAMING = ("policy", "arena", "computer", "level", "vehicle")
 """Parts of a setup that may tell runs apart."""
@@ -57,7 +56,7 @@ def compare_folders(
     resolved = [folder.resolve() for folder in folders]
     if twice := [f for f, r in zip(folders, resolved, strict=True) if resolved.count(r) > 1]:
         raise UsageError(f"{twice[0]}: twice; accepted: each run once")
-    loaded = [load_run(folder) for folder in folders]
+    loaded = [load(folder) for folder in folders]
     runs = dict(zip(_checked(names, loaded), loaded, strict=True))
     entries = [RunEntry(name, str(run.path.resolve())) for name, run in runs.items()]
     return build_runs({}, entries, runs), runs

@@ -1,11 +1,8 @@
-"""A run read back, and its vehicle and arenas made again from their profiles and seeds."""
+"""The vehicle and the arenas of a run, made again from their profiles and seeds."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable
-from pathlib import Path
-from zipfile import BadZipFile
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
@@ -14,17 +11,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
-
-
-def load_run(path: Path) -> LoadedRun:
-    """Read a run folder. Raises UsageError with one line, whatever is wrong with its files."""
-    try:
-        return load(path)
-    except RecursionError:
-        raise UsageError(f"{path}: a file is nested too deeply: damaged") from None
-    except (EOFError, KeyError, NotImplementedError, zlib.error, BadZipFile, OSError) as error:
-        raise UsageError(f"{path}: a file is damaged: {error}") from None
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 
 
 def vehicle_of(info: RunInfo) -> VehicleProfile:
