@@ -334,11 +334,11 @@ def _layout() -> dict[str, Any]:
     """Return axes and cameras: from behind the start, from above, from the side."""
     eyes = {
         "From the start": (0.0, -1.75, 1.2),
-        "From above": (0.0, -0.05, 2.1),
+        "From above": (0.0, -0.05, 2.6),
         "From the side": (1.7, 0.0, 0.7),
     }
     buttons = [
-        {"label": label, "method": "relayout", "args": [{"scene.camera.eye": _eye(eye)}]}
+        {"label": label, "method": "relayout", "args": [{"scene.camera": _camera(eye)}]}
         for label, eye in eyes.items()
     ]
     axes: dict[str, dict[str, Any]] = {
@@ -355,7 +355,7 @@ def _layout() -> dict[str, Any]:
         "scene": {
             **axes,
             "aspectmode": "data",
-            "camera": {"eye": _eye(next(iter(eyes.values()))), "center": _eye((0.0, 0.0, -0.2))},
+            "camera": _camera(next(iter(eyes.values()))),
         },
         "updatemenus": [
             {"type": "buttons", "direction": "right", "x": 0, "y": 1, "yanchor": "top",
@@ -365,8 +365,10 @@ def _layout() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _eye(place: tuple[float, float, float]) -> dict[str, float]:
-    return dict(zip("xyz", place, strict=True))
+def _camera(eye: tuple[float, float, float]) -> dict[str, dict[str, float]]:
+    """Return a camera that looks at a place somewhat below the middle."""
+    places = {"eye": eye, "center": (0.0, 0.0, -0.2)}
+    return {name: dict(zip("xyz", place, strict=True)) for name, place in places.items()}
 
 
 def _thinned(path: Trajectory, points: int) -> Trajectory:

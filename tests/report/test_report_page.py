@@ -46,6 +46,13 @@ FLAGS = (
 
 WATCH = """<script>
 window.seen = [];
+// Frames by the clock that the test moves, not by the screen's.
+window.requestAnimationFrame = (act) => setTimeout(() => act(performance.now()), 50);
+// What is drawn would be gone before it could be looked at.
+const getContext = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, options) {
+  return getContext.call(this, kind, { ...options, preserveDrawingBuffer: true });
+};
 addEventListener("error", (event) => seen.push(`${event.message}`));
 addEventListener("unhandledrejection", (event) => seen.push(`${event.reason}`));
 </script>
@@ -72,7 +79,7 @@ addEventListener("load", () => setTimeout(() => {
   report.flights = [...pick.options].map((option) => option.value);
   const frame = async (name) => {
     await new Promise((done) => setTimeout(done, 300));
-    const drawn = plot.querySelector("canvas");
+    const drawn = plot.querySelector(".gl-container canvas") || plot.querySelector("canvas");
     const canvas = new OffscreenCanvas(400, 300);
     const context = canvas.getContext("2d", { willReadFrequently: true });
     context.drawImage(drawn, 0, 0, 400, 300);
@@ -94,7 +101,7 @@ addEventListener("load", () => setTimeout(() => {
     report.clock = document.getElementById("scene-clock").textContent;
     choose("1"); await frame("other");
     choose("3"); await frame("all");
-    await Plotly.relayout(plot, { "scene.camera.eye": { x: 0, y: -0.05, z: 2 } });
+    await Plotly.relayout(plot, plot.layout.updatemenus[0].buttons[1].args[0]);
     await frame("above");
     report.end = true;
     finish();
