@@ -62,9 +62,9 @@ class Run:
 
     @property
     def sha256(self) -> str | None:
-        """Fingerprint of all flights: the same when they are the same, bit by bit.
+        """Fingerprint of all flights at level lockstep: the same when they are, bit by bit.
 
-        None where flights are never the same: level sitl.
+        None at the other levels, whose flights carry none.
         """
         return run_sha256(self.episodes)
 

@@ -16,6 +16,7 @@ from airl_mav.core.progress import SilentProgress
 from airl_mav.experiments import campaign
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
+from airl_mav.experiments.experiment import Experiment, entry_of, run_experiment
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import (
     CAMPAIGN_FILE,
@@ -25,6 +26,7 @@ from airl_mav.experiments.store import (
     open_campaign,
 )
 from airl_mav.rehearsal import lock
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs
 from tests.support.processes import ROOT, is_running, running, wait_until
@@ -81,7 +83,8 @@ def test_flights_do_not_depend_on_who_flies_them(tmp_path: Path, reference: Path
 
 def test_cells_with_the_same_flights_share_them(tmp_path: Path, reference: Path) -> None:
     ended: list[CellRun] = []
-    twin = replace(gym_cell("c"), title="the same again")
+    # The pace, and who flies it, decide nothing.
+    twin = replace(gym_cell("c", slots=3, workers=5), title="the same again")
     run, _ = fly(tmp_path, [*cells(), twin], ended=ended.append)
     assert [each.cell.name for each in ended] == ["a", "b"]
     assert [each.cell.name for each in run.cells] == ["a", "b", "c"]
@@ -189,6 +192,58 @@ def test_one_evaluation_needs_no_campaign(tmp_path: Path, reference: Path) -> No
     assert [(each.path, each.episodes) for each in run.cells] == [(tmp_path / "other", ())]
 
 
+def experiment_of(flown: list[Cell]) -> Experiment:
+    return Experiment("matrix", "test", {}, tuple(flown), {c.name: entry_of(c) for c in flown})
+
+
+def test_latencies_that_are_drawn_anew_are_other_flights(tmp_path: Path) -> None:
+    late: dict[str, Any] = {"episodes": 2, "latency": "lognormal:400ms,100ms"}
+    run, _ = fly(tmp_path, [gym_cell("a", **late), gym_cell("b", latency_seed=1, **late)])
+    first, second = (load(each.path).latency[0] for each in run.cells)
+    drawn = [
+        (stamps["action_ready_us"] - stamps["infer_start_us"])[:3].tolist()
+        for stamps in (first, second)
+    ]
+    assert drawn[0] != drawn[1]
+
+
+def test_a_policy_that_may_know_its_episodes_is_named_once(tmp_path: Path) -> None:
+    known = [
+        gym_cell(name, policy="no-obstacles", seed=1_000_000, episodes=1, latency=latency)
+        for name, latency in (("a", None), ("b", "150ms"))
+    ]
+    experiment = experiment_of(known)
+    notes = Notes()
+    run_experiment(experiment, tmp_path / "root", notes)
+    told = [line for line in notes.lines if "was trained on seeds from 1000000 on" in line]
+    assert len(told) == 1
+    assert notes.lines[1].startswith("the cell a: 1 ")
+
+
+def test_a_second_ctrl_c_is_not_waited_for_and_nothing_is_lost(
+    tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one lets what has ended be saved; the second is raised at once."""
+    real, seen = EpisodeSaver.add, []
+
+    def pressed(saver: EpisodeSaver, episode: FlownEpisode) -> None:
+        real(saver, episode)
+        seen.append(episode)
+        if len(seen) == 3:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+
+    experiment = experiment_of(cells())
+    with monkeypatch.context() as patched:
+        patched.setattr(EpisodeSaver, "add", pressed)
+        with pytest.raises(KeyboardInterrupt):
+            run_experiment(experiment, tmp_path / "root", Notes())
+    assert 3 <= len(load(tmp_path / "root" / "a").episodes) < 8
+    run = run_experiment(experiment, tmp_path / "root", Notes())
+    assert run.ended == "complete"
+    assert same(tmp_path / "root", reference)
+
+
 # --- the folder
 
 
@@ -215,7 +270,7 @@ def test_the_declaration_is_there_before_anything_flies_and_keeps_its_origin(
         ({"settings": {"policy": "other"}}, "policy = 'greedy', not 'other'"),
         (
             {"cells": {"a": declared([gym_cell("a", hold_s=0.7)]).cells["a"]}},
-            "another cell a: hold_s = 0.5, not 0.7",
+            "another cell a: .*hold_s = 0.5, not 0.7",
         ),
     ],
 )
@@ -239,12 +294,18 @@ def test_another_campaign_is_not_mixed_in(
 
 
 @pytest.mark.parametrize(
-    ("file", "what"), [("run.json", "a single run"), ("train.json", "a train")]
+    ("file", "what"),
+    [
+        ("run.json", "a single run"),
+        ("train.json", "a training"),
+        # Begun by a version that wrote no declaration.
+        *((f"{kind}.json", "runs of an earlier version") for kind in ("gap", "ladder", "matrix")),
+    ],
 )
 def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, what: str) -> None:
     (tmp_path / file).write_text(json.dumps({"schema": 1}))
     with (
-        pytest.raises(UsageError, match=r"holds a .*accepted: another folder"),
+        pytest.raises(UsageError, match=f"holds {what}; accepted: another folder"),
         open_campaign(tmp_path, declared(cells()), command="a test"),
     ):
         pass
@@ -254,7 +315,7 @@ def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, wh
 def test_a_campaign_belongs_to_one_process_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lock, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(lock, "WAIT_S", 0.0)
     told: list[str] = []
     asked = declared(cells())
     with (

@@ -329,7 +329,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     ("change", "named"),
     [
         ({"seed": 41}, "seed = 40, not 41"),
-        ({"hold_s": 0.6}, "hold_s = None, not 0.6"),
+        ({"hold_s": 0.6}, "hold_s = 0.5, not 0.6"),
         ({"time_limit_s": 60.0}, "time_limit_s = 120.0, not 60.0"),
         ({"computer": "ras-pi-4"}, "computer = 'workstation', not 'ras-pi-4'"),
         ({"hover_after_s": 0.1}, "watchdog.hover_after_s = None, not 0.1"),

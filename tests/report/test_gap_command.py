@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -20,17 +19,16 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
-from airl_mav.cli import report
 from airl_mav.cli.gap import OPTIONS
-from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import gap as gap_experiment
 from airl_mav.experiments.gap import DEFAULT_MITIGATED, TRAINING_LATENCY_SEED, declare_gap
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.gap import columns_table, gaps_table, worst_seeds
 from airl_mav.report.comparison.model import load_comparison, save_comparison
@@ -38,6 +36,7 @@ from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES
 from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
+from tests.support.command_line import airl, option_words
 
 GAP_FILE = "gap.json"
 EPISODES = 24
@@ -72,24 +71,13 @@ def measure(mitigated: str, *, page: bool = False, **options: Any) -> tuple[int,
 
     Pages take longer than flights: without `page` none is made.
     """
-    console = Console(record=True, width=80, file=io.StringIO())
-    given: dict[str, Any] = {"mitigated": mitigated, "episodes": EPISODES}
+    words = option_words(**({"mitigated": mitigated, "episodes": EPISODES} | options))
     with (
         nullcontext()
         if page
         else patch.object(show, "write_document", lambda _, folder: folder / "gap.html")
     ):
-        code = carry_out("airl gap", "airl_mav.cli.gap", words_of(given | options), console=console)
-    return code, console.export_text()
-
-
-def words_of(options: dict[str, Any]) -> list[str]:
-    """Return options as words of a command line."""
-    words = []
-    for name, value in options.items():
-        many = value if isinstance(value, tuple) else (value,)
-        words += [f"--{name.replace('_', '-')}", *(f"{each}" for each in many)]
-    return words
+        return airl("gap", *words, width=80)
 
 
 @pytest.fixture(scope="module")
@@ -415,20 +403,33 @@ def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) ->
 def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     out, text = whole
     before = (out / GAP_FILE).read_bytes()
-    console = Console(record=True, width=80, file=io.StringIO())
     with patch.object(show, "write_document", lambda _, folder: folder / "gap.html"):
-        assert report.run(report.ReportOptions(runs=(out,)), console) == 0
+        code, again = airl("report", str(out), width=80)
+    assert code == 0
     assert (out / GAP_FILE).read_bytes() == before
-    assert console.export_text().strip() in text
+    assert again.strip() in text
 
 
-def test_a_part_of_it_is_shown(whole: tuple[Path, str]) -> None:
-    """A gap that was stopped after its second run has one gap already."""
-    gap = load_comparison(whole[0], "gap")
-    entries = [run.entry for run in gap.runs if run.entry.role in ("reference", "target")]
-    part, _ = build_comparison(whole[0], "gap", gap.facts, entries)
-    assert [contrast.entry.key for contrast in part.contrasts] == ["without-mitigation"]
-    assert part.contrasts[0] == gap.contrasts[0]
+def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigated: str) -> None:
+    """A gap that was stopped after its second column has one gap already."""
+    real, flown = EpisodeSaver.add, []
+
+    def interrupted(saver: EpisodeSaver, episode: FlownEpisode) -> None:
+        real(saver, episode)
+        flown.append(episode)
+        if len(flown) == 2 * EPISODES:
+            signal.raise_signal(signal.SIGINT)
+
+    with patch.object(EpisodeSaver, "add", interrupted):
+        code, text = measure(mitigated, out=tmp_path / "root")
+    assert code == 130
+    assert "goes on" in text
+    data = data_of(tmp_path / "root")
+    assert [gap["entry"]["key"] for gap in data["contrasts"]] == ["without-mitigation"]
+    assert gap_of(data, "without-mitigation") == gap_of(data_of(whole[0]), "without-mitigation")
+    code, _ = measure(mitigated, out=tmp_path / "root")
+    assert code == 0
+    assert data_of(tmp_path / "root") == data_of(whole[0])
 
 
 @pytest.mark.parametrize(
@@ -536,6 +537,7 @@ def _unknown(name: str) -> PolicyInfo:
         ({"policy": "nobody"}, "nobody"),
         ({"mitigated": DEFAULT_POLICY}, "accepted: another policy, or none"),
         ({"arena": ("no-obstacles", "no-obstacles")}, "each arena once"),
+        ({"arena": ()}, "--arena"),
         ({"arena": ("nowhere",)}, "nowhere"),
     ],
 )
@@ -655,7 +657,7 @@ def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Pat
     finally:
         process.kill()
     assert process.returncode == 130
-    assert f"the same command with --out {out} goes on" in " ".join(text.split())
+    assert f"interrupted: what was flown is kept; --out {out} goes on" in " ".join(text.split())
     done = subprocess.run(
         command, cwd=root, env=environment, capture_output=True, text=True, timeout=300, check=False
     )

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -18,17 +19,17 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
-from airl_mav.cli import main, report
-from airl_mav.cli.options import carry_out
+from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import ladder as ladder_experiment
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.experiment import make_cell
+from airl_mav.experiments.ladder import declare_ladder
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import tango
-from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.report.comparison import show
 from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.ladder import other_differences, split_table
@@ -38,6 +39,9 @@ from airl_mav.report.comparison.tables import contrast_table, runs_table
 from airl_mav.report.measures import MEASURES
 from airl_mav.report.table import TableView
 from airl_mav.scenario.model import Scenario
+from tests.support.command_line import airl, option_words
+from tests.support.ports import choose_ports
+from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
 
 LADDER_FILE = "ladder.json"
@@ -70,19 +74,13 @@ def climb(*, page: bool = False, **options: Any) -> tuple[int, str]:
 
     Pages take longer than flights: without `page` none is made.
     """
-    console = Console(record=True, width=100, file=io.StringIO())
-    given = WORDS | {"sitl_episodes": SITL_EPISODES} | options
-    words = ["greedy"]
-    for name, value in given.items():
-        many = value if isinstance(value, tuple) else (value,)
-        words += [f"--{name.replace('_', '-')}", *(f"{each}" for each in many)]
+    words = option_words(**(WORDS | {"sitl_episodes": SITL_EPISODES} | options))
     with (
         nullcontext()
         if page
         else patch.object(show, "write_document", lambda _, folder: folder / "ladder.html")
     ):
-        code = carry_out("airl ladder", "airl_mav.cli.ladder", words, console=console)
-    return code, console.export_text()
+        return airl("ladder", "greedy", *words, width=100)
 
 
 @pytest.fixture(scope="module")
@@ -161,6 +159,38 @@ def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
     assert levels_of(one)[1]["start"]["takeoff_s"] > 4.0
     assert 0.0 < levels_of(one)[1]["position_error_m"] < 1.0
     assert (tmp_path / "one" / "ladder.html").exists()
+
+
+def test_level_sitl_flies_fewer_unless_asked() -> None:
+    for episodes, asked, wanted in ((100, None, 10), (4, None, 4), (100, 30, 30)):
+        scenario = Scenario(policy="greedy", episodes=episodes)
+        declared = declare_ladder(scenario, ("gym", "sitl"), sitl_episodes=asked)
+        assert [len(cell.scenario.seeds) for cell in declared.cells] == [episodes, wanted]
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("flight")
+def test_level_sitl_flies_in_a_ladder(tmp_path: Path) -> None:
+    options: dict[str, Any] = {
+        **{f"{name}_port": port for name, port in vars(choose_ports()).items()},
+        "arena": write_arena(tmp_path),
+        "episodes": 2,
+        "sitl_episodes": 1,
+        "speed": 4.0,
+        "levels": ("gym", "sitl"),
+        "out": tmp_path / "ladder",
+    }
+    with patch.object(ladder_experiment, "make_cell", make_cell):
+        code, text = climb(**options)
+        assert code == 0
+        assert "sitl: 1 goal reached\n" in text
+        gym, sitl = levels_of(data_of(tmp_path / "ladder"))
+        assert (gym["flown"], sitl["flown"]) == (2, 1)
+        assert gym["sha256"] is not None
+        assert sitl["sha256"] is None
+        code, text = climb(**options)
+        assert code == 0
+        assert "sitl: 1 goal reached (flown before)" in text
 
 
 # --- what it says
@@ -478,9 +508,9 @@ def test_a_level_without_any_success_still_has_a_page(
 def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     out, text = whole
     before = {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
-    console = Console(record=True, width=100, file=io.StringIO())
-    assert report.run(report.ReportOptions(runs=(out,)), console) == 0
-    assert text.endswith(console.export_text())
+    code, again = airl("report", str(out), width=100)
+    assert code == 0
+    assert text.endswith(again)
     assert {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()} == before
 
 
@@ -502,11 +532,51 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
 def test_a_broken_ladder_gets_one_line(content: str, named: str, tmp_path: Path) -> None:
     (tmp_path / LADDER_FILE).write_text(content)
     with pytest.raises(UsageError, match=re.escape(named)) as error:
-        report.run(report.ReportOptions(runs=(tmp_path,)))
+        airl("report", str(tmp_path))
     assert "\n" not in str(error.value)
 
 
 # --- what it survives
+
+
+def interrupted_after(flights: int) -> Any:
+    """Return a patch that presses Ctrl-C after so many flights."""
+    real, flown = EpisodeSaver.add, []
+
+    def add(saver: EpisodeSaver, episode: FlownEpisode) -> None:
+        real(saver, episode)
+        flown.append(episode)
+        if len(flown) == flights:
+            signal.raise_signal(signal.SIGINT)
+
+    return patch.object(EpisodeSaver, "add", add)
+
+
+def test_an_interrupted_ladder_goes_on(whole: tuple[Path, str], tmp_path: Path) -> None:
+    out = tmp_path / "ladder"
+    with interrupted_after(2 * EPISODES + 2):
+        code, text = climb(out=out, slots=1)
+    assert code == 130
+    assert f"interrupted: what was flown is kept; --out {out} goes on" in text
+    assert "2 of 6 at sitl" in text
+    assert contrasts_of(data_of(out))[1]["success_rate"]["difference"]["n"] == 2
+    # Cut again at once, then to the end.
+    with interrupted_after(1):
+        assert climb(out=out, slots=1)[0] == 130
+    code, text = climb(out=out)
+    assert code == 0
+    assert "3 of 6 episodes are there" in text
+    assert data_of(out) == data_of(whole[0])
+
+
+def test_an_interrupted_first_level(_twins: None, tmp_path: Path) -> None:
+    out = tmp_path / "ladder"
+    with interrupted_after(2):
+        code, text = climb(out=out, slots=1, levels=("gym", "lockstep"))
+    assert code == 130
+    assert "goes on" in text
+    assert not (out / LADDER_FILE).exists()
+    assert len(load(out / "gym").episodes) == 2
 
 
 def test_what_is_finished_is_shown_again_and_not_flown(whole: tuple[Path, str]) -> None:
@@ -534,8 +604,8 @@ def test_what_is_finished_is_shown_again_and_not_flown(whole: tuple[Path, str]) 
         ({"sitl_episodes": 0}, "--sitl-episodes 0"),
         ({"workers": 0}, "--workers 0"),
         ({"speed": 100.0}, "--speed 100"),
-        ({"arena": "moon"}, "'moon'"),
-        ({"computer": "abacus"}, "'abacus'"),
+        ({"arena": "moon"}, "moon"),
+        ({"computer": "abacus"}, "abacus"),
     ],
 )
 def test_what_cannot_be_used_is_refused_before_anything_flies(
@@ -572,6 +642,6 @@ def test_the_command_line(
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("error: ")
-    assert "'telepathy'" in err
+    assert "telepathy" in err
     assert len(err.splitlines()) == 1
     assert not list(tmp_path.iterdir())

@@ -5,32 +5,32 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from airl_mav.experiments.campaign import Cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings
+from airl_mav.experiments.experiment import make_cell
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import Declaration, DeclaredCell, open_campaign
 from airl_mav.rehearsal.run_folder import Arrays, LoadedRun
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.resolve import resolve
 
 SEED = 5
 
 
-def gym_cell(name: str, *, episodes: int = 8, hold_s: float = 0.5) -> Cell:
-    scenario = Scenario(
-        level="gym",
-        policy="greedy",
-        arena="no-obstacles",
-        episodes=episodes,
-        seed=SEED,
-        hold_s=hold_s,
-        time_limit_s=30.0,
-        slots=2,
-    )
-    return Cell(name, f"the cell {name}", resolve(scenario))
+def gym_cell(name: str, *, episodes: int = 8, **changes: Any) -> Cell:
+    asked: dict[str, Any] = {
+        "policy": "greedy",
+        "arena": "no-obstacles",
+        "seed": SEED,
+        "hold_s": 0.5,
+        "time_limit_s": 30.0,
+        "slots": 2,
+    }
+    scenario = Scenario(level="gym", episodes=episodes, **(asked | changes))
+    return make_cell(name, f"the cell {name}", scenario)
 
 
 def declared(cells: list[Cell], kind: str = "test") -> Declaration:
