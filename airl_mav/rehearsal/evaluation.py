@@ -71,6 +71,8 @@ def open_folder(
     folder.sweep()
     if grows:
         folder.plan_again(config, seeds)
+    if grows or not (out / SCENARIO_FILE).exists():
+        # The file is missing where the process was killed as it wrote the folder's first files.
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
     return folder, run.episodes
 

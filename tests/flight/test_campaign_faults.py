@@ -75,9 +75,10 @@ real = os.fsync
 """
 
 WINDOWS = {
-    "the settings half written": "before(atomic, '_commit', lambda _, p: p.name == 'run.json')",
+    "the settings half written": "before(atomic, 'sync', lambda p: p.name == 'run.json.partial')",
+    "no scenario file": "before(atomic, 'sync', lambda p: p.name == 'scenario.toml.partial')",
     "nothing saved": "before(run_folder.RunFolder, 'save_episodes')",
-    "half an archive": "before(atomic, '_commit', lambda _, p: p.name == 'latency.npz')",
+    "half an archive": "before(atomic, 'sync', lambda p: p.name == 'latency.npz.partial')",
     "one archive": "after(run_folder, 'add_arrays')",
     "half a line": "os.fsync = tear",
     "a line": "after(run_folder.RunFolder, 'save_episodes')",
@@ -169,7 +170,7 @@ class Campaign:
         names = {path.name for path in self.out.iterdir()}
         logs = {f"flight-{i:03d}.tlog" for i in range(self.episodes)}
         assert names == logs | {
-            *("run.json", "episodes.jsonl", "trajectories.npz", "latency.npz"),
+            *("run.json", "scenario.toml", "episodes.jsonl", "trajectories.npz", "latency.npz"),
             *("firmware.log", "companion.log"),
         }
 
@@ -302,7 +303,7 @@ def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:
 def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     """At level gym flights are the same every time: so are runs, killed or not."""
     out, straight = tmp_path / "killed", tmp_path / "straight"
-    page = "before(atomic, '_commit', lambda _, p: p.name == 'report.html')"
+    page = "before(atomic, 'sync', lambda p: p.name == 'report.html.partial')"
     deadly = [f"{NO_TABLES}\n{KILLER}\n{window}" for window in WINDOWS.values()]
     deadly.append(f"{KILLER}\n{page}")
     statuses = evaluate(tmp_path, out, *deadly, "", NO_TABLES)
@@ -312,6 +313,7 @@ def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     held = [(path / "episodes.jsonl").read_bytes().splitlines() for path in (out, straight)]
     assert len(held[0]) == 40
     assert sorted(held[0]) == sorted(held[1])
+    assert (out / "scenario.toml").read_bytes() == (straight / "scenario.toml").read_bytes()
     for name in ("trajectories.npz", "latency.npz"):
         with np.load(straight / name) as one, np.load(out / name) as other:
             assert sorted(one.files) == sorted(other.files)
