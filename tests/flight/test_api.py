@@ -228,7 +228,7 @@ def test_policies_in_arenas(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
 def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = {"arena": "no-obstacles", "episodes": 3, "seed": 20, "out": tmp_path / "curve"}
     words = option_words(latencies=("native", "150ms", "400ms"), **options)
-    code, text = airl("degrade", "greedy", *words, width=160)
+    code, text = airl("degrade", "greedy", *words)
     assert code == 0
     for name in ("degradation.json", "degradation.html", "degradation.md"):
         assert (tmp_path / "curve" / name).stat().st_size > 1000

@@ -10,10 +10,13 @@ from rich.console import Console
 from airl_mav.cli.options import carry_out
 
 
-def airl(name: str, *words: str, width: int = 200) -> tuple[int, str]:
-    """Run `airl NAME WORDS`; usage errors are raised, their text naming the option."""
+def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:
+    """Run `airl NAME WORDS`; usage errors are raised, their text naming the option.
+
+    Without a width of the terminal, lines are as long as they are.
+    """
     out = io.StringIO()
-    console = Console(file=out, width=width, soft_wrap=True)
+    console = Console(file=out, width=width or 200, soft_wrap=width is None)
     code = carry_out(f"airl {name}", f"airl_mav.cli.{name}", words, console=console)
     return code, out.getvalue()
 
