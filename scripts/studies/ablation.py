@@ -79,11 +79,11 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
             rows.append((arena, layout, *map(rate_with_interval, rates)))
             if paper := load_published().ablation.get(arena):
                 rows.append((arena, "the paper", *(f"{paper.get(z, NONE)}" for z in INPUTS)))
-    heads = (Column("arena", number=False), Column("layout", number=False))
-    columns = (*heads, *(Column(label, "%") for label in INPUTS.values()))
+    columns = [Column("arena", number=False), Column("layout", number=False)]
+    columns += [Column(label, "%") for label in INPUTS.values()]
     note = "The paper: V.D; for Static Obstacles it has one figure for velocity and position."
-    table = ("ablation", "Success without one input", columns, tuple(sorted({*rows})), (note,))
-    print_table(TableView(*table, in_terminal="stacked"), console, wrap=True)
+    table = ("ablation", "Success without one input", tuple(columns), tuple(sorted({*rows})))
+    print_table(TableView(*table, (note,), in_terminal="stacked"), console, wrap=True)
     return 0
 
 

@@ -6,7 +6,6 @@ changes. Every run folder lies below --out, and the same --out goes on with what
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -53,6 +52,7 @@ class StudyConfig(Scenario):
 
 
 Config = TypeVar("Config", bound=StudyConfig)
+Declare = Callable[[Scenario], Experiment]
 
 
 @contextmanager
@@ -62,9 +62,9 @@ def study(options: StudyOptions, model: type[Config], script: str) -> Iterator[t
     data = read_scenario_file(path)
     data |= validated(model, data, path).quick if options.quick else {}
     data |= {} if options.episodes is None else {"episodes": options.episodes}
-    name = f"{Path(script).stem}{'-quick' if options.quick else ''}"
+    name = Path(script).stem + ("-quick" if options.quick else "")
     try:
-        yield validated(model, data, path), options.out or Path("runs") / "studies" / name
+        yield validated(model, data, path), options.out or Path("runs/studies") / name
     except FieldError as error:
         raise UsageError(f"{path}: {error.line(sign=' = ')}") from None
 
@@ -82,22 +82,15 @@ def find_or_train(
             raise
     folder, training = root / f"train-{policy}", training or policy
     if not (folder / "policy" / "card.json").exists():
-        asked = train.TrainOptions(
-            config=training, out=folder, steps=steps, name=policy, resume=True
-        )
-        command = f"airl train {shlex.quote(training)} --name {policy}"
-        command += "" if steps is None else f" --steps {steps}"
-        if train.run(asked, console, command_line=command):
+        asked = {"config": training, "out": folder, "steps": steps, "name": policy, "resume": True}
+        command = f"airl train {training} --name {policy}" + (f" --steps {steps}" if steps else "")
+        if train.run(train.TrainOptions(**asked), console, command_line=command):
             raise KeyboardInterrupt
     return str(folder / "policy")
 
 
 def fly(
-    declare: Callable[[Scenario], Experiment],
-    scenario: Scenario,
-    one_goal: OneGoal | None,
-    root: Path,
-    console: Console,
+    declare: Declare, scenario: Scenario, one_goal: OneGoal | None, root: Path, console: Console
 ) -> int:
     """Fly an experiment, then the same to one goal; return the exit status of both."""
     code, _ = fly_and_show(declare(scenario), root, console)
@@ -105,17 +98,16 @@ def fly(
         return code
     one = declare(scenario.model_copy(update=one_goal.model_dump()))
     roles = {cell.name: entry_of(cell) for cell in one.cells}
-    one = replace(one, kind="compare", recipe=side_by_side, roles=roles)
+    one = replace(one, kind="compare", recipe=beside_each_other, roles=roles)
     code, flown = fly_and_show(one, root / "one-goal", console)
     for run in flown.cells:
         paths = flown.runs[run.cell.name].trajectories
         wide = bootstrap_mean([aside(paths[e.index], e) for e in run.episodes if e.index in paths])
-        told = f"{run.cell.title}: {with_interval(wide, 2)} m aside of the straight line, at most"
-        console.print(told, highlight=False, markup=False, soft_wrap=True)
+        console.print(f"widest aside {with_interval(wide, 2)} m: {run.cell.title}", soft_wrap=True)
     return code
 
 
-def side_by_side(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+def beside_each_other(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
     return ComparisonRecipe("To one goal", dict(facts), tuple(entries))
 
 

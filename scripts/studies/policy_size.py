@@ -20,16 +20,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import tyro
-from airl_mav.cli.common import EXIT_INTERRUPTED, check_range, run_command
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BaseModel, Field
 from rich.console import Console
 from size_latency_fit import Fit, fit_times
 
+from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import describe_machine, package_versions
@@ -39,11 +38,11 @@ from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.arena import Each
-from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
+from airl_mav.scenario.file import read_scenario_file
 from airl_mav.sweep.document import count, t2_ms
 
 SCHEMA = 1
@@ -69,24 +68,23 @@ class StudyConfig(ProfileModel):
     actions: ActionSpec = Field(default_factory=ActionSpec, description="what they choose among")
 
 
-@dataclass(frozen=True)
-class Command:
+class PolicySizeOptions(BaseModel):
     """Time the template grid on this machine."""
 
-    config: Path | None = None
-    """Which networks, on which image. None: policy_size.toml beside this script."""
+    config: Path = Field(default=DEFAULT, description="which networks, on which image")
+    runs: int | None = quantity(
+        "inferences of each network, a p99 needs 662; by default the configuration's",
+        "1",
+        ge=1,
+        le=1_000_000,
+        default=None,
+    )
+    quick: bool = Field(default=False, description=f"{QUICK_RUNS} inferences of each network")
+    threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
+    out: Path = Field(default=Path("runs/policy-size"), description="folder of the results")
 
-    runs: int | None = None
-    """Inferences of each network, >= 1. None: the configuration's. A p99 needs 662."""
 
-    quick: bool = False
-    """70 inferences each."""
-
-    threads: int = 1
-    """Threads of one inference, 1 to 64."""
-
-    out: Path = Path("runs/policy-size")
-    """Folder of the results."""
+OPTIONS = PolicySizeOptions
 
 
 @dataclass(frozen=True)
@@ -120,34 +118,19 @@ class Timed:
         return self.processor_p50_ms / (self.macs / 1e9)
 
 
-def main() -> None:
-    command = tyro.cli(Command, description=__doc__)
-    run_command(lambda: checked(command, Console()))
-
-
-def checked(command: Command, console: Console) -> int:
-    check_range("--threads", command.threads, 1, 64)
-    if command.runs is not None:
-        check_range("--runs", command.runs, 1, 1_000_000)
-    config = load_profile("sweeps", f"{command.config or DEFAULT}", StudyConfig)
-    try:
-        study(command, config, console)
-    except KeyboardInterrupt:
-        console.print(f"interrupted: the same command with --out {command.out} goes on")
-        return EXIT_INTERRUPTED
-    return 0
-
-
-def study(command: Command, config: StudyConfig, console: Console) -> None:
-    runs = QUICK_RUNS if command.quick else command.runs or config.runs
-    cells = command.out / "cells"
+def run(options: PolicySizeOptions, console: Console | None = None) -> int:
+    """Time what is missing; return the exit status. Raises UsageError."""
+    console = console or Console()
+    config = validated(StudyConfig, read_scenario_file(options.config), options.config)
+    runs = QUICK_RUNS if options.quick else options.runs or config.runs
+    cells = options.out / "cells"
     cells.mkdir(parents=True, exist_ok=True)
     # Small ones first: something is there early, and what takes long comes last.
     grid = sorted(
         ((layers, filters) for layers in config.layers for filters in config.filters),
         key=lambda cell: size_of(config, *cell).macs,
     )
-    done = {cell: read(cells, cell, config, command.threads) for cell in grid}
+    done = {cell: read(cells, cell, config, options.threads) for cell in grid}
     work = {cell: size_of(config, *cell).macs * runs for cell in grid}
     with RichProgress(console) as progress:
         bar = progress.bar("networks", sum(work.values()))
@@ -155,18 +138,19 @@ def study(command: Command, config: StudyConfig, console: Console) -> None:
             bar.update(postfix=f"{cell[0]}x{cell[1]}")
             held = done[cell]
             if held is None or held.runs < runs:
-                timed = time_network(config, *cell, runs, command.threads)
+                timed = time_network(config, *cell, runs, options.threads)
                 write(cells / f"{timed.network}.json", asdict(timed) | shared(config))
                 done[cell] = timed
                 progress.note(told(timed))
-                conclude(command.out, config, [t for t in done.values() if t is not None])
+                conclude(options.out, config, [t for t in done.values() if t is not None])
             bar.advance(work[cell])
     everything = [timed for timed in done.values() if timed is not None]
-    conclude(command.out, config, everything)
+    conclude(options.out, config, everything)
     print_table(table(everything), console, wrap=True)
     for line in words(everything):
         console.print(line, highlight=False)
-    console.print(f"figure  {command.out / 'policy-size.png'}", highlight=False)
+    console.print(f"figure  {options.out / 'policy-size.png'}", highlight=False)
+    return 0
 
 
 # --- one network
@@ -384,4 +368,4 @@ def heat_map(config: StudyConfig, timed: list[Timed], key: str, title: str) -> H
 
 
 if __name__ == "__main__":
-    main()
+    run_command(Path(__file__).name, __name__)
