@@ -135,7 +135,7 @@ def test_every_study_has_a_configuration_and_a_quick_one(name: str) -> None:
         ("episodes = 12", "episode = 12", "episode: unknown field; did you mean 'episodes'"),
         ("episodes = 12", "episodes = 0", "episodes = 0"),
         ("300ms", "native", "degradation.toml: latencies = "),
-        ("300ms", "soon", "degradation.toml: latency = 'soon'|latency = soon"),
+        ("300ms", "soon", "--latency soon: accepted: 150ms"),
         ("arena_seed = 4", "arena_seed = -1", "one_goal.arena_seed = -1"),
     ],
 )
@@ -234,7 +234,7 @@ def test_system_evaluation_is_the_gap_of_every_arena(tmp_path: Path) -> None:
 
 def test_an_arena_twice_gets_one_line(tmp_path: Path) -> None:
     arena = '[[arenas]]\narena = "no-obstacles"\npolicy = "greedy"\nworkload = "template-5x32"\n'
-    with pytest.raises(UsageError, match="system.toml: arenas = .*: accepted: each arena once"):
+    with pytest.raises(UsageError, match="accepted: each arena once"):
         study("system", f'computer = "ras-pi-4"\n{arena}{arena}', tmp_path / "out")
 
 
@@ -304,8 +304,7 @@ def test_a_policy_that_is_not_there_is_trained_once(tmp_path: Path) -> None:
     # The layout is read from the card.
     assert card["observation"]["layout"] == "paper"
     assert [line for line in text.splitlines() if line.split()[:2] == ["no-obstacles", "paper"]]
-    held = load_run(out / "mine-in-no-obstacles" / "none").info.setup.policy
-    assert held.sha256 == card["sha256"]
+    assert load_run(out / "mine-in-no-obstacles" / "none").info.config["policy"] == str(policy)
     before = (policy / "policy.onnx").stat().st_mtime_ns
     assert study("ablation", config, out)[0] == 0
     assert (policy / "policy.onnx").stat().st_mtime_ns == before
@@ -372,9 +371,9 @@ def test_a_killed_study_goes_on_and_finds_the_same(
     assert (out / "degradation.html").exists()
     for folder in ("", "one-goal"):
         for latency in LATENCIES:
-            runs = (load_run(root / folder / f"greedy-{latency}") for root in (out, whole))
-            mine, theirs = (run.sha256 for run in runs)
-            assert mine is not None and mine == theirs
+            runs = (root / folder / f"greedy-{latency}" for root in (out, whole))
+            mine, theirs = (flights(run) for run in runs)
+            assert mine == theirs
     found, expected = (comparison(root, "degradation") for root in (out, whole))
     assert found["contrasts"] == expected["contrasts"]
     wrong = subprocess.run(
