@@ -18,16 +18,13 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-Kind = Literal[
-    "vehicles", "computers", "arenas", "training", "sweeps", "studies", "conformance", "published"
-]
+Kind = Literal["vehicles", "computers", "arenas", "training", "sweeps", "conformance", "published"]
 _SINGULAR: dict[Kind, str] = {
     "vehicles": "vehicle",
     "computers": "computer",
     "arenas": "arena",
     "training": "training",
     "sweeps": "sweep",
-    "studies": "study",
     "conformance": "conformance",
     "published": "publication",
 }

@@ -1,13 +1,91 @@
-"""Sensor ablation: policies with one input made zero, in the body layout and in the paper's own.
+"""Sensor ablation: which of its inputs does a policy need?
 
     python scripts/studies/ablation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-The policies of the paper's layout are trained first, about two minutes each on one core: needs the
-train extra.
+The paper (V.D) makes depth, velocity and position zero, one by one and without training again. This
+does the same with policies of our `body` layout and of the paper's own, each in the arena that it
+was trained in: one comparison for each, in a folder of its own. No policy of the paper's layout is
+shipped: those are trained first, about two minutes each on one core, which needs the train extra.
 """
 
-from airl_mav.studies.ablation import ABLATION_STUDY
-from airl_mav.studies.study import main
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from common import StudyConfig, StudyOptions, find_or_train, study
+from pydantic import Field, create_model
+from rich.console import Console
+
+from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.experiments.experiment import Experiment, entry_of, make_cell
+from airl_mav.flight.statistics import aggregate
+from airl_mav.policy.registry import find_policy
+from airl_mav.profiles.published import load_published
+from airl_mav.report.comparison.model import ComparisonRecipe, ContrastEntry, RunEntry
+from airl_mav.report.measures import rate_with_interval
+from airl_mav.report.table import NONE, Column, TableView, print_table
+from airl_mav.scenario.model import Scenario
+
+OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
+
+INPUTS = {"none": "all inputs", "velocity": "no velocity", "goal": "no goal", "depth": "no depth"}
+"""What is made zero, and how its run is called; the paper's word for the goal: position."""
+
+
+class PolicyConfig(ProfileModel):
+    arena: str = Field(description="arena profile")
+    policy: str = Field(description="a name, or a path to a folder; trained where it is not there")
+    training: str | None = Field(default=None, description="by default the policy's name")
+    steps: int | None = quantity("decisions to train", "1", ge=1, default=None)
+
+
+class AblationConfig(StudyConfig):
+    policies: tuple[PolicyConfig, ...] = Field(min_length=1, description="what flies where")
+
+
+def declare(scenario: Scenario, title: str) -> Experiment:
+    """Declare a policy with all inputs and without each."""
+    zeroed = [name for name in INPUTS if name != "none"]
+    ablated = {name: scenario.model_copy(update={"ablate": name}) for name in zeroed}
+    flown = {"none": scenario, **ablated}
+    cells = tuple(make_cell(k, f"{title}, {label}", flown[k]) for k, label in INPUTS.items())
+    roles = {cell.name: entry_of(cell, label=INPUTS[cell.name]) for cell in cells}
+    contrasts = tuple(ContrastEntry(name, "none") for name in zeroed)
+
+    def recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+        return ComparisonRecipe(title, dict(facts), tuple(entries), contrasts)
+
+    return Experiment("compare", "ablation", {}, cells, recipe, roles)
+
+
+def run(options: StudyOptions, console: Console | None = None) -> int:
+    console, rows = console or Console(), []
+    with study(options, AblationConfig, __file__) as (config, root):
+        for each in config.policies:
+            policy = find_or_train(each.policy, root, console, each.training, each.steps)
+            card, arena = find_policy(policy).card, Path(each.arena).stem
+            layout = NONE if card is None else card.observation.layout
+            place = f"{Path(each.policy).name}-in-{arena}"
+            scenario = scenario_of(config, policy=policy, arena=each.arena)
+            experiment = declare(scenario, f"{each.policy} in {arena}, layout {layout}")
+            code, flown = fly_and_show(experiment, root / place, console)
+            if code:
+                return code
+            rates = (aggregate(run.episodes).success_rate for run in flown.cells)
+            rows.append((arena, layout, *map(rate_with_interval, rates)))
+            if paper := load_published().ablation.get(arena):
+                rows.append((arena, "the paper", *(f"{paper.get(z, NONE)}" for z in INPUTS)))
+    columns = [Column("arena", number=False), Column("layout", number=False)]
+    columns += [Column(label, "%") for label in INPUTS.values()]
+    note = "The paper: V.D; for Static Obstacles it has one figure for velocity and position."
+    table = ("ablation", "Success without one input", tuple(columns), tuple(sorted({*rows})))
+    print_table(TableView(*table, (note,), in_terminal="stacked"), console, wrap=True)
+    return 0
+
 
 if __name__ == "__main__":
-    main(ABLATION_STUDY, __file__)
+    run_command(Path(__file__).name, __name__)

@@ -1,13 +1,42 @@
-"""Degradation: a policy as its decisions come later and later, on the same seeds.
+"""Degradation: what latency that is added to every decision costs a policy.
 
     python scripts/studies/degradation.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-The paper's table of degradation (base, 150, 300 ms; here 400 and 950 ms too) and its trajectories
-with a fixed goal.
+The paper (VI.C) slows its Static Obstacles policy on a Core i9 by sleep, to 150 and 300 ms, and
+draws its trajectories with a fixed goal. This flies policies at growing latencies on the same
+seeds, shows whether every step costs more, and flies the same again to one goal.
 """
 
-from airl_mav.studies.degradation import DEGRADATION_STUDY
-from airl_mav.studies.study import main
+from __future__ import annotations
+
+from pathlib import Path
+
+from common import OneGoal, StudyConfig, StudyOptions, fly, study
+from pydantic import Field, create_model
+from rich.console import Console
+
+from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.experiments.degrade import LATENCIES, declare_degradation
+from airl_mav.experiments.experiment import Experiment
+from airl_mav.scenario.model import Scenario
+
+OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
+
+
+class DegradationConfig(StudyConfig):
+    policies: tuple[str, ...] = Field(min_length=1, description="names, or paths to folders")
+    latencies: tuple[str, ...] = Field(default=LATENCIES, description="t2, growing")
+    one_goal: OneGoal | None = Field(default=None, description="flights to one goal")
+
+
+def run(options: StudyOptions, console: Console | None = None) -> int:
+    with study(options, DegradationConfig, __file__) as (config, root):
+
+        def declare(scenario: Scenario) -> Experiment:
+            return declare_degradation(scenario, config.latencies, config.policies)
+
+        return fly(declare, scenario_of(config), config.one_goal, root, console or Console())
+
 
 if __name__ == "__main__":
-    main(DEGRADATION_STUDY, __file__)
+    run_command(Path(__file__).name, __name__)

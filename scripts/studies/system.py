@@ -2,11 +2,69 @@
 
     python scripts/studies/system.py [--quick] [--episodes N] [--out DIR] [--config FILE]
 
-The paper's three tables of system evaluation, and its trajectories with a fixed goal.
+The paper (VI.B) flies the best policy of each of three arenas on a Core i9 and on a Raspberry Pi 4,
+and draws trajectories with a fixed goal. This flies our policy of each arena on the same seeds, as
+late as the paper's best network of that arena was on both computers, shows the hardware gap of each
+arena beside the paper's, and flies the same again to one goal.
 """
 
-from airl_mav.studies.study import main
-from airl_mav.studies.system import SYSTEM_STUDY
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from common import OneGoal, StudyConfig, StudyOptions, fly, study
+from pydantic import Field, create_model
+from rich.console import Console
+
+from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel
+from airl_mav.experiments.experiment import Experiment
+from airl_mav.experiments.gap import DEFAULT_REFERENCE, NOT_MITIGATED, declare_gap
+from airl_mav.report.comparison.gap import gap_recipe
+from airl_mav.scenario.model import Scenario
+
+OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
+
+
+class ArenaConfig(ProfileModel):
+    arena: str = Field(description="arena profile")
+    policy: str = Field(description="a name, or a path to a folder")
+    workload: str = Field(description="whose latency both computers have")
+
+
+class SystemConfig(StudyConfig):
+    arenas: tuple[ArenaConfig, ...] = Field(min_length=1, description="what flies where")
+    reference: str = Field(default=DEFAULT_REFERENCE, description="computer of the reference")
+    one_goal: OneGoal | None = Field(default=None, description="flights to one goal")
+
+
+def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
+    """Declare the hardware gap of every arena as one experiment."""
+    gaps = [
+        declare_gap(
+            scenario.model_copy(update=each.model_dump()),
+            mitigated=NOT_MITIGATED,
+            reference=config.reference,
+        )
+        for each in config.arenas
+    ]
+    cells = tuple(cell for gap in gaps for cell in gap.cells)
+    if len({cell.name for cell in cells}) < len(cells):
+        raise FieldError("arenas", [Path(e.arena).stem for e in config.arenas], "each arena once")
+    own = ("policy", "workload")
+    facts = gaps[0].facts | {f: ", ".join(f"{gap.facts[f]}" for gap in gaps) for f in own}
+    facts["reference_workload"] = facts["workload"]
+    roles = {name: entry for gap in gaps for name, entry in gap.roles.items()}
+    return Experiment("gap", "system", facts, cells, gap_recipe, roles)
+
+
+def run(options: StudyOptions, console: Console | None = None) -> int:
+    with study(options, SystemConfig, __file__) as (config, root):
+        declared = partial(declare, config=config)
+        return fly(declared, scenario_of(config), config.one_goal, root, console or Console())
+
 
 if __name__ == "__main__":
-    main(SYSTEM_STUDY, __file__)
+    run_command(Path(__file__).name, __name__)

@@ -579,9 +579,9 @@ def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
         (["no-obstacles", "--zone", "5"], "zone = 5: accepted: 0 <= value <= 2"),
         (
             ["no-obstacles", "--png", "a.jpg"],
-            "--png 'a.jpg': accepted: a file name that ends in .png",
+            "--png a.jpg: accepted: a file name that ends in .png",
         ),
-        (["no-obstacles", "--png", "/nowhere/a.png"], "--png '/nowhere/a.png': cannot write"),
+        (["no-obstacles", "--png", "/nowhere/a.png"], "--png /nowhere/a.png: cannot write"),
         (
             ["no-obstacles", "--vehicle-width", "0"],
             "--vehicle-width-m 0: accepted: 0 < value <= 100 m",

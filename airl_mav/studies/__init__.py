@@ -1,1 +1,0 @@
-"""The studies of the Air Learning paper: campaigns of evaluations, each with a page of answers."""

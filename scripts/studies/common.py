@@ -1,0 +1,119 @@
+"""What the studies share: options, configuration, training, flights to one goal.
+
+A configuration is a scenario as TOML with the study's own fields; `[quick]` holds what --quick
+changes. Every run folder lies below --out, and the same --out goes on with what was interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, Field
+from rich.console import Console
+
+from airl_mav.cli import train
+from airl_mav.cli.experiments import fly_and_show
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.experiments.experiment import Experiment, entry_of
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import bootstrap_mean
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.policy.registry import find_policy
+from airl_mav.profiles.loading import list_profiles
+from airl_mav.report.comparison.model import ComparisonRecipe, RunEntry
+from airl_mav.report.measures import with_interval
+from airl_mav.scenario.file import read_scenario_file
+from airl_mav.scenario.model import LevelName, Scenario
+
+
+class StudyOptions(BaseModel):
+    config: Path | None = Field(default=None, description="by default the .toml beside the script")
+    quick: bool = Field(default=False, description="few episodes: a first look")
+    episodes: int | None = quantity("episodes of each run", "1", ge=1, le=100_000, default=None)
+    out: Path | None = Field(default=None, description="folder; by default runs/studies/<name>")
+
+
+class OneGoal(ProfileModel):
+    arena_seed: int = quantity("seed of the arena and the goal", "1", ge=0, le=2**31)
+    episodes: int = quantity("flights of each run", "1", ge=1, le=10_000, default=100)
+
+
+class StudyConfig(Scenario):
+    description: str = Field(default="", description="one line for people")
+    level: LevelName = Field(default="gym", description="rung of the fidelity ladder")
+    episodes: int = quantity("episodes of each run", "1", ge=1, le=100_000, default=1000)
+    quick: dict[str, Any] = Field(default={"episodes": 40}, description="what --quick changes")
+
+
+Config = TypeVar("Config", bound=StudyConfig)
+Declare = Callable[[Scenario], Experiment]
+
+
+@contextmanager
+def study(options: StudyOptions, model: type[Config], script: str) -> Iterator[tuple[Config, Path]]:
+    """Give the configuration and the folder; errors of fields name the configuration's file."""
+    path = options.config or Path(script).with_suffix(".toml")
+    data = read_scenario_file(path)
+    data |= validated(model, data, path).quick if options.quick else {}
+    data |= {} if options.episodes is None else {"episodes": options.episodes}
+    name = Path(script).stem + ("-quick" if options.quick else "")
+    try:
+        yield validated(model, data, path), options.out or Path("runs/studies") / name
+    except FieldError as error:
+        raise UsageError(f"{path}: {error.line(sign=' = ')}") from None
+
+
+def find_or_train(
+    policy: str, root: Path, console: Console, training: str | None = None, steps: int | None = None
+) -> str:
+    """Return a policy that is there, or train it below `root`; a killed training goes on."""
+    try:
+        find_policy(policy)
+        return policy
+    except UsageError as error:
+        known = training is not None or policy in list_profiles("training")
+        if not known or "no such policy" not in str(error):
+            raise
+    folder, training = root / f"train-{policy}", training or policy
+    if not (folder / "policy" / "card.json").exists():
+        asked = {"config": training, "out": folder, "steps": steps, "name": policy, "resume": True}
+        command = f"airl train {training} --name {policy}" + (f" --steps {steps}" if steps else "")
+        if train.run(train.TrainOptions(**asked), console, command_line=command):
+            raise KeyboardInterrupt
+    return str(folder / "policy")
+
+
+def fly(
+    declare: Declare, scenario: Scenario, one_goal: OneGoal | None, root: Path, console: Console
+) -> int:
+    """Fly an experiment, then the same to one goal; return the exit status of both."""
+    code, _ = fly_and_show(declare(scenario), root, console)
+    if code or one_goal is None:
+        return code
+    one = declare(scenario.model_copy(update=one_goal.model_dump()))
+    roles = {cell.name: entry_of(cell) for cell in one.cells}
+    one = replace(one, kind="compare", recipe=beside_each_other, roles=roles)
+    code, flown = fly_and_show(one, root / "one-goal", console)
+    for run in flown.cells:
+        paths = flown.runs[run.cell.name].trajectories
+        wide = bootstrap_mean([aside(paths[e.index], e) for e in run.episodes if e.index in paths])
+        console.print(f"widest aside {with_interval(wide, 2)} m: {run.cell.title}", soft_wrap=True)
+    return code
+
+
+def beside_each_other(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
+    return ComparisonRecipe("To one goal", dict(facts), tuple(entries))
+
+
+def aside(path: Trajectory, episode: EpisodeRecord) -> float:
+    """Return the greatest distance of a path from the line through start and goal [m]."""
+    start_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
+    north, east = np.array(episode.goal) / np.linalg.norm(episode.goal)
+    position = path.between(start_us, episode.ended_us).position
+    return float(np.abs(position[:, :2] @ np.array([-east, north])).max(initial=0.0))
