@@ -10,9 +10,7 @@ shipped: those are trained first, about two minutes each on one core, which need
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from common import StudyConfig, StudyOptions, find_or_train, study
 from pydantic import Field, create_model
@@ -25,7 +23,6 @@ from airl_mav.experiments.experiment import Experiment, entry_of, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import load_published
-from airl_mav.report.comparison.model import ComparisonRecipe, ContrastEntry, RunEntry
 from airl_mav.report.measures import rate_with_interval
 from airl_mav.report.table import NONE, Column, TableView, print_table
 from airl_mav.scenario.model import Scenario
@@ -49,17 +46,11 @@ class AblationConfig(StudyConfig):
 
 def declare(scenario: Scenario, title: str) -> Experiment:
     """Declare a policy with all inputs and without each."""
-    zeroed = [name for name in INPUTS if name != "none"]
-    ablated = {name: scenario.model_copy(update={"ablate": name}) for name in zeroed}
-    flown = {"none": scenario, **ablated}
+    flown = {name: scenario.model_copy(update={"ablate": name}) for name in INPUTS}
+    flown["none"] = scenario
     cells = tuple(make_cell(k, f"{title}, {label}", flown[k]) for k, label in INPUTS.items())
     roles = {cell.name: entry_of(cell, label=INPUTS[cell.name]) for cell in cells}
-    contrasts = tuple(ContrastEntry(name, "none") for name in zeroed)
-
-    def recipe(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
-        return ComparisonRecipe(title, dict(facts), tuple(entries), contrasts)
-
-    return Experiment("compare", "ablation", {}, cells, recipe, roles)
+    return Experiment("compare", "ablation", {"what": title}, cells, roles)
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:

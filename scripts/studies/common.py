@@ -6,7 +6,7 @@ changes. Every run folder lies below --out, and the same --out goes on with what
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +26,6 @@ from airl_mav.flight.statistics import bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.loading import list_profiles
-from airl_mav.report.comparison.model import ComparisonRecipe, RunEntry
 from airl_mav.report.measures import with_interval
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import LevelName, Scenario
@@ -98,17 +97,13 @@ def fly(
         return code
     one = declare(scenario.model_copy(update=one_goal.model_dump()))
     roles = {cell.name: entry_of(cell) for cell in one.cells}
-    one = replace(one, kind="compare", recipe=beside_each_other, roles=roles)
+    one = replace(one, kind="compare", roles=roles)
     code, flown = fly_and_show(one, root / "one-goal", console)
     for run in flown.cells:
         paths = flown.runs[run.cell.name].trajectories
         wide = bootstrap_mean([aside(paths[e.index], e) for e in run.episodes if e.index in paths])
         console.print(f"widest aside {with_interval(wide, 2)} m: {run.cell.title}", soft_wrap=True)
     return code
-
-
-def beside_each_other(facts: Mapping[str, Any], entries: Sequence[RunEntry]) -> ComparisonRecipe:
-    return ComparisonRecipe("To one goal", dict(facts), tuple(entries))
 
 
 def aside(path: Trajectory, episode: EpisodeRecord) -> float:

@@ -21,14 +21,14 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field
+from pydantic import Field
 from rich.console import Console
 from size_latency_fit import Fit, fit_times
 
 from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
-from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
+from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import describe_machine, package_versions
@@ -38,11 +38,11 @@ from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.arena import Each
+from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
-from airl_mav.scenario.file import read_scenario_file
 from airl_mav.sweep.document import count, t2_ms
 
 SCHEMA = 1
@@ -68,23 +68,23 @@ class StudyConfig(ProfileModel):
     actions: ActionSpec = Field(default_factory=ActionSpec, description="what they choose among")
 
 
-class PolicySizeOptions(BaseModel):
+class StudyOptions(ProfileModel):
     """Time the template grid on this machine."""
 
     config: Path = Field(default=DEFAULT, description="which networks, on which image")
     runs: int | None = quantity(
-        "inferences of each network, a p99 needs 662; by default the configuration's",
+        "inferences of each network, by default the configuration's; a p99 needs 662",
         "1",
         ge=1,
         le=1_000_000,
         default=None,
     )
-    quick: bool = Field(default=False, description=f"{QUICK_RUNS} inferences of each network")
+    quick: bool = Field(default=False, description="70 inferences each")
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
     out: Path = Field(default=Path("runs/policy-size"), description="folder of the results")
 
 
-OPTIONS = PolicySizeOptions
+OPTIONS = StudyOptions
 
 
 @dataclass(frozen=True)
@@ -118,10 +118,17 @@ class Timed:
         return self.processor_p50_ms / (self.macs / 1e9)
 
 
-def run(options: PolicySizeOptions, console: Console | None = None) -> int:
-    """Time what is missing; return the exit status. Raises UsageError."""
+def run(options: StudyOptions, console: Console | None = None) -> int:
     console = console or Console()
-    config = validated(StudyConfig, read_scenario_file(options.config), options.config)
+    try:
+        study(options, load_profile("sweeps", f"{options.config}", StudyConfig), console)
+    except KeyboardInterrupt:
+        console.print(f"interrupted: the same command with --out {options.out} goes on")
+        return EXIT_INTERRUPTED
+    return 0
+
+
+def study(options: StudyOptions, config: StudyConfig, console: Console) -> None:
     runs = QUICK_RUNS if options.quick else options.runs or config.runs
     cells = options.out / "cells"
     cells.mkdir(parents=True, exist_ok=True)
@@ -150,7 +157,6 @@ def run(options: PolicySizeOptions, console: Console | None = None) -> int:
     for line in words(everything):
         console.print(line, highlight=False)
     console.print(f"figure  {options.out / 'policy-size.png'}", highlight=False)
-    return 0
 
 
 # --- one network
@@ -368,4 +374,4 @@ def heat_map(config: StudyConfig, timed: list[Timed], key: str, title: str) -> H
 
 
 if __name__ == "__main__":
-    run_command(Path(__file__).name, __name__)
+    run_command("policy_size.py", __name__)

@@ -22,7 +22,6 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.experiments.gap import DEFAULT_REFERENCE, NOT_MITIGATED, declare_gap
-from airl_mav.report.comparison.gap import gap_recipe
 from airl_mav.scenario.model import Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
@@ -57,7 +56,7 @@ def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
     facts = gaps[0].facts | {f: ", ".join(f"{gap.facts[f]}" for gap in gaps) for f in own}
     facts["reference_workload"] = facts["workload"]
     roles = {name: entry for gap in gaps for name, entry in gap.roles.items()}
-    return Experiment("gap", "system", facts, cells, gap_recipe, roles)
+    return Experiment("gap", "system", facts, cells, roles)
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
