@@ -1,6 +1,6 @@
 """A report as headings, tables and pictures: one HTML page that opens offline, Markdown, terminal.
 
-Comparisons, sweeps and studies are documents; the page of a single run has a template of its own.
+Comparisons and sweeps are documents; the page of a single run has a template of its own.
 """
 
 from __future__ import annotations
