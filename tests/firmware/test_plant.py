@@ -19,7 +19,7 @@ from airl_mav.core.frames import Vector, ned_to_enu, quat_ned_frd_to_enu_flu, qu
 from airl_mav.core.location import HOME
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
-from airl_mav.scenario.model import WindSettings
+from airl_mav.scenario.model import Aircraft, WindSettings
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
 from firmware_sim.plant import wind as wind_module
@@ -112,6 +112,8 @@ def make() -> Iterator[PlantMaker]:
         seed: int = 1,
         **more: Any,
     ) -> Plant:
+        if (wind := more.pop("wind", None)) is not None:
+            more["aircraft"] = Aircraft(wind=wind)
         plants.append(Plant(profile, arena, np.random.default_rng(seed), **more))
         return plants[-1]
 
