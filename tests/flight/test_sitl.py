@@ -79,7 +79,7 @@ def test_folder_is_complete_and_nothing_else(done: Done) -> None:
     assert names == {
         *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
         *("report.html", "firmware.log", "companion.log"),
-        *("latency.png", "latency-timeline.png", "energy.png", "flight-3d.png"),
+        *("latency.png", "latency-timeline.png", "energy.png"),
         *(f"{flight}{end}" for flight in flights for end in (".tlog", "-map.png", "-time.png")),
     }
     for name in names:
