@@ -130,7 +130,7 @@ def _facts(options: ExportOptions) -> PolicyFacts:
         | {"algorithm", "epsilon"}
     ) | {
         "name": options.name if options.name is not None else options.out.resolve().name,
-        "observation": validated(ObservationSpec, image | camera),
+        "observation": _observation(options.image, image | camera),
         "actions": validated(ActionSpec, speed),
         "training": Training(
             command=shlex.join(["airl", *sys.argv[1:]]),
@@ -139,3 +139,13 @@ def _facts(options: ExportOptions) -> PolicyFacts:
         ),
     }
     return validated(PolicyFacts, facts)
+
+
+def _observation(image: str, data: dict[str, object]) -> ObservationSpec:
+    """Return what the network sees. Raises FieldError that names the options."""
+    try:
+        return validated(ObservationSpec, data)
+    except FieldError as error:
+        if error.field in ("width_px", "height_px"):
+            raise FieldError("image", image, problem=error.line()) from None
+        raise

@@ -377,8 +377,12 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
             ["--algorithm", "TD3", "--actions", "velocity"],
             ["action space Box(-5.0, 5.0, (2,), float32)", "Box(-1.0, 1.0, (2,), float32)"],
         ),
-        ("dqn.zip", ["--algorithm", "DQN", "--image", "32"], ["image '32'", "WIDTHxHEIGHT"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--image", "2x2"], ["height_px 2", "4 <= value"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--image", "32"], ["--image 32:", "WIDTHxHEIGHT"]),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--image", "2x2"],
+            ["--image 2x2: height_px 2", "4 <= value"],
+        ),
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--layout", "paper", "--image", "32x10"],
@@ -387,13 +391,17 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--horizontal-fov-deg", "200"],
-            ["horizontal_fov_deg 200", "< 170"],
+            ["--horizontal-fov-deg 200", "< 170"],
         ),
-        ("dqn.zip", ["--algorithm", "DQN", "--range-m", "100"], ["range_m 100", "<= 65 m"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--max-speed-m-s", "0"], ["max_speed_m_s 0", "m/s"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--hold-s", "-1"], ["hold_s -1", "0 <= value <= 10 s"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["epsilon 1.5", "value <= 1"]),
-        ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["name 'a b'"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--range-m", "100"], ["--range-m 100", "<= 65 m"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--max-speed-m-s", "0"], ["--max-speed-m-s 0", "m/s"]),
+        (
+            "dqn.zip",
+            ["--algorithm", "DQN", "--hold-s", "-1"],
+            ["--hold-s -1", "0 <= value <= 10 s"],
+        ),
+        ("dqn.zip", ["--algorithm", "DQN", "--epsilon", "1.5"], ["--epsilon 1.5", "value <= 1"]),
+        ("dqn.zip", ["--algorithm", "DQN", "--name", "a b"], ["--name a b"]),
         (
             "sac.zip",
             ["--algorithm", "SAC", "--actions", "velocity", "--epsilon", "0.1"],
