@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,7 +39,9 @@ def room(half: float = 20.0, *, pillar_at: float | None = None) -> Arena:
     return Arena("room", 0, bounds, (0, 0, 0), pillars, (), np.zeros(2))
 
 
-def camera(rate_hz: float = 30.0, mount: Mount | None = None, arena: Arena | None = None):
+def camera(
+    rate_hz: float = 30.0, mount: Mount | None = None, arena: Arena | None = None
+) -> DepthCamera:
     level = Mount((0.0, 0.0, 0.0), 0.0)
     return DepthCamera(LENS, mount or level, rate_hz, 60.0, arena or room())
 
@@ -132,7 +135,7 @@ def connected(server: CameraServer, source: ZmqFrameSource) -> None:
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
-def test_frame_arrives_whole(transport: str, tmp_path) -> None:
+def test_frame_arrives_whole(transport: str, tmp_path: Path) -> None:
     endpoint = LOOPBACK if transport == "tcp" else f"ipc://{tmp_path}/camera"
     clock = SimClock(5)
     server = CameraServer(endpoint)
@@ -184,7 +187,7 @@ def test_stalled_network_cannot_hold_the_simulator() -> None:
         n = 5_000  # 31 MB: far more than any socket buffer
         for sequence in range(1, n):
             server.publish(frame(sequence))
-        seen = []
+        seen: list[int] = []
         while not seen or seen[-1] < n - 1:
             assert stalled.poll(10_000), f"the newest frame never came, last {seen[-1:]}"
             seen.append(Frame.from_bytes(stalled.recv()).sequence)

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,7 +112,7 @@ class Flight:
             yield sample, p, v, r
 
 
-def unbiased(seconds: float, **changes) -> Flight:
+def unbiased(seconds: float, **changes: Any) -> Flight:
     return Flight(seconds, np.zeros(3), np.zeros(3), **changes)
 
 
@@ -188,7 +189,9 @@ def drop_pressure(sample: SensorSample) -> SensorSample:
     [(jump_gps(40.0), 0), (jump_gps(-15.0), 0), (drop_pressure, 1), (bend_field, 2)],
     ids=["gps 40 m", "gps 15 m", "baro 17 m", "mag 90 deg"],
 )
-def test_an_outlier_is_rejected_and_forgotten(change, ratio: int) -> None:
+def test_an_outlier_is_rejected_and_forgotten(
+    change: Callable[[SensorSample], SensorSample], ratio: int
+) -> None:
     flight, start, end = unbiased(16.0), 10.0, 11.5
     clean = run(Estimator(VALUE), (s for s, *_ in flight.samples()))
     dirty = run(Estimator(VALUE), altered(flight, change, start, end))
@@ -293,7 +296,8 @@ def test_transition_matrix(seed: int) -> None:
     """The error after a step, from the error before it; rotation vectors by scipy."""
     rng = np.random.default_rng(seed)
     before = es.new_state()
-    before[es.Q : es.RATES] = quat_xyzw_to_wxyz(tuple(Rotation.random(rng=rng).as_quat()))
+    x, y, z, w = Rotation.random(rng=rng).as_quat()
+    before[es.Q : es.RATES] = quat_xyzw_to_wxyz((x, y, z, w))
     before[es.P : es.Q] = rng.normal(0, 3, 6)
     before[es.GYRO_BIAS : es.BARO_OFFSET] = rng.normal(0, 0.1, 6)
     gyro, accel = rng.normal(0, 1, 3), rng.normal(0, 3, 3) - [0, 0, 9.8]

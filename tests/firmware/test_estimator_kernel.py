@@ -25,7 +25,7 @@ from firmware_sim.autopilot.estimator import Estimator, NewFilter
 from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.interfaces import SensorSample
+from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import flight, quad, velocity_setpoint
 
 TOLERANCE = 1e-9
@@ -55,11 +55,11 @@ def samples() -> list[SensorSample]:
         seen: list[SensorSample] = []
         step = rig.ap.step
 
-        def listen(sample: SensorSample):
+        def listen(sample: SensorSample) -> ActuatorControls:
             seen.append(sample)
             return step(sample)
 
-        rig.ap.step = listen
+        rig.step_through(listen)
         rig.take_off(6.0, settle_s=0.0)
         rng = np.random.default_rng(0)
         rig.go_offboard(velocity_setpoint(0, 0, 0))
@@ -194,14 +194,14 @@ def test_both_fly_the_same() -> None:
         shadow = BuiltinAutopilot(Parameters(parameters), FilterpyFilter)
         step, worst = rig.ap.step, 0.0
 
-        def side_by_side(sample: SensorSample):
+        def side_by_side(sample: SensorSample) -> ActuatorControls:
             nonlocal worst
             mine, other = step(sample), shadow.step(sample)
             assert (mine.time_us, mine.armed) == (other.time_us, other.armed)
             worst = max(worst, *np.abs(np.subtract(mine.motors, other.motors)))
             return mine
 
-        rig.ap.step = side_by_side
+        rig.step_through(side_by_side)
         rig.boot()
         for pilot in (rig.ap, shadow):
             assert pilot.arm(force=False) is Result.ACCEPTED
@@ -223,7 +223,8 @@ seeds = st.integers(0, 2**32 - 1)
 def random_state(rng: np.random.Generator) -> np.ndarray:
     state = es.new_state()
     state[es.P : es.Q] = rng.normal(0, 5, 6)
-    state[es.Q : es.RATES] = quat_xyzw_to_wxyz(tuple(Rotation.random(rng=rng).as_quat()))
+    x, y, z, w = Rotation.random(rng=rng).as_quat()
+    state[es.Q : es.RATES] = quat_xyzw_to_wxyz((x, y, z, w))
     state[es.GYRO_BIAS : es.ACCELERATION] = rng.normal(0, 0.1, 7)
     return state
 

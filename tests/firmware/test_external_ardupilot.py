@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.errors import UsageError
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.external.ardupilot.json_messages import ServoPacketError, parse_servos, state_line
 from firmware_sim.external.ardupilot.sitl import MAX_GARBAGE, ArdupilotBridge
@@ -38,7 +39,9 @@ NUMBERS = st.floats(-1e6, 1e6)
 VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS)
 
 
-def sample(time_us: int = START_US, accel: Any = (0.1, -0.2, -9.81), gyro: Any = (1e-7, 0, -0.5)):
+def sample(
+    time_us: int = START_US, accel: Any = (0.1, -0.2, -9.81), gyro: Any = (1e-7, 0, -0.5)
+) -> SensorSample:
     battery = BatterySample(16.0, 10.0, 0.0, 1.0)
     return SensorSample(time_us, np.array(accel, float), np.array(gyro, float), 20.0, battery)
 
@@ -88,7 +91,9 @@ def test_other_datagrams_are_refused(datagram: bytes, why: str) -> None:
 
 
 @given(NUMBERS, VECTORS, VECTORS, VECTORS, VECTORS)
-def test_state_lines_are_read_back_exactly(time: float, gyro, accel, position, velocity) -> None:
+def test_state_lines_are_read_back_exactly(
+    time: float, gyro: Vec, accel: Vec, position: Vec, velocity: Vec
+) -> None:
     time_us = abs(int(time * 1e6)) + 1
     line = state_line(time_us, sample(0, accel, gyro), truth(position, velocity))
     text = line.decode("ascii")

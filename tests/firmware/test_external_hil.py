@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.location import HOME
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, Truth
 from firmware_sim.mavlink.codec import Encoder, Layout, Values
@@ -18,19 +21,19 @@ from firmware_sim.mavlink.codec import Encoder, Layout, Values
 BATTERY = BatterySample(16.0, 10.0, 100.0, 0.9)
 
 
-def decoded(layout: Layout, values: Values):
+def decoded(layout: Layout, values: Values) -> Any:
     """Return the message that pymavlink finds in the frame."""
     frame = Encoder().frame(layout, layout.payload(values))
     (message,) = dialect.MAVLink(None).parse_buffer(frame)
     return message
 
 
-def sample(**slow) -> SensorSample:
+def sample(**slow: Any) -> SensorSample:
     accel, gyro = np.array([0.1, -0.2, -9.81]), np.array([0.01, -0.02, 0.03])
     return SensorSample(8_000, accel, gyro, 11.8, BATTERY, **slow)
 
 
-def controls_message(motors, mode: int = 129, flags: int = 1):
+def controls_message(motors: Sequence[float], mode: int = 129, flags: int = 1) -> Any:
     packed = dialect.MAVLink_hil_actuator_controls_message(
         7_000, [*motors, *[0.0] * (16 - len(motors))], mode, flags
     ).pack(dialect.MAVLink(None))
@@ -38,7 +41,7 @@ def controls_message(motors, mode: int = 129, flags: int = 1):
     return message
 
 
-def test_an_inertial_sample_updates_nothing_else():
+def test_an_inertial_sample_updates_nothing_else() -> None:
     message = decoded(hil.SENSOR, hil.sensor(sample(), 1_004_000))
     assert message.get_type() == "HIL_SENSOR"
     assert (message.time_usec, message.id) == (1_004_000, 0)
@@ -49,7 +52,7 @@ def test_an_inertial_sample_updates_nothing_else():
     assert turning == pytest.approx((0.01, -0.02, 0.03))
 
 
-def test_inertial_sensors_saturate_like_the_16_bits_behind_them():
+def test_inertial_sensors_saturate_like_the_16_bits_behind_them() -> None:
     hard = SensorSample(1, np.array([0.0, 500.0, -240.0]), np.array([40.0, 0, -40.0]), 1.0, BATTERY)
     message = decoded(hil.SENSOR, hil.sensor(hard, 1))
     # PX4 counts in g/2048 and 2000/32768 deg/s.
@@ -59,13 +62,13 @@ def test_inertial_sensors_saturate_like_the_16_bits_behind_them():
     assert turns == pytest.approx([32_767, -32_767], abs=0.01)
 
 
-def test_compass_in_gauss_is_flagged():
+def test_compass_in_gauss_is_flagged() -> None:
     message = decoded(hil.SENSOR, hil.sensor(sample(mag=np.array([0.21, 0.01, 0.43])), 1))
     assert message.fields_updated == 0b111_111_111
     assert (message.xmag, message.ymag, message.zmag) == pytest.approx((0.21, 0.01, 0.43))
 
 
-def test_barometer_has_pressure_altitude_and_temperature():
+def test_barometer_has_pressure_altitude_and_temperature() -> None:
     # The standard atmosphere's table: 954.61 hPa at 500 m.
     message = decoded(hil.SENSOR, hil.sensor(sample(pressure_hpa=954.61), 1))
     assert message.fields_updated == 0b1_1010_0011_1111
@@ -75,7 +78,7 @@ def test_barometer_has_pressure_altitude_and_temperature():
     assert message.diff_pressure == 0.0
 
 
-def test_a_fix_in_the_units_of_the_message():
+def test_a_fix_in_the_units_of_the_message() -> None:
     fix = GpsFix(
         Geodetic(47.3977421, -8.5455941, 488.123), np.array([3.0, -4.0, -1.5]), 0.9, 1.8, 12
     )
@@ -100,18 +103,18 @@ def test_a_fix_in_the_units_of_the_message():
         ((-1.0, 0.0, 0.0), 18_000),
     ],
 )
-def test_course_over_ground(velocity, course):
+def test_course_over_ground(velocity: Vec, course: int) -> None:
     fix = GpsFix(HOME, np.array(velocity), 1.0, 1.0, 12)
     assert decoded(hil.GPS, hil.gps(fix, 1)).cog == course
 
 
-def test_what_does_not_fit_is_clamped():
+def test_what_does_not_fit_is_clamped() -> None:
     fix = GpsFix(HOME, np.array([400.0, -400.0, 0.0]), 1e4, math.inf, 12)
     message = decoded(hil.GPS, hil.gps(fix, 1))
     assert (message.vn, message.ve, message.eph, message.epv) == (32_767, -32_768, 65_535, 65_535)
 
 
-def test_the_true_state():
+def test_the_true_state() -> None:
     half = math.sqrt(0.5)
     truth = Truth(
         1,
@@ -131,7 +134,7 @@ def test_the_true_state():
     assert (message.vx, message.vy, message.vz) == (100, -200, 25)
 
 
-def test_a_metre_north_and_east_on_the_globe():
+def test_a_metre_north_and_east_on_the_globe() -> None:
     truth = Truth(
         1, np.array([1.0, 1.0, 0.0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0.0, 1.0
     )
@@ -141,35 +144,35 @@ def test_a_metre_north_and_east_on_the_globe():
     assert message.lon - 85_455_940 == round(89.93 / math.cos(math.radians(47.397743)))
 
 
-def test_motor_commands_while_armed():
+def test_motor_commands_while_armed() -> None:
     controls = hil.controls(controls_message([0.1, 0.2, 0.3, 1.0]), 42)
     assert (controls.time_us, controls.armed) == (42, True)
     assert controls.motors == pytest.approx((0.1, 0.2, 0.3, 1.0))
 
 
-def test_rounding_is_clamped():
+def test_rounding_is_clamped() -> None:
     controls = hil.controls(controls_message([-1e-4, 1.0005, 0.0, 0.5]), 1)
     assert controls.motors == (0.0, 1.0, 0.0, 0.5)
 
 
-def test_disarmed_motors_stand_still_whatever_is_commanded():
+def test_disarmed_motors_stand_still_whatever_is_commanded() -> None:
     controls = hil.controls(controls_message([0.5, math.nan, -1.0, 0.5], mode=1), 1)
     assert (controls.motors, controls.armed) == ((0.0, 0.0, 0.0, 0.0), False)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, -0.5, 1.5])
-def test_a_command_that_is_no_motors_is_named(value):
+def test_a_command_that_is_no_motors_is_named(value: float) -> None:
     with pytest.raises(hil.ControlsError, match=r"controls\[2\] = .*0\.\.1"):
         hil.controls(controls_message([0.5, 0.5, value, 0.5]), 1)
 
 
-def test_flags_and_mode():
+def test_flags_and_mode() -> None:
     assert hil.lockstep(controls_message([0.0], flags=1))
     assert not hil.lockstep(controls_message([0.0], flags=0))
     assert hil.armed(controls_message([0.0], mode=129))
     assert not hil.armed(controls_message([0.0], mode=1))
 
 
-def test_layouts_take_every_value_the_plant_can_have():
+def test_layouts_take_every_value_the_plant_can_have() -> None:
     big = sample(mag=np.full(3, 9.9), pressure_hpa=1100.0)
     assert len(hil.SENSOR.payload(hil.sensor(big, 2**60))) <= struct.calcsize("<Q13fIB")

@@ -113,12 +113,13 @@ def test_a_board_behind_a_uart_is_rebooted_though_it_does_not_vanish(
 
 
 def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
-    router: Router, peer: HitlPeer
+    router: Router, peer: HitlPeer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def beat(*_: object) -> None:
+        peer.say(Encoder().pack(dialect.MAVLink_heartbeat_message(2, 12, 29 | 32 | 128, 0, 4, 3)))
+
     peer.board.armed = True
-    peer.board.idle = lambda *_: peer.say(
-        Encoder().pack(dialect.MAVLink_heartbeat_message(2, 12, 29 | 32 | 128, 0, 4, 3))
-    )
+    monkeypatch.setattr(peer.board, "idle", beat)
     bridge = HitlBridge(router, peer.device, reboot_s=2.0)
     with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
         bridge.wait_connected(PATIENCE_S, alive)

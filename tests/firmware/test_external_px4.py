@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.process.firmware_process import FirmwareProcess
 from firmware_sim.external.px4.program import find_px4
@@ -37,35 +40,45 @@ def fine() -> None:
 class Flown:
     """A bridge as a flight controller. Implements `FlightController`."""
 
+    on_message: Callable[[Message], None] | None = None
     internals = None
-    on_message = None
     flight = Flight()
 
     def __init__(self, bridge: Px4Bridge) -> None:
         self.bridge = bridge
         self.rate_hz = bridge.rate_hz
         self.use_truth, self.close = bridge.use_truth, bridge.close
-        self.controls: ActuatorControls | None = None
+        self.last: ActuatorControls | None = None
+
+    @property
+    def controls(self) -> ActuatorControls:
+        assert self.last is not None, "no tick yet"
+        return self.last
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        self.controls = self.bridge.step(sample)
-        return self.controls
+        self.last = self.bridge.step(sample)
+        return self.last
 
 
 class Scene:
     """Our vehicle on the ground, its motors in the hands of a peer."""
 
     def __init__(self, bridge: Px4Bridge, peer: Px4Peer | None, start_us: int) -> None:
-        self.bridge, self.peer = bridge, peer
+        self.bridge, self._peer = bridge, peer
         self.controller = Flown(bridge)
         setup = EpisodeSetup(quad(), None, 1)
         self.sim = Simulation(setup, start_us=start_us, clock=SimClock(), autopilot=self.controller)
+
+    @property
+    def peer(self) -> Px4Peer:
+        assert self._peer is not None, "a scene without one"
+        return self._peer
 
     def fly(self, seconds: float) -> None:
         for _ in range(round(seconds * 250)):
             self.sim.tick()
 
-    def until(self, met, limit_s: float) -> None:
+    def until(self, met: Callable[[], bool], limit_s: float) -> None:
         for _ in range(round(limit_s * 250)):
             if met():
                 return
@@ -83,7 +96,7 @@ def peer_ports(simulator: int) -> Ports:
 
 
 @contextmanager
-def listening(**settings) -> Iterator[Px4Bridge]:
+def listening(**settings: Any) -> Iterator[Px4Bridge]:
     bridge = Px4Bridge(0, **{**PATIENT, **settings})
     try:
         yield bridge
@@ -93,7 +106,11 @@ def listening(**settings) -> Iterator[Px4Bridge]:
 
 @contextmanager
 def scene(
-    *, start_us: int = TICK_US, settings=None, alive=fine, **faults: float
+    *,
+    start_us: int = TICK_US,
+    settings: dict[str, Any] | None = None,
+    alive: Callable[[], None] = fine,
+    **faults: float,
 ) -> Iterator[Scene]:
     """Yield a flight with a peer that has these faults, `no_lockstep=0.0`."""
     with listening(**(settings or {})) as bridge:
@@ -127,9 +144,9 @@ def lost(flight: Scene, seconds: float = 10.0) -> str:
 # --- the order of messages
 
 
-def test_start_runs_free_and_then_every_sample_is_answered():
+def test_start_runs_free_and_then_every_sample_is_answered() -> None:
     with scene() as flight:
-        still = []
+        still: list[ActuatorControls] = []
         while flight.bridge.time_us == 0:
             flight.sim.tick()
             still.append(flight.controller.controls)
@@ -145,14 +162,14 @@ def test_start_runs_free_and_then_every_sample_is_answered():
         assert flight.bridge.duplicates == 0
 
 
-def test_firmware_time_begins_anew_whatever_the_simulated_time():
+def test_firmware_time_begins_anew_whatever_the_simulated_time() -> None:
     with scene(start_us=3_600_000_000) as flight:
         flight.fly(1.0)
         heard = [m for m in flight.peer.heard if m.get_type() == "HIL_SENSOR"]
         assert [m.time_usec for m in heard[:3]] == [1_000_000, 1_004_000, 1_008_000]
 
 
-def test_slower_sensors_come_at_their_own_rates_and_the_truth_as_asked():
+def test_slower_sensors_come_at_their_own_rates_and_the_truth_as_asked() -> None:
     with scene() as flight:
         flight.until(lambda: flight.bridge.time_us > 0, 5.0)
         flight.peer.heard.clear()
@@ -175,7 +192,7 @@ def test_slower_sensors_come_at_their_own_rates_and_the_truth_as_asked():
         assert states[-1].alt == pytest.approx(489_400, abs=200)
 
 
-def test_takeoff_hover_and_landing():
+def test_takeoff_hover_and_landing() -> None:
     with scene() as flight:
         client = Client(flight.peer.ports.api)
         try:
@@ -232,7 +249,7 @@ class Wire:
         self.mav = dialect.MAVLink(None, 1, 1)
         self.us = EPOCH_US
 
-    def send(self, *messages) -> None:
+    def send(self, *messages: Any) -> None:
         self.socket.sendall(b"".join(m.pack(self.mav) for m in messages))
 
     def answer(self, us: int) -> None:
@@ -265,7 +282,7 @@ INTERVALS = [
 
 
 @pytest.mark.parametrize(("asked", "states"), INTERVALS)
-def test_how_often_the_truth_is_asked_for(asked, states):
+def test_how_often_the_truth_is_asked_for(asked: tuple[int, int, float], states: int) -> None:
     with listening() as bridge:
         wire = Wire(bridge.port)
         with wire.socket:
@@ -290,19 +307,19 @@ def test_how_often_the_truth_is_asked_for(asked, states):
 # --- faults
 
 
-def test_it_dies():
+def test_it_dies() -> None:
     with scene(die=0.5) as flight:
         text = lost(flight)
         assert "closed its connection" in text
         assert "at 1.5" in text
 
 
-def test_it_stalls():
+def test_it_stalls() -> None:
     with scene(stall=0.5, settings={"answer_s": 1.0}) as flight:
         assert "did not answer within 1 s, at 1." in lost(flight)
 
 
-def test_disarmed_it_may_leave_samples_unanswered():
+def test_disarmed_it_may_leave_samples_unanswered() -> None:
     """Real PX4 does, in Offboard on the ground without a setpoint: its time must go on."""
     with scene(idle=0.2) as flight:
         flight.until(lambda: flight.bridge.time_us > 0, 5.0)
@@ -313,7 +330,7 @@ def test_disarmed_it_may_leave_samples_unanswered():
         assert not flight.bridge.armed
 
 
-def test_whose_process_died_is_known_before_the_wait_is_over():
+def test_whose_process_died_is_known_before_the_wait_is_over() -> None:
     died: list[str] = []
 
     def alive() -> None:
@@ -327,47 +344,48 @@ def test_whose_process_died_is_known_before_the_wait_is_over():
             flight.fly(5.0)
 
 
-def test_it_restarts_in_the_air():
+def test_it_restarts_in_the_air() -> None:
     with scene(restart=0.5) as flight:
         assert "it ended, or restarted" in lost(flight)
 
 
-def test_garbage_instead_of_answers():
+def test_garbage_instead_of_answers() -> None:
     with scene(garbage=0.5) as flight:
         assert "are not MAVLink" in lost(flight)
 
 
-def test_some_noise_before_an_answer_is_survived():
+def test_some_noise_before_an_answer_is_survived() -> None:
     with scene(noise=0.5) as flight:
         flight.fly(2.0)
         assert flight.bridge.time_us > 2_900_000
 
 
-def test_times_that_have_passed():
+def test_times_that_have_passed() -> None:
     with scene(old=0.5) as flight:
         assert "went back in time from 1.496 s to 0.500 s" in lost(flight)
 
 
-def test_times_to_come():
+def test_times_to_come() -> None:
     with scene(future=0.5) as flight:
         assert "not sent yet: 2.500 s, at 1.500 s" in lost(flight)
 
 
-def test_a_second_answer_is_dropped():
+def test_a_second_answer_is_dropped() -> None:
     with scene(twice=0.5) as flight:
         flight.fly(1.5)
         assert flight.bridge.duplicates > 100
 
 
-def test_motors_commanded_while_disarmed_stand_still():
+def test_motors_commanded_while_disarmed_stand_still() -> None:
     with scene(spin=0.2) as flight:
         flight.fly(2.0)
         assert flight.controller.controls.motors == (0.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("fault", "said"), [("nan", "controls[1] = nan"), ("servo", "= -0.5")])
-def test_commands_that_are_no_motors(fault, said):
-    with scene(**{fault: 0.5}) as flight:
+def test_commands_that_are_no_motors(fault: str, said: str) -> None:
+    faults: dict[str, Any] = {fault: 0.5}
+    with scene(**faults) as flight:
         client = Client(flight.peer.ports.api)
         try:
             flight.until(client.ready, 20.0)
@@ -378,18 +396,18 @@ def test_commands_that_are_no_motors(fault, said):
         assert said in text
 
 
-def test_a_build_that_does_not_wait_is_refused():
+def test_a_build_that_does_not_wait_is_refused() -> None:
     with scene(no_lockstep=0.0) as flight, pytest.raises(FirmwareMissingError, match="lockstep"):
         flight.fly(2.0)
 
 
-def test_it_never_connects():
+def test_it_never_connects() -> None:
     said = r"did not connect .* PX4_SIM_MODEL"
     with listening() as bridge, pytest.raises(FirmwareMissingError, match=said):
         bridge.wait_connected(0.2, fine)
 
 
-def test_a_process_that_dies_before_it_connects():
+def test_a_process_that_dies_before_it_connects() -> None:
     def dead() -> None:
         raise FirmwareLostError("PX4 ended (exit status 255)")
 
@@ -397,7 +415,7 @@ def test_a_process_that_dies_before_it_connects():
         bridge.wait_connected(PATIENCE_S, dead)
 
 
-def test_it_connects_and_never_answers():
+def test_it_connects_and_never_answers() -> None:
     with listening(start_s=0.3) as bridge, socket.create_connection((LOOPBACK, bridge.port)):
         bridge.wait_connected(PATIENCE_S, fine)
         flight = Scene(bridge, None, TICK_US)
@@ -410,7 +428,7 @@ def test_it_connects_and_never_answers():
     assert bridge.unanswered <= 0.3 * 250 + 2
 
 
-def test_a_second_one_is_turned_away():
+def test_a_second_one_is_turned_away() -> None:
     with scene(die=1.0) as flight:
         flight.until(lambda: flight.bridge.time_us > 0, 5.0)
         with socket.create_connection((LOOPBACK, flight.bridge.port)) as second:
@@ -420,18 +438,18 @@ def test_a_second_one_is_turned_away():
         assert "1 other connections refused" in lost(flight)
 
 
-def test_a_taken_port_names_the_option():
+def test_a_taken_port_names_the_option() -> None:
     with listening() as bridge, pytest.raises(UsageError, match=r"taken .*--instance"):
         Px4Bridge(bridge.port)
 
 
 @pytest.mark.parametrize("port", [-1, 70_000])
-def test_a_port_that_is_none(port):
+def test_a_port_that_is_none(port: int) -> None:
     with pytest.raises(UsageError, match=r"--instance"):
         Px4Bridge(port)
 
 
-def test_the_port_is_free_again_at_once():
+def test_the_port_is_free_again_at_once() -> None:
     with listening() as bridge:
         port = bridge.port
         with socket.create_connection((LOOPBACK, port)):
@@ -443,7 +461,7 @@ def test_the_port_is_free_again_at_once():
 # --- the peer as a program, in PX4's place
 
 
-def test_a_program_started_like_px4_is_flown(tmp_path):
+def test_a_program_started_like_px4_is_flown(tmp_path: Path) -> None:
     warm_up(quad())  # compiled once, for both processes
     with listening() as bridge:
         ports = peer_ports(bridge.port)

@@ -234,7 +234,9 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
     end = RouterEnd(router)
 
     def wakes() -> bool:
-        return bool(select.select([end.fileno()], [], [], 0.0)[0])
+        number = end.fileno()
+        assert number is not None
+        return bool(select.select([number], [], [], 0.0)[0])
 
     router.attach(line, 10**6)
     assert not wakes()
@@ -251,7 +253,9 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
         assert data[7:10] == b"\0\0\0"
         assert address == (LOOPBACK, gcs_local)
         station.sendto(Encoder(255, 190).pack(HEARTBEAT), address)
-        assert select.select([end.fileno()], [], [], PATIENCE_S)[0]
+        number = end.fileno()
+        assert number is not None
+        assert select.select([number], [], [], PATIENCE_S)[0]
         end.receive()
     assert line.sent
     router.detach()

@@ -23,7 +23,8 @@ def rig() -> Rig:
 def test_arming(rig: Rig) -> None:
     result, _ = rig.command(400, 1)
     assert result == ACCEPTED
-    assert rig.autopilot.arming is Arming.ARMED
+    arming = rig.autopilot.arming
+    assert arming is Arming.ARMED
     assert rig.autopilot.commands == ["arm force=False"]
     rig.command(400, 1, 21196)
     rig.command(400, 0)
@@ -179,7 +180,7 @@ def test_a_command_to_all_components_is_ours(rig: Rig) -> None:
 
 
 def test_own_words_coming_back_are_ignored(rig: Rig) -> None:
-    echo = RawClient(rig.bench.onboard, ids=(1, 1))
+    echo = RawClient(rig.bench.memory, ids=(1, 1))
     echo.command(400, 1)
     echo.send(dialect.MAVLink_ping_message(1, 1, 0, 0))
     rig.bench.tick()

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.mavlink.endpoint import Address, MemoryEndpoint, UdpEndpoint
+from firmware_sim.mavlink.endpoint import Address, Endpoint, MemoryEndpoint, UdpEndpoint
 
 LOOPBACK = "127.0.0.1"
 FRAME = b"\xfd frame"
@@ -206,4 +206,5 @@ def test_memory_endpoint_is_two_queues() -> None:
     memory.send_streams([b"e", b"f"])
     assert memory.take() == [b"c", b"d", b"e", b"f"]
     assert memory.take() == []
-    assert memory.fileno() is None
+    endpoint: Endpoint = memory
+    assert endpoint.fileno() is None

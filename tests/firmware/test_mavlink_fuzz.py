@@ -114,7 +114,7 @@ def test_senseless_contents_addressed_to_us(name: str, body: bytes) -> None:
         assert message.target_system == 1
     bench = Bench()
     bench.run(0.2)
-    bench.onboard.inbox.append(_repack(kind, raw, mav))
+    bench.memory.inbox.append(_repack(kind, raw, mav))
     bench.tick()
     bench.tick()
     still_answers(bench, "onboard")
@@ -163,12 +163,12 @@ def test_damaged_frames(
 def test_the_same_bytes_twice_give_the_same_answers() -> None:
     def answers() -> list[bytes]:
         bench = Bench()
-        client = RawClient(bench.onboard)
+        client = RawClient(bench.memory)
         for i in range(50):
             client.command(512, float(i))
             client.send(dialect.MAVLink_param_request_read_message(1, 1, b"", i))
             bench.tick()
-        return bench.onboard.take()
+        return bench.memory.take()
 
     run: Callable[[], list[bytes]] = answers
     assert run() == run()

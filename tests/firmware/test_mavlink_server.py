@@ -77,7 +77,7 @@ def test_counters(rig: Rig) -> None:
     start = rig.bench.server.counters()["onboard"]
     rig.client.send(dialect.MAVLink_ping_message(1, 1, 0, 0))
     rig.client.send(dialect.MAVLink_rc_channels_message(0, *[0] * 20))
-    rig.bench.onboard.inbox.append(b"noise")
+    rig.bench.memory.inbox.append(b"noise")
     rig.bench.run(1.0)
     end = rig.bench.server.counters()["onboard"]
     assert end.rx - start.rx == 2

@@ -59,7 +59,7 @@ def flown() -> KinematicAutopilot:
 def newest(autopilot: KinematicAutopilot, name: str) -> Any:
     """Return the first message of that name that the onboard link sends."""
     bench = Bench(autopilot=autopilot)
-    client = RawClient(bench.onboard)
+    client = RawClient(bench.memory)
     client.command(
         dialect.MAV_CMD_REQUEST_MESSAGE, getattr(dialect, f"MAVLINK_MSG_ID_{name}"), 0, 0, 0, 0, 0
     )
@@ -73,7 +73,7 @@ def newest(autopilot: KinematicAutopilot, name: str) -> Any:
 
 def test_rates_are_exactly_those_of_a_real_px4() -> None:
     bench = Bench()
-    onboard, gcs = RawClient(bench.onboard), RawClient(bench.gcs)
+    onboard, gcs = RawClient(bench.memory), RawClient(bench.gcs)
     bench.run(10.0)
     onboard.count()
     gcs.count()
@@ -85,7 +85,7 @@ def test_rates_are_exactly_those_of_a_real_px4() -> None:
 
 def test_streams_start_with_a_heartbeat_in_the_first_tick_and_spread_out() -> None:
     bench = Bench()
-    client = RawClient(bench.onboard)
+    client = RawClient(bench.memory)
     per_tick = []
     for _ in range(250):
         bench.tick()
@@ -351,7 +351,7 @@ def test_setpoints_and_their_masks() -> None:
 def test_vibration_metrics_are_px4s() -> None:
     autopilot = flown()
     bench = Bench(autopilot=autopilot)
-    client = RawClient(bench.onboard)
+    client = RawClient(bench.memory)
     rng = np.random.default_rng(3)
     accels = rng.normal(size=(500, 3))
     gyros = rng.normal(size=(500, 3))
@@ -452,7 +452,7 @@ def test_nothing_is_claimed_before_it_is_known() -> None:
     autopilot = KinematicAutopilot()
     autopilot.ready_us = 10 * US_PER_S
     bench = Bench(autopilot=autopilot)
-    client = RawClient(bench.onboard)
+    client = RawClient(bench.memory)
     bench.run(3.0)
     counts = client.count()
     absent = {"LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "HOME_POSITION"}
@@ -462,7 +462,7 @@ def test_nothing_is_claimed_before_it_is_known() -> None:
 
 def test_the_origin_is_announced_once_on_every_link() -> None:
     bench = Bench()
-    links = [RawClient(bench.onboard), RawClient(bench.gcs)]
+    links = [RawClient(bench.memory), RawClient(bench.gcs)]
     bench.run(3.0)
     assert [len(link.received("GPS_GLOBAL_ORIGIN")) for link in links] == [1, 1]
 
@@ -471,7 +471,7 @@ def test_the_origin_is_announced_once_on_every_link() -> None:
 def test_a_diverged_estimate_silences_no_heartbeat(bad: float) -> None:
     autopilot = flown()
     bench = Bench(autopilot=autopilot)
-    client = RawClient(bench.onboard)
+    client = RawClient(bench.memory)
     autopilot.arming = Arming.ARMED
     autopilot.mode = Mode.HOLD
     autopilot.frozen = True

@@ -33,10 +33,10 @@ def frame(sequence: int) -> bytes:
 
 def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) -> None:
     bench = Bench()
-    client, station = RawClient(bench.onboard), RawClient(bench.gcs)
+    client, station = RawClient(bench.memory), RawClient(bench.gcs)
     bench.run(0.5)
     path = tmp_path / "flight-001.tlog"
-    bench.onboard.take()
+    bench.memory.take()
     with TlogWriter(path, BOOT_UNIX_US) as tlog:
         bench.server.log_to(tlog)
         client.send(dialect.MAVLink_ping_message(1, 77, 0, 0))
@@ -44,7 +44,7 @@ def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) ->
         bench.run(2.0)
         bench.server.log_to(None)
         assert not path.exists()
-    sent = bench.onboard.take()
+    sent = bench.memory.take()
     bench.run(0.1)
 
     logged = read(path)

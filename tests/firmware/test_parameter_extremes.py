@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -33,14 +33,14 @@ def fly_on(rig: Rig, seconds: float) -> None:
     step = rig.ap.step
     commands: list[ActuatorControls] = []
 
-    def noted(sample):
+    def noted(sample: SensorSample) -> ActuatorControls:
         commands.append(step(sample))
         return commands[-1]
 
-    rig.ap.step = noted  # type: ignore[method-assign]
+    rig.step_through(noted)
     server = MavlinkServer([onboard_link(MemoryEndpoint())], rig.ap, boot_unix_us=0)
     rig.run(seconds, lambda: server.send(rig.sim.time_us))
-    rig.ap.step = step  # type: ignore[method-assign]
+    rig.step_through(step)
     motors = np.array([c.motors for c in commands])
     assert np.isfinite(motors).all()
     assert motors.min() >= 0.0
@@ -60,7 +60,7 @@ AT_ONCE = {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
 
 
 @pytest.mark.parametrize("group", GROUPS, ids=[f"{g[0].name}-{g[-1].name}" for g in GROUPS])
-def test_each_parameter_at_the_ends_of_its_range(group):
+def test_each_parameter_at_the_ends_of_its_range(group: list[ParameterSpec]) -> None:
     with flight(parameters=AT_ONCE) as rig:
         rig.boot()
         cases = [(spec, value) for spec in group for value in extremes(spec)]
@@ -80,7 +80,7 @@ def test_each_parameter_at_the_ends_of_its_range(group):
 
 @pytest.mark.parametrize("mode", [Mode.HOLD, Mode.LAND, Mode.RETURN, Mode.POSITION, Mode.TAKEOFF])
 @pytest.mark.parametrize("end", ["low", "high"])
-def test_all_parameters_at_one_end_in_every_mode(mode, end):
+def test_all_parameters_at_one_end_in_every_mode(mode: Mode, end: str) -> None:
     with flight() as rig:
         rig.take_off(2.0, settle_s=0.0)
         for spec in SPECS:
@@ -96,7 +96,7 @@ def test_all_parameters_at_one_end_in_every_mode(mode, end):
     suppress_health_check=list(HealthCheck),
 )
 @given(st.data())
-def test_several_parameters_at_once_in_flight(data):
+def test_several_parameters_at_once_in_flight(data: st.DataObject) -> None:
     with flight() as rig:
         rig.take_off(2.0, settle_s=0.0)
         rig.go_offboard(FORWARD)
@@ -105,7 +105,7 @@ def test_several_parameters_at_once_in_flight(data):
         fly_on(rig, 1.0)
 
 
-def test_a_gyro_filter_made_much_faster_in_flight_does_not_disturb_it():
+def test_a_gyro_filter_made_much_faster_in_flight_does_not_disturb_it() -> None:
     with flight() as rig:
         rig.ap.parameters.set("IMU_GYRO_CUTOFF", 5.0)
         rig.take_off(3.0)
@@ -119,7 +119,7 @@ def test_a_gyro_filter_made_much_faster_in_flight_does_not_disturb_it():
 
 
 @pytest.mark.parametrize("far_m", [1e-160, 5e-324])
-def test_arms_without_any_length_on_one_axis_fly(far_m):
+def test_arms_without_any_length_on_one_axis_fly(far_m: float) -> None:
     """Set before the flight, as by a vehicle's profile: all four rotors in a line."""
     line = {f"CA_ROTOR{i}_PX": far_m for i in range(4)}
     line |= {f"CA_ROTOR{i}_PY": 100.0 for i in range(4)}

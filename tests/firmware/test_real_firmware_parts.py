@@ -111,7 +111,8 @@ def test_a_program_does_not_outlive_a_holder_that_is_killed(tmp_path: Path) -> N
     finally:
         holder.send_signal(signal.SIGKILL)
         holder.wait()
-        holder.stdout.close()
+        if holder.stdout is not None:
+            holder.stdout.close()
     wait_until(lambda: not is_running(pid), "the program to end", 30.0)
 
 
@@ -193,7 +194,8 @@ def ardupilot(vehicle: VehicleProfile) -> ArduPilotAirframe:
 
 
 def ardupilot_set_right() -> dict[str, int | float]:
-    return {f"SERVO{i}_FUNCTION": 32 + i for i in range(1, 5)} | {"FRAME_CLASS": 1, "FRAME_TYPE": 1}
+    functions = {f"SERVO{i}_FUNCTION": 32 + i for i in range(1, 5)}
+    return {**functions, "FRAME_CLASS": 1, "FRAME_TYPE": 1}
 
 
 def test_a_wrong_ardupilot_frame_is_told() -> None:

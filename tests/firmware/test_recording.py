@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import TICK_US
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import MAX_LAG_US, Pacing, Unpaced, WallPacing
-from firmware_sim.simulation import EpisodeSetup
+from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import quad, velocity_setpoint
 
 TICKS_A_MINUTE = 60 * 250
@@ -36,11 +37,22 @@ def firmware(pacing: Pacing, *, recording: bool) -> Firmware:
     return Firmware(BuiltinFlightStack(server), None, pacing, recording=recording)
 
 
+def simulated(flown: Firmware) -> Simulation:
+    assert flown.simulation is not None
+    return flown.simulation
+
+
+def autopilot_of(flown: Firmware) -> BuiltinAutopilot:
+    autopilot = simulated(flown).autopilot
+    assert isinstance(autopilot, BuiltinAutopilot)
+    return autopilot
+
+
 def fly(flown: Firmware, ticks: int, setpoint: Setpoint | None = None) -> None:
     """Fly on; with a setpoint, streamed at 25 Hz."""
     for i in range(ticks):
         if setpoint is not None and i % 10 == 0:
-            flown.simulation.autopilot.offer_setpoint(setpoint, flown.clock.time_us())
+            autopilot_of(flown).offer_setpoint(setpoint, flown.clock.time_us())
         flown.step()
 
 
@@ -49,7 +61,7 @@ def blocks_kept_by_two_minutes(*, recording: bool) -> int:
     flown = firmware(Unpaced(), recording=recording)
     circle = velocity_setpoint(1.0, 0.0, -0.01, yaw=float("nan"), yaw_rate=0.3)
     flown.load(EpisodeSetup(quad(), None, 1), None, 0)
-    autopilot = flown.simulation.autopilot
+    autopilot = autopilot_of(flown)
     fly(flown, 4 * 250)
     assert autopilot.arm(force=False) == 0
     autopilot.takeoff(5.0)
@@ -66,18 +78,18 @@ def blocks_kept_by_two_minutes(*, recording: bool) -> int:
     return kept
 
 
-def test_memory_stays_bounded_where_nobody_collects_the_record():
+def test_memory_stays_bounded_where_nobody_collects_the_record() -> None:
     assert blocks_kept_by_two_minutes(recording=False) < 200
 
 
-def test_the_same_flight_recorded_keeps_its_samples():
+def test_the_same_flight_recorded_keeps_its_samples() -> None:
     assert blocks_kept_by_two_minutes(recording=True) > 6_000
 
 
-def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten():
+def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten() -> None:
     flown = firmware(Unpaced(), recording=False)
     flown.load(EpisodeSetup(quad(), None, 1), None, 0)
-    autopilot = flown.simulation.autopilot
+    autopilot = autopilot_of(flown)
     fly(flown, 4 * 250)
     autopilot.arm(force=False)
     autopilot.takeoff(3.0)
@@ -86,17 +98,17 @@ def test_collisions_of_a_flight_that_is_not_recorded_are_forgotten():
     fell = 0
     for _ in range(3 * 250):
         flown.step()
-        fell += len(flown.simulation.plant.collisions)
+        fell += len(simulated(flown).plant.collisions)
     assert fell >= 1, "it fell from 3 m"
-    assert flown.simulation.plant.collisions == []
+    assert simulated(flown).plant.collisions == []
     flown.close()
 
 
-def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path):
+def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path) -> None:
     """Against the pacing's own account, at a hundred times real time: 10 ms are a second."""
     flown = firmware(WallPacing(100.0), recording=True)
     flown.load(EpisodeSetup(quad(), None, 1), None, 0)
-    first_us = flown.simulation.time_us
+    first_us = simulated(flown).time_us
     for pause_s in (0.0, 0.03, 0.0):
         time.sleep(pause_s)
         flown.step()
@@ -115,13 +127,13 @@ def test_what_the_host_gave_up_is_saved_with_the_ticks(tmp_path: Path):
 
 
 @pytest.mark.parametrize("recording", [True, False])
-def test_an_unpaced_flight_has_no_late_ticks(tmp_path: Path, recording: bool):
+def test_an_unpaced_flight_has_no_late_ticks(tmp_path: Path, recording: bool) -> None:
     flown = firmware(Unpaced(), recording=recording)
     flown.load(EpisodeSetup(quad(), None, 1), None, 0)
     fly(flown, 20)
-    assert (flown.simulation.recorder is not None) is recording
+    assert (simulated(flown).recorder is not None) is recording
     if recording:
-        arrays = flown.simulation.arrays()
+        arrays = simulated(flown).arrays()
         assert arrays["tick/lateness_us"].shape == (0,)
         assert arrays["tick/slips_us"].shape == (0, 2)
     flown.close()

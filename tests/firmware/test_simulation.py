@@ -23,6 +23,8 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.model import WindSettings
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
@@ -51,13 +53,13 @@ def digest_of_a_flight(seed: int) -> str:
     rig = Rig(seed, arena=arena("crowded"), wind=GUSTY)
     step = rig.ap.step
 
-    def noted(sample):
+    def noted(sample: SensorSample) -> ActuatorControls:
         add(digest, sample)
         controls = step(sample)
         add(digest, controls)
         return controls
 
-    rig.ap.step = noted  # type: ignore[method-assign]
+    rig.step_through(noted)
     frames: list[Frame] = []
     rig.take_off(2.5, settle_s=0.0)
     rig.go_offboard(velocity_setpoint(5.0, 1.0, 0.0))
@@ -203,14 +205,16 @@ def test_what_is_recorded_is_what_was() -> None:
 def test_on_the_ground_a_setpoint_is_taken_in_the_tick_after_it() -> None:
     clock = SimClock()
     simulation = Simulation(EpisodeSetup(quad(), None, 1), start_us=0, clock=clock)
+    autopilot = simulation.autopilot
+    assert isinstance(autopilot, BuiltinAutopilot)
     for i in range(6):
         if i in (1, 3):
             setpoint = velocity_setpoint(float(i), 0.0, 0.0)._replace(wire=(i, 0.0, 0.0, 0.0))
-            simulation.autopilot.offer_setpoint(setpoint, clock.time_us())
-            simulation.autopilot.offer_setpoint(setpoint, clock.time_us() + 1)
+            autopilot.offer_setpoint(setpoint, clock.time_us())
+            autopilot.offer_setpoint(setpoint, clock.time_us() + 1)
         clock.advance(TICK_US)
         simulation.tick()
-    simulation.autopilot.offer_setpoint(velocity_setpoint(9.0, 0.0, 0.0), clock.time_us())
+    autopilot.offer_setpoint(velocity_setpoint(9.0, 0.0, 0.0), clock.time_us())
     arrays = simulation.arrays()
     simulation.close()
     assert arrays["setpoints/accepted_us"].tolist() == [4000, 4001, 12_000, 12_001]
@@ -221,7 +225,7 @@ def test_on_the_ground_a_setpoint_is_taken_in_the_tick_after_it() -> None:
 @pytest.mark.parametrize("ticks", [100, 101])
 def test_in_flight_a_setpoint_is_stamped_when_the_motors_first_differ(ticks: int) -> None:
     """Against the same flight without it: whichever of two ticks the position loop runs in."""
-    motors: list[list[tuple[float, ...]]] = []
+    motors: list[list[tuple[float, float, float, float]]] = []
     flown: list[int] = []
     for north in (0.0, 2.0):
         with flight(3) as rig:
@@ -230,13 +234,15 @@ def test_in_flight_a_setpoint_is_stamped_when_the_motors_first_differ(ticks: int
             rig.stream(None)
             for _ in range(ticks):
                 rig.tick()
-            assert not rig.sim.recorder.setpoints.pending
+            recorder = rig.sim.recorder
+            assert recorder is not None
+            assert not recorder.setpoints.pending
             rig.ap.offer_setpoint(velocity_setpoint(north, 0.0, 0.0), rig.sim.time_us)
             rows, pending = [], []
             for _ in range(10):
                 rig.tick()
                 rows.append(rig.ap.state().motors)
-                pending.append(rig.sim.recorder.setpoints.pending)
+                pending.append(recorder.setpoints.pending)
             motors.append(rows)
             flown.append(pending.index(False))
     differ = [a != b for a, b in zip(*motors, strict=True)].index(True)

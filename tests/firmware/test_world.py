@@ -109,8 +109,8 @@ class PlainWorld:
             self.names[body] = f"{'moving' if moving else 'static'}-{kind}-{i}"
             if moving:
                 self.movers.append((body, i, turn))
-        half = (0.5 * BODY.width_m, 0.5 * BODY.width_m, 0.5 * BODY.height_m)
-        box = self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
+        size = (0.5 * BODY.width_m, 0.5 * BODY.width_m, 0.5 * BODY.height_m)
+        box = self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=size)
         self.vehicle = self.client.createMultiBody(BODY.mass_kg, box, basePosition=(0, 0, 50))
         inertia = (BODY.inertia_xx_kg_m2, BODY.inertia_yy_kg_m2, BODY.inertia_zz_kg_m2)
         self.client.changeDynamics(

@@ -169,8 +169,9 @@ class Manners:
             dialect.MAV_CMD_REQUEST_MESSAGE,
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
-            p = tuple(params)
-            return commands.ACTIONS[number](commands.Command(number, p), context)
+            a, b, c, d, e, f, g = params
+            command = commands.Command(number, (a, b, c, d, e, f, g))
+            return commands.ACTIONS[number](command, context)
         return Result.UNSUPPORTED
 
     def _setpoint(self, message: WireMessage) -> None:

@@ -123,8 +123,8 @@ class ArdupilotPeer:
 
 
 def _client(port: int) -> UdpEndpoint:
-    words = {"local_option": "local", "remote_option": "remote"}
-    return UdpEndpoint(("127.0.0.1", 0), ("127.0.0.1", port), **words)
+    here, there = ("127.0.0.1", 0), ("127.0.0.1", port)
+    return UdpEndpoint(here, there, local_option="local", remote_option="remote")
 
 
 def _defaults(paths: str) -> dict[str, float]:

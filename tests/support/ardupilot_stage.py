@@ -10,6 +10,7 @@ from typing import Any
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -21,8 +22,8 @@ from tests.support.ports import free_ports
 class BridgeOnly:
     """A flight controller that is nothing but its bridge. Implements `FlightController`."""
 
+    on_message: Callable[[Message], None] | None = None
     internals = None
-    on_message = None
 
     def __init__(self, bridge: ArdupilotBridge) -> None:
         self.rate_hz = bridge.rate_hz

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 import struct
+from collections.abc import Callable
 from typing import NamedTuple
 
 MAGIC = 18_458
@@ -44,8 +45,9 @@ def read_state(line: str) -> State | None:
             return None
         values.append(tuple(float(number) for number in found.groups()))
     sync = _behind(line, "", "no_time_sync")
-    (stamp,), *vectors = values
-    return State(stamp, *vectors, sync is not None and re.match(r"\s*0*[1-9]", sync) is not None)
+    (stamp,), gyro, accel, position, quaternion, velocity = values
+    no_time_sync = sync is not None and re.match(r"\s*0*[1-9]", sync) is not None
+    return State(stamp, gyro, accel, position, quaternion, velocity, no_time_sync)
 
 
 def _behind(line: str, section: str, key: str) -> str | None:
@@ -76,6 +78,8 @@ class JsonLink:
         self.resent = 0
         self.stalled_lines = 0
         """Lines that did not move time: less than 0, or 0.1 s and more."""
+        self.stop: Callable[[], bool] = lambda: False
+        """Whether to stop waiting; set by who runs it."""
         self._last_s = 0.0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(0.1)
@@ -119,10 +123,6 @@ class JsonLink:
             self.stalled_lines += 1
         self.frame_count += 1
         return state
-
-    def stop(self) -> bool:
-        """Whether to stop waiting; replaced by who runs it."""
-        return False
 
     def close(self) -> None:
         self._socket.close()

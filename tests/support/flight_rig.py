@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -15,8 +15,9 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Aircraft, WindSettings
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
-from firmware_sim.interfaces import Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 SETPOINT_US = 50_000
@@ -62,6 +63,7 @@ class Rig:
         )
         self.texts: list[tuple[int, str]] = []
         """Time [µs] and text of everything said so far."""
+        assert isinstance(self.sim.autopilot, BuiltinAutopilot)
         self.ap = self.sim.autopilot
         self.ap.on_message = lambda m: self.texts.append((self.sim.time_us, m.text))
         self._setpoint: Setpoint | None = None
@@ -93,6 +95,10 @@ class Rig:
             self.ap.offer_setpoint(self._setpoint, self.sim.time_us)
             self._next_us += SETPOINT_US
         self.sim.tick()
+
+    def step_through(self, step: Callable[[SensorSample], ActuatorControls]) -> None:
+        """Let the autopilot be stepped by this from now on, as a test that listens in does."""
+        self.ap.step = step  # type: ignore[method-assign, assignment]  # a test listens in
 
     def run(self, seconds: float, each: Callable[[], None] | None = None) -> None:
         """Fly on for some time, calling `each` after every tick."""
@@ -141,7 +147,7 @@ class Rig:
 
 
 @contextmanager
-def flight(seed: int = 0, **settings: Any):
+def flight(seed: int = 0, **settings: Any) -> Iterator[Rig]:
     """Make a Rig and release it afterwards."""
     rig = Rig(seed, **settings)
     try:

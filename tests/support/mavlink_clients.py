@@ -41,6 +41,12 @@ class Bench:
             boot_unix_us=BOOT_UNIX_US,
         )
 
+    @property
+    def memory(self) -> MemoryEndpoint:
+        """The onboard endpoint, where it is in memory."""
+        assert isinstance(self.onboard, MemoryEndpoint)
+        return self.onboard
+
     def tick(self) -> None:
         """Receive, step, send."""
         self.server.receive(self.autopilot.time_us)
@@ -102,7 +108,7 @@ class Rig:
     def __init__(self, autopilot: KinematicAutopilot | None = None) -> None:
         self.bench = Bench(autopilot=autopilot)
         self.autopilot = self.bench.autopilot
-        self.client = RawClient(self.bench.onboard)
+        self.client = RawClient(self.bench.memory)
         self.station = RawClient(self.bench.gcs)
         self.bench.run(0.2)
         self.client.received()

@@ -29,9 +29,9 @@ class Nowhere(gymnasium.Env[dict[str, np.ndarray], Any]):
     """An environment that only has spaces: a model cannot be made without one."""
 
     def __init__(self, spec: ObservationSpec, action_space: spaces.Space[Any]) -> None:
-        self.observation_space = spaces.Dict(
+        self.observation_space: spaces.Space[Any] = spaces.Dict(
             {
-                key: spaces.Box(box.low, box.high, box.shape, box.dtype)  # type: ignore[arg-type]
+                key: spaces.Box(box.low, box.high, box.shape, box.dtype)
                 for key, box in boxes(spec).items()
             }
         )

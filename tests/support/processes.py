@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,11 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
         assert time.monotonic() < deadline, f"timed out waiting for {what}"
         time.sleep(0.01)
     return value
+
+
+def has_ended(pid: int) -> bool:
+    """Return whether a process is gone, as a condition to wait for."""
+    return not is_running(pid)
 
 
 def state_of(pid: int) -> str:
@@ -140,7 +146,7 @@ class Running:
     def no_child_left(self) -> None:
         """Fail when a child outlives it by more than a moment."""
         for name, pid in self.children.items():
-            wait_until(lambda pid=pid: not is_running(pid), f"{name} to end", 30.0)
+            wait_until(partial(has_ended, pid), f"{name} to end", 30.0)
 
     def end(self) -> None:
         """Kill what is left: this process and the children seen."""

@@ -229,7 +229,9 @@ class Flying:
 
     def _faulty(self, kind: str, now_us: int) -> bool:
         at_s = self.peer.faults.get(kind)
-        return at_s is not None and now_us - self.first_us >= at_s * 1e6
+        if at_s is None or self.first_us is None:
+            return False
+        return now_us - self.first_us >= at_s * 1e6
 
     def _step(self, message: Any) -> None:
         now_us = message.time_usec
