@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from airl_mav.arena.draw import draw_arena, save_png
 from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
+from airl_mav.arena.placement import place_all
 from airl_mav.arena.zones import zone_of, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
@@ -349,11 +351,13 @@ def test_movers_are_where_their_tours_say() -> None:
 def test_too_dense_is_refused_with_counts_after_bounded_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    layouts = []
-    original = generate_module.place_all
-    monkeypatch.setattr(
-        generate_module, "place_all", lambda *args: (layouts.append(1), original(*args))[1]
-    )
+    layouts: list[int] = []
+
+    def counted(*args: Any) -> Any:
+        layouts.append(1)
+        return place_all(*args)
+
+    monkeypatch.setattr(generate_module, "place_all", counted)
     with pytest.raises(UsageError) as caught:
         make(spec_of(static={"count": [150, 150]}), 3)
     message = str(caught.value)
@@ -388,7 +392,7 @@ def test_too_dense_is_refused_with_counts_after_bounded_work(
         ),
     ],
 )
-def test_impossible_requests_say_why(knobs: dict, width: float, message: str) -> None:
+def test_impossible_requests_say_why(knobs: dict[str, Any], width: float, message: str) -> None:
     with pytest.raises(UsageError) as caught:
         make(spec_of(**knobs), 0, width=width)
     assert message in str(caught.value)
@@ -534,7 +538,7 @@ def test_picture_shows_what_is_there() -> None:
     FigureCanvasAgg(figure)
     ax = figure.add_subplot()
     draw_arena(arena, ax, 5_000_000, goal_radius_m=3)
-    lines = {line.get_label(): line.get_xydata()[0] for line in ax.lines}
+    lines = {line.get_label(): np.asarray(line.get_xydata())[0] for line in ax.lines}
     np.testing.assert_allclose(lines["goal"], arena.goal[::-1])
     np.testing.assert_allclose(lines["start, heading north"], [0, 0])
     drawn = {

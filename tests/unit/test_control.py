@@ -26,6 +26,7 @@ from airl_mav.control.velocity import (
 )
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, wrap_pi
+from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.autopilot.parameter_store import Parameters
 
 GAINS = Gains.from_parameters(Parameters({"MPC_THR_HOVER": 0.52}).__getitem__)
@@ -99,7 +100,7 @@ def test_unknown_arms_are_equal_ones() -> None:
 
 
 @given(st.floats(0.2, 0.8), st.tuples(*[st.floats(-0.25, 0.25)] * 3))
-def test_inside_the_limits_the_allocation_is_exact(thrust, torque) -> None:
+def test_inside_the_limits_the_allocation_is_exact(thrust: float, torque: Vec) -> None:
     expected = ALLOCATION @ [*torque, thrust]
     # PX4 fits roll, pitch and thrust into the limits first, yaw after them.
     without_yaw = ALLOCATION @ [torque[0], torque[1], 0.0, thrust]
@@ -112,7 +113,7 @@ def test_inside_the_limits_the_allocation_is_exact(thrust, torque) -> None:
 
 
 @given(st.floats(-0.5, 1.5), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
-def test_outputs_are_commands(thrust, torque) -> None:
+def test_outputs_are_commands(thrust: float, torque: Vec) -> None:
     motors, missing = mix(thrust, torque, GAINS)
     assert all(0.0 <= m <= 1.0 for m in motors)
     delivered = EFFECT @ motors
@@ -120,7 +121,7 @@ def test_outputs_are_commands(thrust, torque) -> None:
 
 
 @given(st.floats(0.0, 1.0), st.tuples(*[st.floats(-2.0, 2.0)] * 3))
-def test_thrust_is_lowered_never_raised(thrust, torque) -> None:
+def test_thrust_is_lowered_never_raised(thrust: float, torque: Vec) -> None:
     motors, _ = mix(thrust, torque, GAINS)
     asked_without_limits = ALLOCATION @ [*torque, thrust]
     # Clipping the last bit of a motor at 0 may add lift that nobody asked for, but no more than
@@ -135,7 +136,9 @@ def test_thrust_is_lowered_never_raised(thrust, torque) -> None:
     st.floats(-0.12, 0.12),
     st.floats(-3.0, 3.0),
 )
-def test_yaw_never_costs_roll_or_pitch(thrust, roll, pitch, yaw) -> None:
+def test_yaw_never_costs_roll_or_pitch(
+    thrust: float, roll: float, pitch: float, yaw: float
+) -> None:
     """Around half thrust yaw may fill the range from both ends; PX4 then clips a little."""
     motors, _ = mix(thrust, (roll, pitch, yaw), GAINS)
     delivered = EFFECT @ motors
@@ -145,7 +148,7 @@ def test_yaw_never_costs_roll_or_pitch(thrust, roll, pitch, yaw) -> None:
 
 
 @given(st.floats(0.75, 1.0), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
-def test_roll_and_pitch_are_kept_at_full_thrust(thrust, roll, pitch) -> None:
+def test_roll_and_pitch_are_kept_at_full_thrust(thrust: float, roll: float, pitch: float) -> None:
     motors, missing = mix(thrust, (roll, pitch, 0.0), GAINS)
     delivered = EFFECT @ motors
     np.testing.assert_allclose(delivered[:2], [roll, pitch], atol=1e-9)
@@ -161,7 +164,7 @@ def test_some_yaw_is_left_at_full_thrust() -> None:
     assert delivered[3] == pytest.approx(0.85, abs=0.01)
 
 
-def px4_mix(thrust: float, torque: tuple[float, float, float]) -> np.ndarray:
+def px4_mix(thrust: float, torque: Vec) -> np.ndarray:
     """ControlAllocationSequentialDesaturation::mixAirmodeDisabled of PX4 1.16, from its source.
 
     There thrust points down: its column is -1 and "increase only" means less lift.
@@ -201,7 +204,7 @@ def px4_mix(thrust: float, torque: tuple[float, float, float]) -> np.ndarray:
 
 
 @given(st.floats(-0.2, 1.3), st.tuples(*[st.floats(-3.0, 3.0)] * 3))
-def test_saturation_is_px4s(thrust, torque) -> None:
+def test_saturation_is_px4s(thrust: float, torque: Vec) -> None:
     np.testing.assert_allclose(mix(thrust, torque, GAINS)[0], px4_mix(thrust, torque), atol=1e-9)
 
 
@@ -209,7 +212,7 @@ def test_saturation_is_px4s(thrust, torque) -> None:
 
 
 @given(triples, angles)
-def test_thrust_axis_and_heading_are_as_asked(thrust, yaw) -> None:
+def test_thrust_axis_and_heading_are_as_asked(thrust: Vec, yaw: float) -> None:
     thrust = (thrust[0], thrust[1], -abs(thrust[2]))
     assume(np.linalg.norm(thrust) > 0.01)
     # Upwards thrust, no closer than 2 degrees to the horizon: there heading loses its meaning.
@@ -221,7 +224,7 @@ def test_thrust_axis_and_heading_are_as_asked(thrust, yaw) -> None:
 
 
 @given(triples, angles)
-def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust, yaw) -> None:
+def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust: Vec, yaw: float) -> None:
     thrust = (thrust[0], thrust[1], abs(thrust[2]))
     assume(thrust[2] > 0.03 * np.linalg.norm(thrust) > 1e-4)
     turn = scipy_of(attitude_setpoint(thrust, yaw))
@@ -231,7 +234,7 @@ def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust, yaw) -> No
 
 
 @given(angles)
-def test_no_thrust_is_level(yaw) -> None:
+def test_no_thrust_is_level(yaw: float) -> None:
     turn = scipy_of(attitude_setpoint(ZERO, yaw))
     np.testing.assert_allclose(turn.apply([0.0, 0.0, 1.0]), [0, 0, 1], atol=1e-12)
     assert abs(wrap_pi(turn.as_euler("ZYX")[0] - yaw)) < 1e-9
@@ -241,14 +244,14 @@ def test_no_thrust_is_level(yaw) -> None:
 
 
 @given(quaternions)
-def test_no_error_no_rate(q) -> None:
+def test_no_error_no_rate(q: Quat) -> None:
     np.testing.assert_allclose(rate_setpoint(q, q, 0.0, GAINS), 0.0, atol=1e-6)
-    minus = tuple(-c for c in q)
+    minus = (-q[0], -q[1], -q[2], -q[3])
     np.testing.assert_allclose(rate_setpoint(q, minus, 0.0, GAINS), 0.0, atol=1e-6)
 
 
 @given(quaternions, quaternions)
-def test_rates_reduce_the_error(q, q_sp) -> None:
+def test_rates_reduce_the_error(q: Quat, q_sp: Quat) -> None:
     goal, now = scipy_of(q_sp), scipy_of(q)
     error = (now.inv() * goal).magnitude()
     assume(0.01 < error < 3.0)
@@ -262,7 +265,9 @@ def test_rates_reduce_the_error(q, q_sp) -> None:
 
 
 @given(st.tuples(*[st.floats(-0.3, 0.3)] * 2), quaternions)
-def test_small_tilt_errors_are_turned_back_proportionally(tilt, q) -> None:
+def test_small_tilt_errors_are_turned_back_proportionally(
+    tilt: tuple[float, float], q: Quat
+) -> None:
     error = Rotation.from_rotvec([*tilt, 0.0])
     goal = (scipy_of(q) * error).as_quat()
     rates = rate_setpoint(q, (goal[3], *goal[:3]), 0.0, GAINS)
@@ -271,7 +276,7 @@ def test_small_tilt_errors_are_turned_back_proportionally(tilt, q) -> None:
 
 
 @given(st.floats(-0.5, 0.5))
-def test_a_pure_heading_error_has_the_gain_of_mc_yaw_p(yaw) -> None:
+def test_a_pure_heading_error_has_the_gain_of_mc_yaw_p(yaw: float) -> None:
     q_sp = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
     w = GAINS.yaw_weight
     expected = GAINS.att_p_yaw / w * 2 * math.sin(w * yaw / 2)
@@ -282,13 +287,13 @@ def test_a_pure_heading_error_has_the_gain_of_mc_yaw_p(yaw) -> None:
 
 
 @given(quaternions, st.floats(-2.0, 2.0))
-def test_heading_rate_is_about_the_worlds_down_axis(q, rate) -> None:
+def test_heading_rate_is_about_the_worlds_down_axis(q: Quat, rate: float) -> None:
     expected = scipy_of(q).inv().apply([0.0, 0.0, rate])
     np.testing.assert_allclose(rate_setpoint(q, q, rate, GAINS), expected, atol=1e-6)
 
 
 @given(quaternions, quaternions, st.floats(-20.0, 20.0))
-def test_rates_stay_inside_their_limits(q, q_sp, ff) -> None:
+def test_rates_stay_inside_their_limits(q: Quat, q_sp: Quat, ff: float) -> None:
     rates = rate_setpoint(q, q_sp, ff, GAINS)
     assert all(math.isfinite(r) for r in rates)
     assert np.all(np.abs(rates) <= np.array([220.0, 220.0, 200.0]) * DEG + 1e-12)
@@ -303,22 +308,22 @@ def test_upside_down_turns_over() -> None:
 
 
 @given(triples, triples, triples)
-def test_velocity_limits(position, position_sp, velocity) -> None:
+def test_velocity_limits(position: Vec, position_sp: Vec, velocity: Vec) -> None:
     vx, vy, vz = velocity_setpoint(position, position_sp, velocity, GAINS)
     assert math.hypot(vx, vy) <= 12.0 + 1e-9
     assert -3.0 <= vz <= 1.5
 
 
 @given(triples, triples)
-def test_inside_the_limits_it_is_p_plus_feed_forward(position, error) -> None:
-    error = np.array(error) * 0.02
+def test_inside_the_limits_it_is_p_plus_feed_forward(position: Vec, error: Vec) -> None:
+    away = np.array(error) * 0.02
     velocity = np.array([1.0, -2.0, 0.3])
-    sp = velocity_setpoint(position, tuple(np.array(position) + error), tuple(velocity), GAINS)
-    np.testing.assert_allclose(sp, velocity + error * [0.95, 0.95, 1.0], atol=1e-9)
+    sp = velocity_setpoint(position, tuple(np.array(position) + away), tuple(velocity), GAINS)
+    np.testing.assert_allclose(sp, velocity + away * [0.95, 0.95, 1.0], atol=1e-9)
 
 
 @given(triples, triples)
-def test_position_comes_before_feed_forward(position, feed) -> None:
+def test_position_comes_before_feed_forward(position: Vec, feed: Vec) -> None:
     goal = (position[0] + 8.0, position[1] - 4.0, NAN)
     assume(math.hypot(feed[0], feed[1]) > 0.1)
     v = np.array(velocity_setpoint(position, goal, feed, GAINS))[:2]
@@ -351,7 +356,7 @@ def test_what_is_not_controlled_stays_level() -> None:
 
 
 @given(triples)
-def test_tilt_limit(acceleration) -> None:
+def test_tilt_limit(acceleration: Vec) -> None:
     x, y, z = thrust_from_acceleration(acceleration, GAINS)
     tilt = math.atan2(math.hypot(x, y), -z)
     wanted = math.atan2(math.hypot(*acceleration[:2]), GRAVITY_M_S2)
@@ -362,7 +367,7 @@ def test_tilt_limit(acceleration) -> None:
 
 
 @given(st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-5, 5)))
-def test_acceleration_becomes_the_thrust_that_makes_it(acceleration) -> None:
+def test_acceleration_becomes_the_thrust_that_makes_it(acceleration: Vec) -> None:
     thrust = np.array(thrust_from_acceleration(acceleration, GAINS))
     # A body whose hover thrust is 0.52 gets g from 0.52: what this thrust makes of it.
     produced = thrust / 0.52 * GRAVITY_M_S2 + [0, 0, GRAVITY_M_S2]
@@ -373,7 +378,7 @@ def test_acceleration_becomes_the_thrust_that_makes_it(acceleration) -> None:
 
 
 @given(triples, triples, triples)
-def test_thrust_stays_inside_its_limits(velocity, dot, sp) -> None:
+def test_thrust_stays_inside_its_limits(velocity: Vec, dot: Vec, sp: Vec) -> None:
     thrust, integral = velocity_control(velocity, dot, sp, ZERO, GAINS, TICK_S)
     norm = np.linalg.norm(thrust)
     # thrust_min is the least collective; the tilt takes from its vertical part.
@@ -444,19 +449,20 @@ def test_rate_pid() -> None:
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_rate_integral_stops_where_the_mixer_is_short(axis: int, sign: float) -> None:
-    want = tuple(sign if i == axis else 0.0 for i in range(3))
+    x, y, z = (sign if i == axis else 0.0 for i in range(3))
+    want = (x, y, z)
     _, free = rate_control(ZERO, ZERO, want, ZERO, ZERO, GAINS, TICK_S)
     assert free[axis] * sign > 0
     _, short = rate_control(ZERO, ZERO, want, ZERO, want, GAINS, TICK_S)
     assert short[axis] == 0.0
     # Short the other way: this direction may be integrated.
-    other = tuple(-w for w in want)
+    other = (-x, -y, -z)
     _, unwinding = rate_control(ZERO, ZERO, want, ZERO, other, GAINS, TICK_S)
     assert unwinding == free
 
 
 @given(triples, triples)
-def test_rate_integral_is_limited(rates, wanted) -> None:
+def test_rate_integral_is_limited(rates: Vec, wanted: Vec) -> None:
     integral = ZERO
     for _ in range(200):
         _, integral = rate_control(rates, ZERO, wanted, integral, ZERO, GAINS, 0.5)
@@ -498,7 +504,9 @@ def test_what_was_before_does_not_kick_the_first_tick() -> None:
 
 
 @given(triples, triples, quaternions, triples, triples, triples, angles)
-def test_any_state_gives_commands(position, velocity, q, omega, p_sp, v_sp, yaw) -> None:
+def test_any_state_gives_commands(
+    position: Vec, velocity: Vec, q: Quat, omega: Vec, p_sp: Vec, v_sp: Vec, yaw: float
+) -> None:
     memory = new_memory()
     for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):
         out = cascade(position, velocity, q, omega, demand, memory, GAINS, TICK_S)
@@ -609,7 +617,9 @@ def test_gains_cross_over_whole() -> None:
 
 
 @given(triples, triples, quaternions, triples, triples, triples, angles)
-def test_the_controller_is_the_cascade(position, velocity, q, omega, p_sp, v_sp, yaw) -> None:
+def test_the_controller_is_the_cascade(
+    position: Vec, velocity: Vec, q: Quat, omega: Vec, p_sp: Vec, v_sp: Vec, yaw: float
+) -> None:
     controller, memory = Controller(GAINS, TICK_S), new_memory()
     state = np.array([*position, *velocity, *q, *omega, 7.0, 8.0])
     for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):

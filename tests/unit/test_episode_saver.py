@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,10 @@ def test_nothing_to_save_leaves_nothing(folder: RunFolder) -> None:
     assert [path.name for path in folder.path.iterdir()] == ["run.json"]
 
 
+def has_lines(folder: RunFolder, count: int) -> bool:
+    return (folder.path / EPISODES_FILE).read_bytes().count(b"\n") == count
+
+
 def test_after_a_while_they_are_saved_though_more_will_come(
     folder: RunFolder, episode: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -66,10 +71,7 @@ def test_after_a_while_they_are_saved_though_more_will_come(
         for index in range(2):
             saver.add(episode(index))
             wait_until(lambda: (folder.path / EPISODES_FILE).exists(), "the first line")
-            wait_until(
-                lambda n=index + 1: (folder.path / EPISODES_FILE).read_bytes().count(b"\n") == n,
-                "the next line",
-            )
+            wait_until(partial(has_lines, folder, index + 1), "the next line")
 
 
 def test_no_more_than_so_many_wait(

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import zlib
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -37,8 +38,10 @@ FLIPS = 300
 OLD_RUN = Path(__file__).parents[1] / "support" / "run_without_checksums"
 """Two episodes of a lockstep run, thinned out, as they were written before files had checksums."""
 
+Arrays = Mapping[str, np.ndarray]
 
-def same_arrays(ours: dict, theirs: dict) -> bool:
+
+def same_arrays(ours: Arrays, theirs: Arrays) -> bool:
     return ours.keys() == theirs.keys() and all(
         ours[name].dtype == theirs[name].dtype and np.array_equal(ours[name], theirs[name])
         for name in ours
@@ -46,7 +49,7 @@ def same_arrays(ours: dict, theirs: dict) -> bool:
 
 
 def same_run(ours: LoadedRun, theirs: LoadedRun) -> bool:
-    def paths(run: LoadedRun) -> dict[int, dict]:
+    def paths(run: LoadedRun) -> dict[int, Arrays]:
         return {index: path.arrays() for index, path in run.trajectories.items()}
 
     return (

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,7 +55,9 @@ def test_no_nan_is_written(record: EpisodeRecord, tmp_path: Path) -> None:
         ({"seed": "many"}, "here: seed = 'many': accepted: a whole number"),
     ],
 )
-def test_a_foreign_line_is_refused(record: EpisodeRecord, change: dict, message: str) -> None:
+def test_a_foreign_line_is_refused(
+    record: EpisodeRecord, change: dict[str, Any], message: str
+) -> None:
     with pytest.raises(UsageError) as error:
         EpisodeRecord.from_data({**record.as_data(), **change}, "here")
     assert message in str(error.value)

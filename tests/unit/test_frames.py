@@ -43,7 +43,9 @@ def same_rotation(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 @given(quaternions, quaternions, quaternions)
-def test_product_is_associative_and_keeps_length(a, b, c) -> None:
+def test_product_is_associative_and_keeps_length(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray
+) -> None:
     left = frames.quat_multiply(frames.quat_multiply(a, b), c)
     right = frames.quat_multiply(a, frames.quat_multiply(b, c))
     np.testing.assert_allclose(left, right, atol=1e-12)
@@ -51,7 +53,7 @@ def test_product_is_associative_and_keeps_length(a, b, c) -> None:
 
 
 @given(quaternions)
-def test_identity_and_inverse(q) -> None:
+def test_identity_and_inverse(q: np.ndarray) -> None:
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     np.testing.assert_array_equal(frames.quat_multiply(q, identity), q)
     np.testing.assert_array_equal(frames.quat_multiply(identity, q), q)
@@ -61,7 +63,7 @@ def test_identity_and_inverse(q) -> None:
 
 
 @given(quaternions, st.floats(0.01, 100.0))
-def test_normalize_keeps_the_rotation_and_the_sign_convention(q, scale) -> None:
+def test_normalize_keeps_the_rotation_and_the_sign_convention(q: np.ndarray, scale: float) -> None:
     unit = frames.quat_normalize(scale * q)
     assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-12)
     assert unit[0] >= 0.0
@@ -77,20 +79,20 @@ def test_a_zero_quaternion_is_refused() -> None:
 
 
 @given(quaternions, vectors)
-def test_matrix_and_rotation_of_vectors(q, v) -> None:
+def test_matrix_and_rotation_of_vectors(q: np.ndarray, v: np.ndarray) -> None:
     np.testing.assert_allclose(frames.quat_to_matrix(q), to_scipy(q).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(frames.quat_rotate(q, v), to_scipy(q).apply(v), atol=1e-9)
 
 
 @given(quaternions, quaternions)
-def test_product(a, b) -> None:
+def test_product(a: np.ndarray, b: np.ndarray) -> None:
     ours = frames.quat_multiply(a, b)
     theirs = frames.quat_xyzw_to_wxyz(tuple((to_scipy(a) * to_scipy(b)).as_quat()))
     assert same_rotation(ours, theirs)
 
 
 @given(angles, st.floats(-1.57, 1.57), angles)
-def test_euler_angles_are_the_aerospace_sequence(roll, pitch, yaw) -> None:
+def test_euler_angles_are_the_aerospace_sequence(roll: float, pitch: float, yaw: float) -> None:
     q = frames.quat_from_euler(roll, pitch, yaw)
     reference = Rotation.from_euler("ZYX", [yaw, pitch, roll])
     assert same_rotation(q, frames.quat_xyzw_to_wxyz(tuple(reference.as_quat())))
@@ -116,7 +118,7 @@ def test_euler_at_the_poles_is_finite_and_the_same_rotation(pitch: float) -> Non
 
 
 @given(vectors)
-def test_axis_swaps(v) -> None:
+def test_axis_swaps(v: np.ndarray) -> None:
     np.testing.assert_array_equal(frames.ned_to_enu(v), ENU_FROM_NED @ v)
     np.testing.assert_array_equal(frames.frd_to_flu(v), FLU_FROM_FRD @ v)
     np.testing.assert_array_equal(frames.enu_to_ned(frames.ned_to_enu(v)), v)
@@ -130,7 +132,9 @@ def test_axis_swaps_take_stacks() -> None:
 
 
 @given(quaternions, vectors)
-def test_attitude_turns_a_vector_to_the_same_place_in_both_conventions(q, v_frd) -> None:
+def test_attitude_turns_a_vector_to_the_same_place_in_both_conventions(
+    q: np.ndarray, v_frd: np.ndarray
+) -> None:
     q_enu = frames.quat_ned_frd_to_enu_flu(q)
     in_ned = to_scipy(q).apply(v_frd)
     in_enu = to_scipy(q_enu).apply(FLU_FROM_FRD @ v_frd)
@@ -144,7 +148,7 @@ def test_facing_north_is_a_quarter_turn_in_enu() -> None:
 
 
 @given(vectors, angles)
-def test_heading_frame_is_a_turn_about_the_vertical(v, yaw) -> None:
+def test_heading_frame_is_a_turn_about_the_vertical(v: np.ndarray, yaw: float) -> None:
     turn = Rotation.from_euler("Z", yaw)
     np.testing.assert_allclose(frames.heading_to_ned(v, yaw), turn.apply(v), atol=1e-9)
     np.testing.assert_allclose(frames.ned_to_heading(v, yaw), turn.inv().apply(v), atol=1e-9)
@@ -156,7 +160,7 @@ def test_heading_east_sees_north_on_the_left() -> None:
 
 
 @given(st.floats(-1e4, 1e4))
-def test_wrap(angle) -> None:
+def test_wrap(angle: float) -> None:
     wrapped = frames.wrap_pi(angle)
     assert -math.pi <= wrapped <= math.pi
     turns = (angle - wrapped) / (2 * math.pi)
@@ -188,7 +192,7 @@ def haversine_m(a: Geodetic, b: Geodetic) -> float:
 
 
 @given(places, offsets)
-def test_local_to_globe_and_back(origin, ned) -> None:
+def test_local_to_globe_and_back(origin: Geodetic, ned: np.ndarray) -> None:
     there = frames.local_to_geodetic(ned, origin)
     np.testing.assert_allclose(frames.geodetic_to_local(there, origin), ned, atol=1e-5)
     # The projection keeps distances from the origin, and heights.
@@ -197,7 +201,7 @@ def test_local_to_globe_and_back(origin, ned) -> None:
 
 
 @given(st.floats(0.0, 2 * math.pi), st.floats(1.0, 20_000.0))
-def test_bearing_from_the_origin_is_kept(bearing, distance) -> None:
+def test_bearing_from_the_origin_is_kept(bearing: float, distance: float) -> None:
     ned = np.array([distance * math.cos(bearing), distance * math.sin(bearing), 0.0])
     there = frames.local_to_geodetic(ned, HOME)
     lat1, lat2 = math.radians(HOME.latitude_deg), math.radians(there.latitude_deg)
@@ -229,7 +233,7 @@ def test_millimetres_survive_the_way_over_the_globe() -> None:
 
 
 @given(quaternions, quaternions, vectors)
-def test_kernels_agree(a, b, v) -> None:
+def test_kernels_agree(a: np.ndarray, b: np.ndarray, v: np.ndarray) -> None:
     ta, tb, tv = tuple(a), tuple(b), tuple(v)
     np.testing.assert_allclose(kernels.rotate(ta, tv), frames.quat_rotate(a, v), atol=1e-10)
     np.testing.assert_allclose(kernels.multiply(ta, tb), frames.quat_multiply(a, b), atol=1e-12)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ SETPOINTS = st.tuples(*[st.floats(width=32)] * 4)
     st.integers(1, 5),
     st.lists(st.tuples(*[TIMES] * len(STAMPS), SETPOINTS), max_size=30),
 )
-def test_what_goes_in_comes_out(capacity: int, rows: list[tuple]) -> None:
+def test_what_goes_in_comes_out(capacity: int, rows: list[tuple[Any, ...]]) -> None:
     log = DecisionLog(capacity)
     for row in rows:
         log.record(*row)

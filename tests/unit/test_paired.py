@@ -179,7 +179,8 @@ def test_too_few_pairs_and_pairs_of_one_ratio() -> None:
     none = relative_difference([], [])
     assert (none.value, none.low, none.high, none.n) == (None, None, None, 0)
     one = relative_difference([4.0], [5.0])
-    assert (one.value, one.low, one.high, one.n) == (pytest.approx(25.0), None, None, 1)
+    assert one.value == pytest.approx(25.0)
+    assert (one.low, one.high, one.n) == (None, None, 1)
     first, _ = pairs(25)
     for factor in (1.0, 1.1):
         same = relative_difference(first, factor * first)

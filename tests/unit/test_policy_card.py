@@ -192,6 +192,11 @@ def set_axis(value: Any, axis: int, size: int) -> None:
     value.type.tensor_type.shape.dim[axis].dim_value = size
 
 
+def one_row_only(graph: Any) -> None:
+    for value in (*graph.input, *graph.output):
+        set_axis(value, 0, 1)
+
+
 def rename(graph: Any, old: str, new: str) -> None:
     for value in (*graph.input, *graph.output):
         value.name = new if value.name == old else value.name
@@ -206,7 +211,7 @@ def rename(graph: Any, old: str, new: str) -> None:
         (lambda g: rename(g, "velocity", "speed"), ["inputs", "speed", "velocity tensor(float)"]),
         (lambda g: rename(g, "action", "q"), ["outputs q", "action tensor(float) (n, 25)"]),
         (
-            lambda g: [set_axis(value, 0, 1) for value in (*g.input, *g.output)],
+            one_row_only,
             ["depth tensor(uint8) (1, 1, 24, 32)", "depth tensor(uint8) (n, 1, 24, 32)"],
         ),
     ],
@@ -245,7 +250,11 @@ def test_a_card_that_says_something_else_than_the_network_is_refused(
 def test_a_file_that_is_no_onnx_is_refused_though_the_digest_fits(folder: Path) -> None:
     for data in (b"", b"not a network", (folder / "policy.onnx").read_bytes()[:5000]):
         (folder / "policy.onnx").write_bytes(data)
-        edit(folder, lambda card, data=data: card.update(sha256=digest(data)))
+
+        def record_digest(card: dict[str, Any], sha256: str = digest(data)) -> None:
+            card["sha256"] = sha256
+
+        edit(folder, record_digest)
         assert "not a model that ONNX Runtime loads" in refusal(folder)
 
 

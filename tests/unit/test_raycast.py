@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -47,8 +49,11 @@ class Scene:
         )
 
 
-def obstacles(*bodies: tuple[Shape, tuple, tuple, float]) -> Obstacles:
-    """Pack (shape, centre, half size, yaw)."""
+Body = tuple[Shape, Sequence[float], Sequence[float], float]
+"""Shape, centre, half size, yaw."""
+
+
+def obstacles(*bodies: Body) -> Obstacles:
     return Obstacles(
         np.array([b[0] for b in bodies], np.int8),
         np.array([b[1] for b in bodies], np.float64).reshape(-1, 3),
@@ -57,7 +62,13 @@ def obstacles(*bodies: tuple[Shape, tuple, tuple, float]) -> Obstacles:
     )
 
 
-def seen(*bodies, position=(0.0, 0.0, -2.0), quaternion=LEVEL, max_range=100.0, side=20.0):
+def seen(
+    *bodies: Body,
+    position: Sequence[float] = (0.0, 0.0, -2.0),
+    quaternion: np.ndarray = LEVEL,
+    max_range: float = 100.0,
+    side: float = 20.0,
+) -> np.ndarray:
     """Render bodies in a square room with 5 m walls."""
     bounds = Bounds(-side, side, -side, side, 5.0)
     return Scene(
@@ -92,7 +103,9 @@ class Rays:
         self.t[nearer] = t[nearer]
         self.body[nearer] = self.number
 
-    def rectangle(self, d, o, axis: int, at: float, low, high) -> None:
+    def rectangle(
+        self, d: np.ndarray, o: np.ndarray, axis: int, at: float, low: np.ndarray, high: np.ndarray
+    ) -> None:
         """Cross the plane x[axis] = at where the other coordinates are within low..high."""
         t = (at - o[axis]) / d[:, axis]
         p = o + t[:, None] * d
@@ -108,7 +121,7 @@ class Rays:
             self.rectangle(self.d, self.o, axis, high[axis], low, high)
         self.rectangle(self.d, self.o, 2, 0.0, low, high)
 
-    def box(self, center, half, yaw) -> bool:
+    def box(self, center: np.ndarray, half: np.ndarray, yaw: float) -> bool:
         turn = Rotation.from_euler("z", -yaw).as_matrix()
         o, d = turn @ (self.o - center), self.d @ turn.T
         for axis in range(3):
@@ -116,12 +129,12 @@ class Rays:
                 self.rectangle(d, o, axis, sign * half[axis], -half, half)
         return bool(np.all(np.abs(o) <= half))
 
-    def quadratic(self, a, b, c):
+    def quadratic(self, a: Any, b: np.ndarray, c: float) -> tuple[np.ndarray, np.ndarray]:
         """Both roots of a t² + 2 b t + c; NaN where there is none."""
         root = np.sqrt(b * b - a * c)
         return (-b - root) / a, (-b + root) / a
 
-    def cylinder(self, center, half) -> bool:
+    def cylinder(self, center: np.ndarray, half: np.ndarray) -> bool:
         o, radius = self.o - center, half[0]
         a = np.sum(self.d[:, :2] ** 2, axis=1)
         b = self.d[:, :2] @ o[:2]
@@ -134,7 +147,7 @@ class Rays:
             self.hit(t, np.sum(p**2, axis=1) <= radius**2)
         return bool(c <= 0.0 and abs(o[2]) <= half[2])
 
-    def sphere(self, center, radius) -> bool:
+    def sphere(self, center: np.ndarray, radius: float) -> bool:
         o = self.o - center
         c = o @ o - radius**2
         for t in self.quadratic(np.sum(self.d**2, axis=1), self.d @ o, c):
@@ -183,7 +196,8 @@ def random_scene(rng: np.random.Generator) -> Scene:
     elif where < 0.5 and n:  # beside or inside an obstacle
         position = center[0] + rng.uniform(-1.5, 1.5, 3) * half[0]
     if rng.random() < 0.5:
-        quaternion = quat_from_euler(*rng.normal(0.0, 0.2, 2), rng.uniform(-np.pi, np.pi))
+        roll, pitch = rng.normal(0.0, 0.2, 2)
+        quaternion = quat_from_euler(roll, pitch, rng.uniform(-np.pi, np.pi))
     else:
         quaternion = rng.normal(size=4)
         quaternion /= np.linalg.norm(quaternion)
@@ -203,8 +217,8 @@ def test_agrees_with_brute_force(seed: int) -> None:
         depth, expected = scene.render(), brute_force(scene)[0]
         error = float(np.max(np.abs(depth - expected)))
         assert error < 1e-4, f"scene {number}: {error} m, {scene}"
-        returns += np.count_nonzero(expected > MIN_DEPTH_M)
-        escapes += np.count_nonzero(expected == 0.0)
+        returns += int(np.count_nonzero(expected > MIN_DEPTH_M))
+        escapes += int(np.count_nonzero(expected == 0.0))
         inside += bool(np.all(expected == np.float64(MIN_DEPTH_M)))
     # The scenes must not be trivial.
     assert returns > 15_000
@@ -227,12 +241,18 @@ def points_on(shape: Shape, half: np.ndarray) -> np.ndarray:
         rim = np.stack([np.cos(turn), np.sin(turn), np.ones_like(turn)], axis=1)
         return half * np.concatenate([rim, rim * [1.0, 1.0, -1.0]])
     i = np.arange(4000)  # a Fibonacci sphere
-    z, turn = 1.0 - (2.0 * i + 1.0) / len(i), i * np.pi * (3.0 - math.sqrt(5.0))
+    z, angle = 1.0 - (2.0 * i + 1.0) / len(i), i * np.pi * (3.0 - math.sqrt(5.0))
     ring = np.sqrt(1.0 - z * z)
-    return half * np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    return half * np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
 
 
-def add_body(client, shape, center, half, yaw) -> None:
+def add_body(
+    client: int,
+    shape: int,
+    center: Sequence[float] | np.ndarray,
+    half: Sequence[float] | np.ndarray,
+    yaw: float,
+) -> None:
     points = points_on(Shape(shape), np.asarray(half, np.float64))
     faces = ConvexHull(points).simplices
     visual = pybullet.createVisualShape(
@@ -248,7 +268,7 @@ def add_body(client, shape, center, half, yaw) -> None:
     pybullet.createMultiBody(0, -1, visual, position, turn, physicsClientId=client)
 
 
-def tiny_renderer(client, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def tiny_renderer(client: int, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Return pybullet's depth [m] and body numbers (-1 = none), both (height, width)."""
     k, near, far = scene.intrinsics, 0.05, 60.0
     forward, _, down = quat_to_matrix(scene.quaternion).T
@@ -294,8 +314,8 @@ def test_agrees_with_pybullet_tiny_renderer(seed: int) -> None:
     bodies = Obstacles(shape, center, half, rng.uniform(-np.pi, np.pi, 9))
     client = pybullet.connect(pybullet.DIRECT)
     try:
-        for body in zip(bodies.shape, bodies.center, bodies.half_size, bodies.yaw, strict=True):
-            add_body(client, *body)
+        for row in zip(bodies.shape, bodies.center, bodies.half_size, bodies.yaw, strict=True):
+            add_body(client, *row)
         add_body(client, Shape.BOX, (0, 0, 0.5), (10, 12, 0.5), 0.0)
         for side in (-1, 1):
             add_body(client, Shape.BOX, (side * 10.5, 0, -2), (0.5, 12, 2), 0.0)
@@ -305,7 +325,8 @@ def test_agrees_with_pybullet_tiny_renderer(seed: int) -> None:
             position = rng.uniform([-9, -11, -3.5], [9, 11, -0.3])
             if np.min(np.linalg.norm(center - position, axis=1)) < 2.5:
                 continue  # inside, or nearer than pybullet's near plane
-            attitude = quat_from_euler(*rng.normal(0.0, 0.25, 2), rng.uniform(-np.pi, np.pi))
+            roll, pitch = rng.normal(0.0, 0.25, 2)
+            attitude = quat_from_euler(roll, pitch, rng.uniform(-np.pi, np.pi))
             w, h = 64, 48
             # TinyRenderer samples the lower left corner of a pixel, not its centre.
             corner = Intrinsics(w, h, 0.5 * w, 0.5 * w, 0.5 * h - 1.0)
@@ -377,7 +398,7 @@ def test_range_limits_depth_along_the_axis() -> None:
         ((Shape.SPHERE, (6, 0, -2), (0.5, 0.5, 0.5), 0.0), 5.5),
     ],
 )
-def test_distance_to_a_body_ahead(body, expected) -> None:
+def test_distance_to_a_body_ahead(body: Body, expected: float) -> None:
     assert seen(body)[12, 16] == pytest.approx(expected, rel=1e-6)
 
 

@@ -178,7 +178,7 @@ def test_kill_9_at_any_moment_loses_one_episode_at_most(tmp_path: Path) -> None:
 
 
 def test_archives_are_the_same_bytes_for_the_same_arrays(tmp_path: Path) -> None:
-    arrays = {"x": np.arange(5), "y": np.ones((2, 3), np.float32)}
+    arrays: dict[str, np.ndarray] = {"x": np.arange(5), "y": np.ones((2, 3), np.float32)}
     for name in ("a.npz", "b.npz"):
         add_arrays(tmp_path / name, {"000": arrays})
         add_arrays(tmp_path / name, {"001": arrays})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args
 
@@ -236,7 +236,11 @@ def test_options_lie_over_the_file(tmp_path: Path) -> None:
 def test_errors_in_a_file_name_it_and_the_field(tmp_path: Path, text: str, line: str) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(text)
-    for read in (lambda: load_scenario(path), lambda: options(str(path))):
+    reads: list[Callable[[], object]] = [
+        lambda: load_scenario(path),
+        lambda: options(str(path)),
+    ]
+    for read in reads:
         with pytest.raises(UsageError) as refused:
             read()
         assert str(refused.value).startswith(f"{path}: {line}")

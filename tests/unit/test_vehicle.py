@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -22,6 +23,7 @@ from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
+from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import lag, settle, steady_speed, wrench
 
 QUAD = Airframe.from_profile(load_profile("vehicles", "quad", VehicleProfile))
@@ -64,7 +66,9 @@ def test_commands_beyond_the_range_are_clipped(command: float, speed: float) -> 
 
 
 @given(st.tuples(*[st.floats(0.0, 1.0)] * 4))
-def test_thrust_and_torque_follow_from_the_geometry(speeds: tuple[float, ...]) -> None:
+def test_thrust_and_torque_follow_from_the_geometry(
+    speeds: tuple[float, float, float, float],
+) -> None:
     lift = QUAD.thrust_max * np.array(speeds) ** 2
     forces = np.column_stack([np.zeros(4), np.zeros(4), -lift])
     torque = np.cross(POSITIONS, forces).sum(axis=0)
@@ -85,9 +89,8 @@ def test_thrust_and_torque_follow_from_the_geometry(speeds: tuple[float, ...]) -
     ],
 )
 def test_what_each_rotor_alone_does(rotor: int, signs: tuple[int, int, int]) -> None:
-    speeds = [0.0] * 4
-    speeds[rotor] = 0.7
-    _, torque = wrench(*speeds, QUAD)
+    a, b, c, d = (0.7 if i == rotor else 0.0 for i in range(4))
+    _, torque = wrench(a, b, c, d, QUAD)
     assert tuple(np.sign(torque)) == signs
     # And the body follows: after a tick it turns that way.
     _, _, _, omega = step(ZERO, ZERO, LEVEL, ZERO, ZERO, torque, QUAD, TICK_S)
@@ -105,7 +108,7 @@ def test_hover_thrust_of_the_shipped_quad() -> None:
 # --- drag and closed-form motion
 
 
-def fly(airframe: Airframe, seconds: float, dt: float, **start):
+def fly(airframe: Airframe, seconds: float, dt: float, **start: Any) -> tuple[Vec, Vec, Quat, Vec]:
     """Integrate a body that only drag acts on; return position, velocity, attitude, rates."""
     p, v = start.get("p", ZERO), start.get("v", ZERO)
     q, w = start.get("q", LEVEL), start.get("w", ZERO)
@@ -143,7 +146,7 @@ def test_terminal_velocity_with_quadratic_drag() -> None:
 
 
 @given(st.tuples(*[st.floats(-20, 20)] * 3), st.tuples(*[st.floats(-10, 10)] * 3))
-def test_drag_points_against_the_air(velocity, wind) -> None:
+def test_drag_points_against_the_air(velocity: Vec, wind: Vec) -> None:
     airframe = QUAD._replace(drag_linear=0.4, drag_quadratic=0.1)
     air = np.array(velocity) - np.array(wind)
     expected = -(0.4 + 0.1 * np.linalg.norm(air)) * air
@@ -169,11 +172,11 @@ def test_symmetric_top_precesses_at_the_closed_form_rate() -> None:
     assert abs(complex(w[0], w[1]) - expected) < 2e-3
 
 
-def euler_reference(airframe: Airframe, w0, t: float) -> tuple[np.ndarray, np.ndarray]:
+def euler_reference(airframe: Airframe, w0: Vec, t: float) -> tuple[np.ndarray, np.ndarray]:
     """Attitude (w, x, y, z) and rates after t, by a high-order integrator."""
     inertia = np.array([airframe.inertia_xx, airframe.inertia_yy, airframe.inertia_zz])
 
-    def slope(_t, state):
+    def slope(_t: float, state: np.ndarray) -> np.ndarray:
         q, w = state[:4], state[4:]
         dw = -np.cross(w, inertia * w) / inertia
         dq = 0.5 * np.array(
@@ -208,7 +211,16 @@ def test_tumbling_converges_to_the_reference_with_first_order(airframe: Airframe
 
 
 @kernel
-def _free_flight(p, v, q, w, forces, torques, airframe, dt):
+def _free_flight(
+    p: Vec,
+    v: Vec,
+    q: Quat,
+    w: Vec,
+    forces: np.ndarray,
+    torques: np.ndarray,
+    airframe: Airframe,
+    dt: float,
+) -> tuple[Vec, Vec, Quat, Vec]:
     """Apply world forces and body torques, one row a tick."""
     for i in range(len(forces)):
         force = (forces[i, 0], forces[i, 1], forces[i, 2])
@@ -237,7 +249,7 @@ def test_free_body_agrees_with_pybullet() -> None:
     client.changeDynamics(
         body, -1, localInertiaDiagonal=inertia, linearDamping=0.0, angularDamping=0.0
     )
-    p, v, q, w = ZERO, ZERO, tuple(float(c) for c in q0), ZERO
+    p, v, q, w = ZERO, ZERO, (float(q0[0]), float(q0[1]), float(q0[2]), float(q0[3])), ZERO
     worst = 0.0
     for start in range(0, ticks, 250):
         rows = slice(start, start + 250)
@@ -302,7 +314,7 @@ def test_the_shipped_quad_has_the_papers_coefficients() -> None:
         ((100.0, 0.0, 0.0), ZERO, (-50.0, 0.0, 0.0), 0.0, 0.0),  # never negative
     ],
 )
-def test_power_by_hand(v, a, wind, payload: float, watts: float) -> None:
+def test_power_by_hand(v: Vec, a: Vec, wind: Vec, payload: float, watts: float) -> None:
     assert power_w(v, a, wind, payload, SOLO) == pytest.approx(watts, abs=1e-9)
 
 
