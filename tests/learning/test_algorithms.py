@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from stable_baselines3 import PPO
 
@@ -11,7 +13,7 @@ from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from tests.support.toy_fleet import ToyFleet
 
-SHORT = {
+SHORT: dict[str, dict[str, Any]] = {
     "ppo": {"options": {"n_steps": 16, "n_epochs": 1}, "batch_size": 32},
     "trpo": {"options": {"n_steps": 8}, "batch_size": 16},
     "a2c": {},
@@ -19,13 +21,13 @@ SHORT = {
 REPLAYING = {"buffer_size": 500, "learning_starts": 50, "batch_size": 8}
 
 
-def make(name: str, *, continuous: bool = False, **fields):
+def make(name: str, *, continuous: bool = False, **fields: Any) -> Any:
     spec = AlgorithmSpec(name=name, **fields)
     return make_model(spec, NetworkSpec(), ToyFleet(4, continuous=continuous), seed=0)
 
 
 @pytest.mark.parametrize("name", CLASSES)
-def test_every_known_algorithm_learns(name):
+def test_every_known_algorithm_learns(name: str) -> None:
     model = make(name, continuous=name in CONTINUOUS_ONLY, **SHORT.get(name, REPLAYING))
     before = {k: v.clone() for k, v in model.policy.state_dict().items()}
     model.learn(100)
@@ -33,7 +35,7 @@ def test_every_known_algorithm_learns(name):
     assert any(not before[key].equal(after[key]) for key in before)
 
 
-def test_dqn_takes_every_field():
+def test_dqn_takes_every_field() -> None:
     model = make(
         "dqn",
         learning_rate=0.01,
@@ -64,7 +66,7 @@ def test_dqn_takes_every_field():
 
 
 @pytest.mark.parametrize("vehicles", [1, 3, 32, 48])
-def test_whole_batches_fill_a_rollout(vehicles):
+def test_whole_batches_fill_a_rollout(vehicles: int) -> None:
     model = make_model(AlgorithmSpec(name="ppo"), NetworkSpec(), ToyFleet(vehicles), seed=0)
     assert isinstance(model, PPO)
     assert model.n_steps * vehicles % model.batch_size == 0
@@ -85,7 +87,7 @@ def test_whole_batches_fill_a_rollout(vehicles):
         ({"name": "ppo", "options": {"clip_range": "x"}}, "algorithm.options of 'ppo': "),
     ],
 )
-def test_misuse_gets_one_line(fields, line):
+def test_misuse_gets_one_line(fields: dict[str, Any], line: str) -> None:
     with pytest.raises(UsageError) as refusal:
         make(**fields)
     assert line in str(refusal.value)
@@ -93,6 +95,6 @@ def test_misuse_gets_one_line(fields, line):
 
 
 @pytest.mark.parametrize("name", ["dqn", "qrdqn"])
-def test_discrete_learners_are_refused_on_continuous_actions(name):
+def test_discrete_learners_are_refused_on_continuous_actions(name: str) -> None:
     with pytest.raises(UsageError, match="chooses discrete actions"):
         make(name, continuous=True)

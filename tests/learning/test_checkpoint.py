@@ -10,7 +10,9 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from tests.support.toy_fleet import ToyFleet
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLES = 4
 REPLAYING = {"buffer_size": 300, "learning_starts": 40, "batch_size": 8}
-FIELDS = {
+FIELDS: dict[str, dict[str, Any]] = {
     # The ring has gone round before the checkpoint.
     "dqn": REPLAYING | {"target_interval": 130, "exploration_fraction": 0.9},
     "ppo": {"batch_size": 32, "options": {"n_steps": 16, "n_epochs": 2}},
@@ -38,7 +40,7 @@ FIELDS = {
 TOTAL = {"dqn": 1000, "ppo": 64 * 8, "sac": 200, "td3": 200, "qrdqn": 400, "a2c": 200}
 
 
-def fresh(name: str, seed: int = 3, **changes):
+def fresh(name: str, seed: int = 3, **changes: Any) -> Any:
     vehicles = changes.pop("vehicles", VEHICLES)
     network = changes.pop("network", NetworkSpec())
     spec = AlgorithmSpec(**({"name": name} | FIELDS[name] | changes))
@@ -61,11 +63,11 @@ class SaveOnce(BaseCallback):
         return True
 
 
-def everything(model) -> dict[str, np.ndarray]:
+def everything(model: Any) -> dict[str, np.ndarray]:
     """Weights, target weights and the optimisers' moments, by name."""
     found = {}
 
-    def walk(path, value):
+    def walk(path: str, value: object) -> None:
         if isinstance(value, torch.Tensor):
             found[path] = value.detach().numpy()
         elif isinstance(value, dict):
@@ -100,7 +102,7 @@ def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
-def test_a_run_goes_on_in_another_process_bit_for_bit(name, tmp_path):
+def test_a_run_goes_on_in_another_process_bit_for_bit(name: str, tmp_path: Path) -> None:
     folder, out = tmp_path / "checkpoints", tmp_path / "resumed.npz"
     expected = straight(name, folder)
     done = subprocess.run(
@@ -114,14 +116,14 @@ def test_a_run_goes_on_in_another_process_bit_for_bit(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a2c", "qrdqn", "sac", "td3"])
-def test_other_learners_go_on_bit_for_bit(name, tmp_path):
+def test_other_learners_go_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     expected = straight(name, tmp_path / "checkpoints")
     random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002
     assert_same(expected, resume(name, tmp_path / "checkpoints"))
 
 
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
-def test_saving_changes_nothing(name, tmp_path):
+def test_saving_changes_nothing(name: str, tmp_path: Path) -> None:
     saved = straight(name, tmp_path / "checkpoints")
     model = fresh(name)
     model.learn(TOTAL[name])
@@ -131,7 +133,7 @@ def test_saving_changes_nothing(name, tmp_path):
 # --- on the disk
 
 
-def marked(model, mark: int) -> None:
+def marked(model: Any, mark: int) -> None:
     """Make weights and replay recognisable."""
     with torch.no_grad():
         for weights in model.policy.parameters():
@@ -139,20 +141,20 @@ def marked(model, mark: int) -> None:
     model.replay._actions[:] = mark
 
 
-def started():
+def started() -> Any:
     model = fresh("dqn")
     model.learn(60)
     return model
 
 
-def assert_whole(model, mark: int) -> None:
+def assert_whole(model: Any, mark: int) -> None:
     assert all((weights == mark).all() for weights in model.policy.parameters())
     actions = model.replay.get_state()["actions"]
     assert len(actions) == 15
     assert (actions == mark).all()
 
 
-def in_child(job) -> int:
+def in_child(job: Callable[[], None]) -> int:
     """Run a job in a forked process and return its wait status."""
     child = os.fork()
     if child:
@@ -165,7 +167,7 @@ def in_child(job) -> int:
     os._exit(0)
 
 
-def test_kill_at_any_file_operation_leaves_a_whole_checkpoint(tmp_path):
+def test_kill_at_any_file_operation_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
     model, reader = started(), fresh("dqn")
     for mark in (1, 2):
         marked(model, mark)
@@ -174,10 +176,10 @@ def test_kill_at_any_file_operation_leaves_a_whole_checkpoint(tmp_path):
     for mark in range(3, 100):
         marked(model, mark)
 
-        def save_and_die(mark=mark):
+        def save_and_die(mark: int = mark) -> None:
             left = mark - 2
 
-            def hook(event, _):
+            def hook(event: str, _: object) -> None:
                 nonlocal left
                 if event in {"open", "os.rename", "os.remove", "os.rmdir", "os.mkdir"}:
                     left -= 1
@@ -200,13 +202,14 @@ def test_kill_at_any_file_operation_leaves_a_whole_checkpoint(tmp_path):
             break
         seen.add(meta["mark"] == mark)
     assert status == 0
+    assert meta is not None
     assert meta["mark"] == mark
     # It was killed before and after the new one counted.
     assert seen == {False, True}
     assert len(list(tmp_path.glob("checkpoint-*"))) == 2
 
 
-def test_kill_at_any_time_leaves_a_whole_checkpoint(tmp_path):
+def test_kill_at_any_time_leaves_a_whole_checkpoint(tmp_path: Path) -> None:
     model, reader = started(), fresh("dqn")
     marked(model, 0)
     save_checkpoint(tmp_path, model, {"mark": 0})
@@ -215,7 +218,7 @@ def test_kill_at_any_time_leaves_a_whole_checkpoint(tmp_path):
     # On a busy machine some children die before they have saved anything.
     while kills < 12 or first < 4:
 
-        def save_for_ever(first=first):
+        def save_for_ever(first: int = first) -> None:
             for mark in range(first + 1, 10_000):
                 marked(model, mark)
                 save_checkpoint(tmp_path, model, {"mark": mark})
@@ -230,12 +233,14 @@ def test_kill_at_any_time_leaves_a_whole_checkpoint(tmp_path):
         os.kill(child, signal.SIGKILL)
         assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
         kills += 1
-        first = load_latest(tmp_path, reader)["mark"]
+        meta = load_latest(tmp_path, reader)
+        assert meta is not None
+        first = meta["mark"]
         assert_whole(reader, first)
 
 
 @pytest.fixture
-def two(tmp_path):
+def two(tmp_path: Path) -> tuple[Path, Any]:
     """Return a folder with two checkpoints, marked 1 and 2, and a learner to load into."""
     model = started()
     for mark in (1, 2):
@@ -266,10 +271,12 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_damage_is_told_and_the_one_before_is_used(two, damage):
+def test_damage_is_told_and_the_one_before_is_used(
+    two: tuple[Path, Any], damage: Callable[[Path], object]
+) -> None:
     folder, model = two
     damage(folder / "checkpoint-000002")
-    told = []
+    told: list[str] = []
     assert load_latest(folder, model, told.append) == {"mark": 1}
     assert_whole(model, 1)
     assert len(told) == 1
@@ -283,14 +290,14 @@ def test_damage_is_told_and_the_one_before_is_used(two, damage):
     assert load_latest(folder, model, told.append) == {"mark": 1}
 
 
-def test_damage_is_a_warning_by_default(two):
+def test_damage_is_a_warning_by_default(two: tuple[Path, Any]) -> None:
     folder, model = two
     flip(folder / "checkpoint-000002" / "state.json")
     with pytest.warns(UserWarning, match="state.json has changed since it was written"):
         load_latest(folder, model)
 
 
-def test_all_damaged_is_refused_for_good(two):
+def test_all_damaged_is_refused_for_good(two: tuple[Path, Any]) -> None:
     folder, model = two
     for path in folder.glob("checkpoint-*"):
         flip(path / "weights.pt")
@@ -299,12 +306,14 @@ def test_all_damaged_is_refused_for_good(two):
             load_latest(folder, model, lambda _: None)
 
 
-def test_none_yet(tmp_path):
+def test_none_yet(tmp_path: Path) -> None:
     assert load_latest(tmp_path / "nothing", started()) is None
 
 
 @pytest.mark.parametrize("pointer", [b"", b"checkpoint-000077\n", b"\xff\x00", None])
-def test_without_its_pointer_the_newest_is_found(two, pointer):
+def test_without_its_pointer_the_newest_is_found(
+    two: tuple[Path, Any], pointer: bytes | None
+) -> None:
     folder, model = two
     (folder / "latest").unlink()
     if pointer is not None:
@@ -312,7 +321,7 @@ def test_without_its_pointer_the_newest_is_found(two, pointer):
     assert load_latest(folder, model) == {"mark": 2}
 
 
-def test_two_stay_and_the_pointer_names_the_newest(two):
+def test_two_stay_and_the_pointer_names_the_newest(two: tuple[Path, Any]) -> None:
     folder, model = two
     save_checkpoint(folder, model, {"mark": 3})
     names = sorted(path.name for path in folder.iterdir())
@@ -328,20 +337,20 @@ def test_two_stay_and_the_pointer_names_the_newest(two):
         {"n_step": 20, "vehicles": 8},
     ],
 )
-def test_another_configuration_is_refused(two, other):
+def test_another_configuration_is_refused(two: tuple[Path, Any], other: dict[str, Any]) -> None:
     folder, _ = two
     with pytest.raises(UsageError, match="a checkpoint of another configuration: ") as refusal:
         load_latest(folder, fresh("dqn", **other))
     assert "\n" not in str(refusal.value)
 
 
-def test_another_algorithm_is_refused(two):
+def test_another_algorithm_is_refused(two: tuple[Path, Any]) -> None:
     folder, _ = two
     with pytest.raises(UsageError, match="a checkpoint of another configuration: "):
         load_latest(folder, fresh("ppo"))
 
 
-def test_nothing_needs_unpickling(two):
+def test_nothing_needs_unpickling(two: tuple[Path, Any]) -> None:
     folder, _ = two
     path = folder / "checkpoint-000002"
     torch.load(path / "weights.pt", weights_only=True)
@@ -354,4 +363,5 @@ def test_nothing_needs_unpickling(two):
 
 
 if __name__ == "__main__":
-    np.savez(sys.argv[3], **resume(sys.argv[1], Path(sys.argv[2])))
+    arrays: dict[str, Any] = {**resume(sys.argv[1], Path(sys.argv[2]))}
+    np.savez(sys.argv[3], **arrays)

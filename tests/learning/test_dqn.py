@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -16,11 +18,14 @@ from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.replay import NStepReplay
 from tests.support.toy_fleet import ToyFleet
 
-SHAPES = {"depth": ((1, 2, 2), np.dtype(np.uint8)), "goal": ((3,), np.dtype(np.float32))}
+SHAPES: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
+    "depth": ((1, 2, 2), np.dtype(np.uint8)),
+    "goal": ((3,), np.dtype(np.float32)),
+}
 ON, DEAD, LATE = 0, 1, 2
 
 
-def seen(numbers):
+def seen(numbers: Any) -> dict[str, np.ndarray]:
     """Observations that can be told apart by a number."""
     numbers = np.asarray(numbers)
     depth = np.broadcast_to((numbers % 251)[..., None, None, None], (*numbers.shape, 1, 2, 2))
@@ -31,16 +36,25 @@ def seen(numbers):
 class Told:
     """The same steps as a plain list for each vehicle."""
 
-    def __init__(self, vehicles):
-        self.steps = [[] for _ in range(vehicles)]
+    def __init__(self, vehicles: int) -> None:
+        self.steps: list[list[tuple[Any, ...]]] = [[] for _ in range(vehicles)]
 
-    def add(self, now, actions, rewards, ends, last):
+    def add(
+        self,
+        now: np.ndarray,
+        actions: np.ndarray,
+        rewards: np.ndarray,
+        ends: np.ndarray,
+        last: np.ndarray,
+    ) -> None:
         for vehicle, steps in enumerate(self.steps):
             steps.append(
                 (now[vehicle], actions[vehicle], rewards[vehicle], ends[vehicle], last[vehicle])
             )
 
-    def chain(self, vehicle, start, n_step, gamma):
+    def chain(
+        self, vehicle: int, start: int, n_step: int, gamma: float
+    ) -> tuple[int, float, float, int | None]:
         """Return (action, return, discount, number of the next observation or None)."""
         steps = self.steps[vehicle]
         total = 0.0
@@ -54,7 +68,7 @@ class Told:
         return steps[start][1], total, gamma**n_step, steps[start + n_step][0]
 
 
-def fill(memory, vehicles, steps, seed, ending):
+def fill(memory: NStepReplay, vehicles: int, steps: int, seed: int, ending: float) -> Told:
     """Store random steps and return them as a list; observations are numbered consecutively."""
     rng = np.random.default_rng(seed)
     told = Told(vehicles)
@@ -76,7 +90,7 @@ def fill(memory, vehicles, steps, seed, ending):
     return told
 
 
-def check(memory, told, steps, n_step, gamma):
+def check(memory: NStepReplay, told: Told, steps: int, n_step: int, gamma: float) -> None:
     """Every transition that can be sampled is the one of the list."""
     first = max(0, steps - memory.rows)
     vehicles = memory.vehicles
@@ -106,14 +120,16 @@ def check(memory, told, steps, n_step, gamma):
     ending=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
     seed=st.integers(0, 1000),
 )
-def test_transitions_are_those_of_the_episodes(vehicles, capacity, n_step, steps, ending, seed):
+def test_transitions_are_those_of_the_episodes(
+    vehicles: int, capacity: int, n_step: int, steps: int, ending: float, seed: int
+) -> None:
     memory = NStepReplay(capacity, vehicles, SHAPES, n_step, gamma=0.9)
     told = fill(memory, vehicles, steps, seed, ending)
     check(memory, told, steps, n_step, 0.9)
 
 
 @given(steps=st.integers(1, 40), more=st.integers(0, 30), seed=st.integers(0, 1000))
-def test_state_goes_over_to_another_memory(steps, more, seed):
+def test_state_goes_over_to_another_memory(steps: int, more: int, seed: int) -> None:
     first = NStepReplay(50, 2, SHAPES, 3, 0.9)
     fill(first, 2, steps, seed, 0.3)
     second = NStepReplay(50, 2, SHAPES, 3, 0.9)
@@ -126,13 +142,13 @@ def test_state_goes_over_to_another_memory(steps, more, seed):
         np.testing.assert_array_equal(a[key], b[key])
 
 
-def test_state_of_another_size_is_refused():
+def test_state_of_another_size_is_refused() -> None:
     state = NStepReplay(50, 2, SHAPES, 3, 0.9).get_state()
     with pytest.raises(ValueError, match="does not fit"):
         NStepReplay(50, 3, SHAPES, 3, 0.9).set_state(state)
 
 
-def test_samples_are_uniform():
+def test_samples_are_uniform() -> None:
     memory = NStepReplay(40, 4, SHAPES, 3, 0.9)
     fill(memory, 4, 17, 0, 0.2)
     drawn = memory.sample(20_000, np.random.default_rng(0)).observations["goal"][:, 0]
@@ -142,13 +158,13 @@ def test_samples_are_uniform():
     assert np.abs(counts - 500).max() < 5 * np.sqrt(500)
 
 
-def test_memory_for_last_observations_does_not_leak():
+def test_memory_for_last_observations_does_not_leak() -> None:
     memory = NStepReplay(40, 4, SHAPES, 3, 0.9)
     fill(memory, 4, 300, 0, 1.0)
     assert len(memory.get_state()["last/goal"]) <= 2 * memory.rows * 4
 
 
-def learner(vehicles=4, **fields) -> DoubleDQN:
+def learner(vehicles: int = 4, **fields: Any) -> DoubleDQN:
     spec = AlgorithmSpec(**({"batch_size": 16, "learning_starts": 0} | fields))
     model = make_model(spec, NetworkSpec(), ToyFleet(vehicles), seed=0)
     assert isinstance(model, DoubleDQN)
@@ -157,7 +173,7 @@ def learner(vehicles=4, **fields) -> DoubleDQN:
 
 
 @pytest.mark.parametrize("double", [True, False])
-def test_one_update_is_the_one_by_hand(double):
+def test_one_update_is_the_one_by_hand(double: bool) -> None:
     model = learner(double=double, n_step=2, gamma=0.9)
     model.learn(200)
     with torch.no_grad():
@@ -165,7 +181,7 @@ def test_one_update_is_the_one_by_hand(double):
             weights.add_(0.05 * torch.randn(weights.shape))
     batch = model.replay.sample(64, model.generator)
 
-    def values(net, observations):
+    def values(net: torch.nn.Module, observations: dict[str, np.ndarray]) -> np.ndarray:
         with torch.no_grad():
             return net({k: torch.from_numpy(v) for k, v in observations.items()}).numpy()
 
@@ -181,12 +197,19 @@ def test_one_update_is_the_one_by_hand(double):
 
 
 @pytest.mark.parametrize("vehicles", [1, 5, 32, 100])
-def test_intervals_count_steps_of_single_vehicles(vehicles, monkeypatch):
+def test_intervals_count_steps_of_single_vehicles(
+    vehicles: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     model = learner(vehicles, env_steps_per_update=32, target_interval=500)
     copies = []
     monkeypatch.setattr("airl_mav.training.dqn.polyak_update", lambda *_: copies.append(1))
     updates = []
-    monkeypatch.setattr(model, "_update", lambda _: updates.append(1) or 0.0)
+
+    def update(_: object) -> float:
+        updates.append(1)
+        return 0.0
+
+    monkeypatch.setattr(model, "_update", update)
     model.learn(3200)
     steps = model.num_timesteps
     assert len(copies) == steps // 500
@@ -195,11 +218,12 @@ def test_intervals_count_steps_of_single_vehicles(vehicles, monkeypatch):
     assert model._n_updates == len(updates)
 
 
-def test_vehicles_explore_each_for_itself():
+def test_vehicles_explore_each_for_itself() -> None:
     model = learner(200)
     model.learn(400)
     model.exploration_rate = 0.25
     shares = []
+    assert isinstance(model._last_obs, dict)
     greedy = model.q_net({k: torch.from_numpy(v) for k, v in model._last_obs.items()}).argmax(1)
     for _ in range(50):
         actions, _ = model._sample_action(0, n_envs=200)
@@ -209,7 +233,7 @@ def test_vehicles_explore_each_for_itself():
     assert min(shares) > 0 and max(shares) < 0.5
 
 
-def test_same_seed_same_weights():
+def test_same_seed_same_weights() -> None:
     runs = [learner() for _ in range(2)]
     for model in runs:
         model.learn(600)
@@ -220,11 +244,11 @@ def test_same_seed_same_weights():
 class Endless(ToyFleet):
     """Stands still, earns one a step; episodes end after five steps, of old age or of death."""
 
-    def __init__(self, vehicles, *, dies):
+    def __init__(self, vehicles: int, *, dies: bool) -> None:
         super().__init__(vehicles)
         self.dies = dies
 
-    def step_wait(self):
+    def step_wait(self) -> Any:
         self.time = self.time + 1
         self.place = self.time.copy()
         done = self.time >= 5
@@ -242,7 +266,7 @@ class Endless(ToyFleet):
 
 @pytest.mark.parametrize("dies", [False, True])
 @pytest.mark.parametrize("n_step", [1, 3])
-def test_values_converge_to_the_closed_form(dies, n_step):
+def test_values_converge_to_the_closed_form(dies: bool, n_step: int) -> None:
     spec = AlgorithmSpec(
         learning_rate=3e-3,
         gamma=0.7,
@@ -255,18 +279,19 @@ def test_values_converge_to_the_closed_form(dies, n_step):
     )
     env = Endless(5, dies=dies)
     model = make_model(spec, NetworkSpec(), env, seed=0)
+    assert isinstance(model, DoubleDQN)
     model.learn(3000)
     env.time = env.place = np.arange(5)
     now = {k: torch.from_numpy(v) for k, v in env._seen().items()}
     with torch.no_grad():
-        values = model.policy.q_net(now).max(1).values.numpy()
+        values = model.q_net(now).max(1).values.numpy()
     left = 5 - np.arange(5)
     # Death: the sum of what is left. Old age: the task goes on for ever.
     expected = (1 - 0.7**left) / 0.3 if dies else np.full(5, 1 / 0.3)
     np.testing.assert_allclose(values, expected, rtol=0.08)
 
 
-def test_bfloat16_learns_with_float32_weights():
+def test_bfloat16_learns_with_float32_weights() -> None:
     model = learner(precision="bfloat16")
     model.learn(400)
     assert model._n_updates > 0

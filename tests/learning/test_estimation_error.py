@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -175,7 +177,7 @@ def test_velocity_errors_correlate_as_the_ekf_s(flown: np.ndarray, lag_s: float)
 # --- the profile
 
 
-def test_a_profile_may_do_without(tmp_path) -> None:
+def test_a_profile_may_do_without(tmp_path: Path) -> None:
     text = (profiles_dir() / "vehicles" / "quad.toml").read_text()
     head, _, rest = text.partition("[estimation]\n")
     mine = tmp_path / "mine.toml"
@@ -191,7 +193,7 @@ def test_a_profile_may_do_without(tmp_path) -> None:
         ("tilt_deg = 1.0", "tilt_deg"),
     ],
 )
-def test_a_wrong_table_is_refused_in_one_line(tmp_path, line: str, said: str) -> None:
+def test_a_wrong_table_is_refused_in_one_line(tmp_path: Path, line: str, said: str) -> None:
     text = (profiles_dir() / "vehicles" / "quad.toml").read_text()
     key = line.split(" ")[0]
     lines = [x for x in text.splitlines() if not x.startswith(f"{key} =")]

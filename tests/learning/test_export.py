@@ -107,6 +107,13 @@ def test_onnx_decides_as_the_model_predicts(name: str, tmp_path: Path) -> None:
     assert card == load_card(tmp_path)
 
 
+def scores_of(model: BaseAlgorithm) -> torch.nn.Module:
+    """Return the network that scores the actions of a DQN."""
+    network = model.policy.q_net
+    assert isinstance(network, torch.nn.Module)
+    return network
+
+
 def test_scores_are_those_of_torch_for_any_number_of_rows(tmp_path: Path) -> None:
     model = make_model("DQN")
     card = export_sb3(model, facts(), tmp_path)
@@ -114,7 +121,7 @@ def test_scores_are_those_of_torch_for_any_number_of_rows(tmp_path: Path) -> Non
     for n in (1, 2, 17):
         seen = noise(n, seed=n)
         with torch.no_grad():
-            wanted = model.policy.q_net({k: torch.from_numpy(v) for k, v in seen.items()}).numpy()
+            wanted = scores_of(model)({k: torch.from_numpy(v) for k, v in seen.items()}).numpy()
         found = runtime.infer(seen)
         assert found.shape == (n, 25)
         assert found.dtype == np.float32
@@ -189,7 +196,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
     card = export_sb3(make_model("DQN"), told, tmp_path)
     assert {name: getattr(card, name) for name in type(told).model_fields} == dict(told)
     assert card.network == "conv 4 3x3/2, conv 8 3x3/2, dense 16, dense 16, dense 25"
-    assert card.parameters == sum(p.numel() for p in make_model("DQN").policy.q_net.parameters())
+    assert card.parameters == sum(p.numel() for p in scores_of(make_model("DQN")).parameters())
     plain = json.loads((tmp_path / "card.json").read_text())
     assert next(iter(plain.items())) == ("schema", 1)
     assert plain["observation"] == {
@@ -234,7 +241,7 @@ def test_nothing_is_written_when_the_export_differs(
 def test_a_network_without_finite_scores_is_refused(tmp_path: Path) -> None:
     model = make_model("DQN")
     with torch.no_grad():
-        next(model.policy.q_net.parameters()).fill_(torch.nan)
+        next(scores_of(model).parameters()).fill_(torch.nan)
     with pytest.raises(UsageError):
         export_sb3(model, facts(), tmp_path / "new")
     assert not (tmp_path / "new").exists()
@@ -243,7 +250,7 @@ def test_a_network_without_finite_scores_is_refused(tmp_path: Path) -> None:
 def test_a_policy_that_decides_by_more_than_its_network_is_refused(tmp_path: Path) -> None:
     class Contrary(MultiInputPolicy):
         def _predict(self, obs: Any, deterministic: bool = True) -> torch.Tensor:
-            return self.q_net(obs).argmin(dim=1)  # type: ignore[no-any-return]
+            return self.q_net(obs).argmin(dim=1)
 
     model = make_model("DQN")
     model.policy.__class__ = Contrary
@@ -348,8 +355,10 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         layout="paper", height_px=34, width_px=32, horizontal_fov_deg=90.0, range_m=20.0
     )
     make_model("PPO", spec=paper).save(tmp_path / "paper.zip")
-    words = ("--algorithm", "PPO", "--layout", "paper", "--image", "32x34")
-    assert airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *words) == 0
+    layout = ("--algorithm", "PPO", "--layout", "paper", "--image", "32x34")
+    assert (
+        airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *layout) == 0
+    )
     assert load_card(tmp_path / "p").observation == paper
 
 

@@ -77,7 +77,8 @@ class PlantPilot:
                 self.velocity = heading_to_ned(setpoint[:3], quat_yaw(truth.quaternion))
                 self.repeat_us += REPEAT_US
             nan = (math.nan,) * 3
-            demand = Demand(nan, tuple(self.velocity), math.nan, float(setpoint[3]))
+            north, east, down = self.velocity
+            demand = Demand(nan, (north, east, down), math.nan, float(setpoint[3]))
             out = cascade(
                 tuple(truth.position),
                 tuple(truth.velocity),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,12 +29,12 @@ from tests.support.toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
     ("layers", "filters", "parameters"),
     [(5, 32, 40_412_761), (4, 48, 90_904_345), (7, 32, 40_433_369), (8, 64, 161_771_033)],
 )
-def test_templates_have_the_papers_parameters(layers, filters, parameters):
+def test_templates_have_the_papers_parameters(layers: int, filters: int, parameters: int) -> None:
     spec = NetworkSpec(kind="template", layers=layers, filters=filters)
     assert count_parameters(spec, 154, 256, 25) == parameters
 
 
-def test_appendix_network_is_the_one_of_air_learnings_code():
+def test_appendix_network_is_the_one_of_air_learnings_code() -> None:
     spec = NetworkSpec(kind="appendix")
     # Its code fixes the flat size; the parameters by hand: conv, dense on 32,640 + 6, output.
     assert flat_size(spec, 154, 256) == 32_640
@@ -42,7 +43,7 @@ def test_appendix_network_is_the_one_of_air_learnings_code():
     assert count_parameters(spec, 154, 256) == convolutions + dense
 
 
-def test_appendix_network_of_a_low_image_starts_with_stride_two():
+def test_appendix_network_of_a_low_image_starts_with_stride_two() -> None:
     spec, explicit = NetworkSpec(kind="appendix"), (2, 2, 1, 1)
     assert flat_size(spec, 24, 32) == flat_size(
         NetworkSpec(kind="appendix", strides=explicit), 24, 32
@@ -53,7 +54,7 @@ def test_appendix_network_of_a_low_image_starts_with_stride_two():
 
 
 @pytest.mark.parametrize(("height", "width", "flat"), [(24, 32, 3 * 4 * 32), (48, 64, 6 * 8 * 32)])
-def test_small_network(height, width, flat):
+def test_small_network(height: int, width: int, flat: int) -> None:
     spec = NetworkSpec()
     assert flat_size(spec, height, width) == flat
     convolutions = (9 + 1) * 16 + (9 * 16 + 1) * 32 + 2 * (9 * 32 + 1) * 32
@@ -71,18 +72,19 @@ def test_small_network(height, width, flat):
     ],
 )
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
-def test_policy_is_what_is_counted(spec, name):
+def test_policy_is_what_is_counted(spec: NetworkSpec, name: str) -> None:
     model = make_model(AlgorithmSpec(name=name), spec, ToyFleet(4), seed=0)
+    modules: list[Any]
     if isinstance(model, DoubleDQN):
         modules = [model.q_net]
     else:
-        policy = model.policy
+        policy: Any = model.policy
         modules = [policy.features_extractor, policy.mlp_extractor.policy_net, policy.action_net]
     counted = sum(weights.numel() for module in modules for weights in module.parameters())
     assert counted == count_parameters(spec, HEIGHT, WIDTH, outputs=3)
 
 
-def test_extractor_convolves_the_scaled_image_and_joins_the_vectors():
+def test_extractor_convolves_the_scaled_image_and_joins_the_vectors() -> None:
     torch.manual_seed(0)
     extractor = DepthExtractor(observation_space(), NetworkSpec())
     rng = np.random.default_rng(0)
@@ -101,7 +103,7 @@ def test_extractor_convolves_the_scaled_image_and_joins_the_vectors():
     torch.testing.assert_close(features, expected)
 
 
-def test_weights_layout_changes_speed_not_values():
+def test_weights_layout_changes_speed_not_values() -> None:
     torch.manual_seed(0)
     plain = DepthExtractor(observation_space(), NetworkSpec())
     other = copy.deepcopy(plain)
@@ -116,7 +118,7 @@ def test_weights_layout_changes_speed_not_values():
     torch.testing.assert_close(other(seen), plain(seen))
 
 
-def test_too_small_an_image_is_refused():
+def test_too_small_an_image_is_refused() -> None:
     with pytest.raises(UsageError, match="16x8 px is too small"):
         flat_size(NetworkSpec(kind="appendix"), 8, 16)
 
@@ -132,6 +134,6 @@ def test_too_small_an_image_is_refused():
         {"kind": "template", "layers": 0, "filters": 8},
     ],
 )
-def test_wrong_specifications_are_refused(fields):
+def test_wrong_specifications_are_refused(fields: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         NetworkSpec(**fields)

@@ -220,4 +220,4 @@ def test_setpoints_are_what_was_commanded() -> None:
     setpoints = trace.latency(slot)["setpoint"]
     assert flown.verdict is Verdict.TIMEOUT
     assert setpoints.dtype == np.float32
-    assert np.all(setpoints[:, [0, 1, 3]] == np.float32([1.0, -0.5, 0.25]))
+    assert np.all(setpoints[:, [0, 1, 3]] == np.array([1.0, -0.5, 0.25], np.float32))
