@@ -129,7 +129,9 @@ def test_nobody_to_prepare() -> None:
             link.prepare(60.0, stop)
 
 
-def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting() -> None:
+def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     (port,), _ = free_ports(1, 0)
     endpoint = UdpEndpoint(
         (LOOPBACK, 0), (LOOPBACK, port), local_option="local", remote_option="remote"
@@ -143,7 +145,7 @@ def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting() -
         asked.append(getattr(dialect, f"MAVLINK_MSG_ID_{name}"))
         set_interval(name, interval_us, now_us)
 
-    scheduler.set_interval = note
+    monkeypatch.setattr(scheduler, "set_interval", note)
     kinematics = [dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED]
     kinematics.append(dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION)
     pacer = Pacer(bench)

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from tests.support.processes import (
     Ground,
     Running,
     ground_station,
+    has_ended,
     is_running,
     running,
     wait_until,
@@ -190,7 +192,7 @@ def test_a_flight_that_loses_a_process_is_flown_again(
         os.kill(children[victim], signal.SIGKILL)
         run.wait_for_text(f"flight 000, seed 1 begins again: the {victim} died \\(SIGKILL\\)")
         for pid in children.values():
-            wait_until(lambda pid=pid: not is_running(pid), "both to end")
+            wait_until(partial(has_ended, pid), "both to end")
         assert run.wait() == 0
         run.no_child_left()
     assert "Traceback" not in run.text()
@@ -583,8 +585,8 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     assert "simulated time given up" in run.text()
     # Stamps stay in order, on the simulator's clock.
     stamps = done.latency[0]
-    names = ("decoded_us", "infer_start_us", "action_ready_us")
-    names += ("sent_us", "accepted_us", "motor_us")
+    names = ["decoded_us", "infer_start_us", "action_ready_us"]
+    names += ["sent_us", "accepted_us", "motor_us"]
     rows = np.stack([stamps[name] for name in names])
     assert rows.min() > 0, "a decision without a stamp"
     assert np.all(np.diff(rows, axis=0) >= 0)

@@ -288,6 +288,7 @@ def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
             told.append(now_us()) if "Failsafe" in message.text else None
         )
         simulation = stage.run(setup, lambda: companion_dies(stage), linger_us=2 * US_PER_S)
+        assert simulation.recorder is not None
         last_us = int(simulation.recorder.setpoints.arrays()["accepted_us"][-1])
     assert len(told) == 1
     assert US_PER_S < told[0] - last_us <= US_PER_S + 2 * TICK_US

@@ -363,8 +363,8 @@ def flown_beside(simulator_us: Callable[[int], int]) -> hil.TimedMission:
     log = DecisionLog()
     for i in range(40):
         seen_us = 2_000_000 + 60_000 * i
-        stamps = (np.array([8_000, 8_100, 9_000, 9_100, 59_100]) + seen_us).tolist()
-        log.record(simulator_us(seen_us), *stamps, (0.0, 0.0, 0.0, 0.0))
+        a, b, c, d, e = (seen_us + later for later in (8_000, 8_100, 9_000, 9_100, 59_100))
+        log.record(simulator_us(seen_us), a, b, c, d, e, (0.0, 0.0, 0.0, 0.0))
     return hil.TimedMission(
         MissionResult("stopped", (), log),
         asked(0, 100, 5_000, 400),
@@ -462,11 +462,11 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(hil, "WallClock", made)
     free = choose_ports()
-    words = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
+    command = [sys.executable, "-c", FIRMWARE_THAT_TELLS_ITS_EPOCH, "--arena", "no-obstacles"]
     log_path = tmp_path / "firmware.log"
     with log_path.open("wb") as log:
         firmware = subprocess.Popen(
-            [*words, *free.options()],
+            [*command, *free.options()],
             cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
             stdout=log,

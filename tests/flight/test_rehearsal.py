@@ -371,7 +371,8 @@ def test_decisions_are_joined_with_the_setpoints(play: Callable[..., Run]) -> No
         log.record(
             second, second + 10, second + 20, second + 30, second + 40, second + 50, (1, 0, 0, 0)
         )
-        np.savez(run.stage.children[COMPANION].decisions, **log.columns())
+        columns: dict[str, Any] = {**log.columns()}
+        np.savez(run.stage.children[COMPANION].decisions, **columns)
 
     run.stage.scripts[0].insert(0, leave_log)
     run.fly()

@@ -8,7 +8,9 @@ import signal
 import socket
 import sys
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from tests.support.processes import (
     SITL_WITHOUT_REPORT,
     Running,
     children_of,
+    has_ended,
     is_running,
     running,
     wait_until,
@@ -73,14 +76,14 @@ def leashed(process: Running) -> list[int]:
     return [] if firmware is None else list(children_of(firmware).values())
 
 
-def episode(folder: Path) -> dict[str, object]:
+def episode(folder: Path) -> dict[str, Any]:
     (line,) = (folder / "run" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
-    flown: dict[str, object] = json.loads(line)
+    flown: dict[str, Any] = json.loads(line)
     return flown
 
 
-def setup(folder: Path) -> dict[str, object]:
-    info: dict[str, dict[str, object]] = json.loads((folder / "run" / "run.json").read_text())
+def setup(folder: Path) -> dict[str, Any]:
+    info: dict[str, dict[str, Any]] = json.loads((folder / "run" / "run.json").read_text())
     return info["setup"]
 
 
@@ -100,7 +103,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
         programs = wait_until(lambda: leashed(process), "PX4")
         assert process.wait(250.0) == 0, process.text()
         for pid in programs:
-            wait_until(lambda pid=pid: not is_running(pid), "PX4 to end", 30.0)
+            wait_until(partial(has_ended, pid), "PX4 to end", 30.0)
     run, flown = tmp_path / "run", episode(tmp_path)
     assert "begins again: the firmware gave up: PX4" in process.text()
     assert flown["outcome"] == "success"

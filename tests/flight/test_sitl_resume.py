@@ -6,6 +6,7 @@ Flights are stood in for; `test_campaign_faults.py` kills real ones.
 from __future__ import annotations
 
 import errno
+import fcntl
 import io
 import json
 import re
@@ -280,6 +281,6 @@ def test_a_file_system_without_locks_is_flown_into(
     def no_locks(*_: object) -> None:
         raise OSError(errno.EBADF, "not of a folder")
 
-    monkeypatch.setattr(lock.fcntl, "flock", no_locks)
+    monkeypatch.setattr(fcntl, "flock", no_locks)
     with lock.locked(tmp_path, lambda _: None):
         pass

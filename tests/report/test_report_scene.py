@@ -23,6 +23,7 @@ from airl_mav.report.scene import (
     plotly_script,
     scene_json,
 )
+from airl_mav.report.table import OUTCOME_LABELS
 from tests.support.run_demo import demo_arena, write_demo_run
 
 Demo = tuple[LoadedRun, dict[int, Arena]]
@@ -81,7 +82,7 @@ def test_the_path_is_that_of_the_flight(demo: Demo) -> None:
 
 def test_nothing_can_end_the_script_element(demo: Demo, monkeypatch: pytest.MonkeyPatch) -> None:
     evil = "</script><!--<script>"
-    monkeypatch.setitem(scene.OUTCOME_LABELS, Outcome.SUCCESS, evil)
+    monkeypatch.setitem(OUTCOME_LABELS, Outcome.SUCCESS, evil)
     text = scene_json(demo[0], shown(demo), demo[0].episodes, 0.0)
     assert "<" not in text
     assert evil in json.dumps(json.loads(text))
@@ -149,7 +150,7 @@ def test_all_flights_together_are_coloured_by_how_they_ended(demo: Demo) -> None
     assert "obstacle" not in names
     for outcome in {episode.outcome for episode in run.episodes}:
         count = sum(episode.outcome is outcome for episode in run.episodes)
-        line = trace(view, f"{scene.OUTCOME_LABELS[outcome]} ({count})")
+        line = trace(view, f"{OUTCOME_LABELS[outcome]} ({count})")
         assert line["x"].count(None) == count
 
 
