@@ -44,7 +44,7 @@ def test_all_public_names_are_there() -> None:
     assert set(airl_mav.__all__) <= set(dir(airl_mav))
     assert all(callable(getattr(airl_mav, name)) for name in airl_mav.__all__)
     with pytest.raises(AttributeError, match="no attribute 'fly'"):
-        _ = airl_mav.fly  # type: ignore[attr-defined]
+        _ = airl_mav.fly
 
 
 def test_a_run_says_all_that_was_flown(flown: Run) -> None:
@@ -226,18 +226,22 @@ def test_policies_in_arenas(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
 
 
 def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options = {"arena": "no-obstacles", "episodes": 3, "seed": 20, "out": tmp_path / "curve"}
-    words = option_words(latencies=("native", "150ms", "400ms"), **options)
+    out = tmp_path / "curve"
+    words = option_words(
+        latencies=("native", "150ms", "400ms"),
+        arena="no-obstacles",
+        episodes=3,
+        seed=20,
+        out=out,
+    )
     code, text = airl("degrade", "greedy", *words)
     assert code == 0
     for name in ("degradation.json", "degradation.html", "degradation.md"):
-        assert (tmp_path / "curve" / name).stat().st_size > 1000
-    assert str(tmp_path / "curve" / "degradation.html") in text
+        assert (out / name).stat().st_size > 1000
+    assert str(out / "degradation.html") in text
     # The same figures from Python, with nothing flown again; a longer curve goes on.
     monkeypatch.setattr(show, "write_document", lambda _, folder: folder / "none.html")
-    found = degrade(
-        asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=options["out"]
-    )
+    found = degrade(asked(episodes=3), ("native", "150ms", "400ms", "950ms"), ("greedy",), out=out)
     assert list(found.runs) == [f"greedy-{name}" for name in ("native", "150ms", "400ms", "950ms")]
     means = [run.latency["t2"].mean() / 1e3 for run in found.runs.values()]
     assert means == pytest.approx([1.0, 150.0, 400.0, 950.0], abs=1.0)

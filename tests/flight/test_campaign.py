@@ -6,6 +6,7 @@ import json
 import signal
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
 from airl_mav.experiments.experiment import Experiment, entry_of, run_experiment
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import (
-    CAMPAIGN_FILE,
     Declaration,
     DeclaredCell,
     load_campaign,
@@ -27,9 +27,10 @@ from airl_mav.experiments.store import (
 )
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
+from airl_mav.rehearsal.evaluation import CAMPAIGN_FILE
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs
-from tests.support.processes import ROOT, is_running, running, wait_until
+from tests.support.processes import ROOT, has_ended, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
 
@@ -139,7 +140,7 @@ def test_a_campaign_that_is_killed_leaves_nobody_behind_and_goes_on(tmp_path: Pa
         parent.process.send_signal(signal.SIGKILL)
         parent.process.wait()
         for pid in workers:
-            wait_until(lambda pid=pid: not is_running(pid), "an orphan to end", 30.0)
+            wait_until(partial(has_ended, pid), "an orphan to end", 30.0)
     assert load_campaign(root).declaration == declared(cells(episodes))
     held = len(load(root / "a").episodes)
     run, _ = fly(root, cells(episodes))

@@ -15,6 +15,7 @@ import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from tests.support.processes import (
     NO_REPORT,
     Running,
     children_of,
+    has_ended,
     is_running,
     running,
     wait_until,
@@ -177,7 +179,7 @@ class Campaign:
     def nobody_left(self) -> None:
         """Fail when one of its processes outlives it by more than a moment."""
         for pid in self.pids:
-            wait_until(lambda pid=pid: not is_running(pid), f"process {pid} to end", 30.0)
+            wait_until(partial(has_ended, pid), f"process {pid} to end", 30.0)
 
 
 def check_log(path: Path, time_us: np.ndarray) -> None:

@@ -198,7 +198,7 @@ def test_a_learned_policy_flies_in_the_environment_of_its_card(
     linear: Path, tmp_path: Path, ablate: Any
 ) -> None:
     """The same network by hand, in an environment written down here."""
-    options = {"arena": ("static-obstacles",), "time_limit_s": 25.0}
+    options: dict[str, Any] = {"arena": ("static-obstacles",), "time_limit_s": 25.0}
     evaluate(linear, episodes=12, seed=3, ablate=ablate, out=tmp_path / "run", **options)
     spec = EnvironmentSpec(
         arena="static-obstacles",
@@ -248,7 +248,11 @@ def test_random_actions_do_not_depend_on_the_neighbours(tmp_path: Path) -> None:
 
 
 def test_the_latency_of_a_workload_is_flown_and_told(linear: Path, tmp_path: Path) -> None:
-    options = {"computer": "ras-pi-4", "workload": "template-5x32", "out": tmp_path / "run"}
+    options: dict[str, Any] = {
+        "computer": "ras-pi-4",
+        "workload": "template-5x32",
+        "out": tmp_path / "run",
+    }
     evaluate(linear, episodes=4, **options)
     run_ = load(tmp_path / "run")
     t2 = np.concatenate(
@@ -271,7 +275,12 @@ def test_the_latency_of_a_workload_is_flown_and_told(linear: Path, tmp_path: Pat
 
 
 def test_rules_that_are_asked_for_beat_those_of_the_card(linear: Path, tmp_path: Path) -> None:
-    rules = {"goal_radius_m": 5.0, "hold_s": 0.7, "altitude_m": 1.5, "hover_after_s": 0.1}
+    rules: dict[str, Any] = {
+        "goal_radius_m": 5.0,
+        "hold_s": 0.7,
+        "altitude_m": 1.5,
+        "hover_after_s": 0.1,
+    }
     evaluate(linear, episodes=2, **rules, out=tmp_path / "run")
     run_ = load(tmp_path / "run")
     assert all(e.goal_radius_m == 5.0 for e in run_.episodes)
@@ -461,7 +470,7 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
     reference: LoadedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "run"
-    options = {"arena": ("no-obstacles",), "episodes": 40, "out": out}
+    options: dict[str, Any] = {"arena": ("no-obstacles",), "episodes": 40, "out": out}
     monkeypatch.setattr(episode_saver, "INTERVAL_S", 60.0)
     monkeypatch.setattr(episode_saver, "MAX_WAITING", 10)
     real, calls = RunFolder.save_episodes, []
@@ -675,7 +684,11 @@ def test_a_table_goes_on_where_it_was_left(
     linear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "matrix"
-    options = {"arena": ("no-obstacles", "static-obstacles"), "episodes": 5, "out": out}
+    options: dict[str, Any] = {
+        "arena": ("no-obstacles", "static-obstacles"),
+        "episodes": 5,
+        "out": out,
+    }
     flights = []
     real = EpisodeSaver.add
 
@@ -740,7 +753,7 @@ def test_every_level_flies_by_the_rules_of_the_card(tmp_path: Path) -> None:
 @pytest.mark.timeout(300)
 def test_level_sitl_flies(linear: Path, tmp_path: Path) -> None:
     ports = vars(choose_ports())
-    options = {f"{name}_port": port for name, port in ports.items()}
+    options: dict[str, Any] = {f"{name}_port": port for name, port in ports.items()}
     options |= {"arena": "no-obstacles", "level": "sitl", "speed": 4.0}
     out = tmp_path / "run"
     code, text = evaluate(linear, episodes=1, seed=10, table=True, out=out, **options)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -21,7 +22,7 @@ import pytest
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import SilentProgress
 from airl_mav.experiments import campaign
-from airl_mav.experiments.fly import fly_live
+from airl_mav.experiments.live import fly_live
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.card import load_card
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
@@ -33,7 +34,7 @@ from tests.flight.test_evaluate import Page
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
 from tests.support.linear_policy import write_linear
-from tests.support.processes import Running, is_running, running, wait_until
+from tests.support.processes import Running, has_ended, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("lockstep-evaluation")]
@@ -214,7 +215,7 @@ class Evaluating:
         """Fail when one of its processes outlives it by more than a moment."""
         assert len(self.seen) >= 2
         for pid in self.seen:
-            wait_until(lambda pid=pid: not is_running(pid), "a process to end", 30.0)
+            wait_until(partial(has_ended, pid), "a process to end", 30.0)
 
 
 @contextmanager

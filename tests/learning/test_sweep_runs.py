@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from airl_mav.policy.template import Size
 from airl_mav.sweep.config import load_sweep
 from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import size_of, trials
-from tests.support.processes import PATIENCE_S, Running, is_running, running, wait_until
+from tests.support.processes import PATIENCE_S, Running, has_ended, running, wait_until
 from tests.support.sweep_kit import TINY, write_sweep_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sweep"), pytest.mark.timeout(400)]
@@ -178,7 +179,7 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
         held = SweepFolder(tmp_path / "out", config).results(trials(config))
         assert len(held) < TRIALS
         for pid in workers:
-            wait_until(lambda pid=pid: not is_running(pid), "an orphan to end", 30.0)
+            wait_until(partial(has_ended, pid), "an orphan to end", 30.0)
     with running(sweep(tmp_path, "--workers", "1"), tmp_path) as process:
         assert process.wait(PATIENCE_S * 2) == 0, process.text()
     assert outcome(tmp_path) == outcome(undisturbed)

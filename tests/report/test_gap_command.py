@@ -616,7 +616,8 @@ def test_a_card_with_a_wrong_delay_is_one_line(tmp_path: Path) -> None:
 def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
     entries = [run.entry for run in load_comparison(whole[0], "gap").runs][:1]
     gap, runs = build_comparison(whole[0], "gap", {}, entries)
-    assert gap.contrasts == gap.answers == ()
+    assert gap.contrasts == ()
+    assert gap.answers == ()
     document = show.comparison_to_document(gap, runs, whole[0])
     assert "Hardware gap" not in [section.title for section in document.sections]
 

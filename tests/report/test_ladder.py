@@ -339,7 +339,7 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compariso
             if index == 2:
                 record = replace(record, outcome=Outcome.ABORTED)
             path = replace(path, position=path.position + np.array([0.0, aside, 0.0]))
-            estimate = {
+            estimate: dict[str, np.ndarray] = {
                 # Between the samples of the path, and on after the verdict.
                 "estimate/time_us": path.time_us[:-1] + 10_000,
                 "estimate/position": 0.5 * (path.position[:-1] + path.position[1:])
@@ -361,10 +361,10 @@ def test_where_navigation_begins_and_what_is_believed(
     assert lockstep.start.n == 2  # The third one was aborted.
     assert lockstep.start.takeoff_s == pytest.approx(5.0, abs=0.02)
     paths = load(root / "lockstep")
-    at = [
-        p.position[np.searchsorted(p.time_us, e.navigation_us)]
-        for e, p in zip(paths.episodes, paths.trajectories.values(), strict=True)
-    ][:2]
+    at = []
+    for e, p in zip(paths.episodes[:2], list(paths.trajectories.values())[:2], strict=True):
+        assert e.navigation_us is not None
+        at.append(p.position[np.searchsorted(p.time_us, e.navigation_us)])
     assert lockstep.start.aside_m == pytest.approx(np.mean([np.hypot(*p[:2]) for p in at]))
     assert lockstep.start.height_m == pytest.approx(np.mean([-p[2] for p in at]))
     assert sitl.start.aside_m != pytest.approx(lockstep.start.aside_m)

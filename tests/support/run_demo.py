@@ -68,7 +68,9 @@ def demo_episode(
             t2 = int(rng.lognormal(np.log(396e3), 0.05))
             capture = now - int(rng.uniform(1e3, 33e3))
             stamps = np.cumsum([capture, rng.gamma(4, 400), 900, t2, 40]).astype(int)
-            log.record(*map(int, stamps), int(stamps[-1] + 500_000), (*map(float, command), 0.0))
+            a, b, c, d, e = (int(stamp) for stamp in stamps)
+            north, east, down = (float(v) for v in command)
+            log.record(a, b, c, d, e, e + 500_000, (north, east, down, 0.0))
             link, control = int(rng.gamma(2, 90)), int(rng.uniform(0, 8e3))
             setpoints.append((stamps[-1] + link, stamps[-1] + link + control))
             decide_us = int(stamps[-1]) + 500_000
@@ -78,7 +80,8 @@ def demo_episode(
         now += TICK_US
         power = 430.0 + 9.0 * abs(change[2]) + 4.0 * np.hypot(*change[:2])
         charge -= power * 0.02 / (14.8 * 5.2 * 3600)
-        sample = TruthSample(now, tuple(position), _hit(arena, position, now - started_us), charge)
+        x, y, z = position
+        sample = TruthSample(now, (x, y, z), _hit(arena, position, now - started_us), charge)
         ended = referee.observe(sample)
         recorder.add(now, position, velocity, [1.0, 0.0, 0.0, 0.0], power, keep=ended is not None)
     # A recording goes on until the vehicle is down, off the way it flew.

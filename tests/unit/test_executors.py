@@ -25,7 +25,7 @@ from airl_mav.experiments.executors import (
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.process_executor import ProcessExecutor
 from tests.support import worker_jobs
-from tests.support.processes import ROOT, is_running, running, wait_until
+from tests.support.processes import ROOT, has_ended, is_running, running, wait_until
 
 NEEDS_RAY = pytest.mark.skipif(find_spec("ray") is None, reason="not installed: airl-mav[ray]")
 
@@ -226,7 +226,7 @@ def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
         assert all(is_running(pid) for pid in pids)
         parent.process.send_signal(signal.SIGKILL)
         for pid in pids:
-            wait_until(lambda pid=pid: not is_running(pid), "an orphan to end", 30.0)
+            wait_until(partial(has_ended, pid), "an orphan to end", 30.0)
         # Nothing but what it was: no trace of a worker that was surprised.
         assert parent.text() == ""
 
