@@ -7,6 +7,7 @@ import itertools
 import math
 import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -168,9 +169,7 @@ def check_streams(autopilot: KinematicAutopilot, bench: Bench) -> set[str]:
             continue
         spoken.add(name)
         kind = KINDS[name]
-        assert packed(lambda v=values, k=kind: ours(k, v)) == packed(  # type: ignore[misc]
-            lambda v=values, k=kind: pymavlinks(k, v)  # type: ignore[misc]
-        )
+        assert packed(partial(ours, kind, values)) == packed(partial(pymavlinks, kind, values))
     return spoken
 
 

@@ -88,7 +88,9 @@ def test_counters(rig: Rig) -> None:
     assert rig.bench.server.filenos() == []
 
 
-def test_the_snapshot_is_only_taken_when_there_is_something_to_send() -> None:
+def test_the_snapshot_is_only_taken_when_there_is_something_to_send(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     autopilot = KinematicAutopilot()
     endpoint = MemoryEndpoint()
     server = MavlinkServer([onboard_link(endpoint)], autopilot, boot_unix_us=0)
@@ -110,7 +112,7 @@ def test_the_snapshot_is_only_taken_when_there_is_something_to_send() -> None:
         taken += 1
         return state()
 
-    autopilot.state = counted  # type: ignore[method-assign]
+    monkeypatch.setattr(autopilot, "state", counted)
     for _ in range(250):
         autopilot.step()
         server.receive(autopilot.time_us)

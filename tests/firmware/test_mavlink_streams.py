@@ -468,7 +468,9 @@ def test_the_origin_is_announced_once_on_every_link() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300])
-def test_a_diverged_estimate_silences_no_heartbeat(bad: float) -> None:
+def test_a_diverged_estimate_silences_no_heartbeat(
+    bad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     autopilot = flown()
     bench = Bench(autopilot=autopilot)
     client = RawClient(bench.memory)
@@ -485,7 +487,7 @@ def test_a_diverged_estimate_silences_no_heartbeat(bad: float) -> None:
             field[:] = bad
         return state
 
-    autopilot.state = diverged  # type: ignore[method-assign]
+    monkeypatch.setattr(autopilot, "state", diverged)
     bench.run(2.0)
     counts = client.count()
     assert counts["HEARTBEAT"] == 2

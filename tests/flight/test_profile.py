@@ -47,13 +47,12 @@ SMALL = ("--network", "2x4", "--image", "64x48")
 
 def profiled(out: Path, *words: str) -> str:
     """Run the command; return what it printed."""
-    console = Console(file=io.StringIO(), width=200, force_terminal=False)
+    printed = io.StringIO()
+    console = Console(file=printed, width=200, force_terminal=False)
     few = ("--decisions", "80", "--warm-up", "5")
     given = ("--on", "box", "--out", str(out), *few, *words)
     assert command.run(read_options(command.OPTIONS, "airl profile", given), console) == 0
-    printed = console.file.getvalue()  # type: ignore[attr-defined]
-    assert isinstance(printed, str)
-    return printed
+    return printed.getvalue()
 
 
 def test_profile_flies(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ FORWARD = 22
 """`arc-25`: full speed ahead."""
 
 
-class _Canvas(FigureCanvasAgg):  # type: ignore[misc]
+class _Canvas(FigureCanvasAgg):  # type: ignore[misc]  # matplotlib is not followed
     """A window without a display: events do nothing."""
 
     manager_class = FigureManagerBase
@@ -59,8 +59,8 @@ class _Canvas(FigureCanvasAgg):  # type: ignore[misc]
 @pytest.fixture
 def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
     """A matplotlib backend that pretends to have a display; what it showed."""
-    backend = types.ModuleType("pretended_display")
-    backend.FigureCanvas = _Canvas  # type: ignore[attr-defined]
+    backend: Any = types.ModuleType("pretended_display")
+    backend.FigureCanvas = _Canvas
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
     _Canvas.shown.clear()
     with mpl.rc_context():

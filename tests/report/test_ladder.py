@@ -21,6 +21,7 @@ import pytest
 from PIL import Image
 
 from airl_mav.cli import main
+from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import ladder as ladder_experiment
 from airl_mav.experiments.campaign import Cell
@@ -331,8 +332,9 @@ def ladder_of(root: Path, facts: dict[str, Any], levels: list[RunEntry]) -> Comp
 def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Comparison]:
     """Flights that begin with a take-off, at two levels that are 0.3 m apart."""
     root = tmp_path_factory.mktemp("rehearsed")
-    for level, aside in (("lockstep", 0.0), ("sitl", 0.3)):
-        setup = replace(demo_setup(), level=level)  # type: ignore[arg-type]
+    sides: dict[Level, float] = {"lockstep": 0.0, "sitl": 0.3}
+    for level, aside in sides.items():
+        setup = replace(demo_setup(), level=level)
         folder = RunFolder.create(root / level, "demo", {}, setup=setup)
         for index in range(3):
             record, path, latency = demo_episode(index, demo_arena(index + 1))

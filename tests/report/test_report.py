@@ -393,9 +393,10 @@ def test_the_terminal_shows_the_same_tables_in_80_columns(
     demo: tuple[LoadedRun, dict[int, Arena]],
 ) -> None:
     run, _ = demo
-    console = Console(file=io.StringIO(), width=80, color_system=None)
+    printed = io.StringIO()
+    console = Console(file=printed, width=80, color_system=None)
     print_report(run, console, Path("runs/demo/report.html"))
-    text = console.file.getvalue()  # type: ignore[attr-defined]
+    text = printed.getvalue()
     assert "…" not in text.replace(" … ", "")
     assert "runs/demo/report.html" in text
     summary = summarize_run(run)

@@ -102,7 +102,7 @@ def _die(how: str) -> None:
             os.write(connection.fileno(), bytes(data)[:3])
             os._exit(7)
 
-        Connection._send = half  # type: ignore[attr-defined]
+        Connection._send = half  # type: ignore[attr-defined]  # private, not in the stubs
 
 
 def complains(how: str, stop: Stop) -> Callable[[int], list[int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -398,7 +399,7 @@ def test_a_longer_hold_makes_greedy_slower_before_an_obstacle() -> None:
 
 
 @pytest.mark.parametrize("find", [find_policy, lambda name: load_policy(name, 0.5)])
-def test_an_unknown_policy_lists_those_that_exist(find) -> None:  # type: ignore[no-untyped-def]
+def test_an_unknown_policy_lists_those_that_exist(find: Callable[[str], object]) -> None:
     with pytest.raises(UsageError) as error:
         find("gredy")
     assert "'gredy'" in str(error.value)

@@ -327,9 +327,10 @@ def test_policies_are_found_by_name_and_by_path(
 
 
 def test_greedy_takes_no_runtime_and_no_ablation() -> None:
-    for options in ({"runtime": "torch"}, {"ablate": "depth"}):
+    cases: list[dict[str, Any]] = [{"runtime": "torch"}, {"ablate": "depth"}]
+    for options in cases:
         with pytest.raises(UsageError, match="accepted: for a learned policy; greedy is none"):
-            load_policy("greedy", 0.5, **options)  # type: ignore[arg-type]
+            load_policy("greedy", 0.5, **options)
 
 
 # --- the card's settings in flight

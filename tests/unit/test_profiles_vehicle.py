@@ -19,8 +19,8 @@ from pydantic.fields import FieldInfo
 
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
-from airl_mav.profiles.loading import list_profiles, load_profile, profiles_dir
-from airl_mav.profiles.parameters import SPECS
+from airl_mav.profiles.loading import Kind, list_profiles, load_profile, profiles_dir
+from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.autopilot.parameter_store import Parameters
 
@@ -230,12 +230,12 @@ def test_a_parameter_that_is_no_number_is_refused(tmp_path: Path, value: str) ->
 
 
 @pytest.mark.parametrize("kind", ["vehicles", "computers", "arenas"])
-def test_an_unknown_profile_lists_those_that_exist(kind: str) -> None:
+def test_an_unknown_profile_lists_those_that_exist(kind: Kind) -> None:
     shipped = sorted(path.stem for path in (ROOT / "profiles" / kind).glob("*.toml"))
     assert shipped
-    assert list_profiles(kind) == shipped  # type: ignore[arg-type]
+    assert list_profiles(kind) == shipped
     with pytest.raises(UsageError) as error:
-        load_profile(kind, "no-such-thing", VehicleProfile)  # type: ignore[arg-type]
+        load_profile(kind, "no-such-thing", VehicleProfile)
     assert "'no-such-thing'" in str(error.value)
     assert ", ".join(shipped) in str(error.value)
     assert "\n" not in str(error.value)
@@ -343,7 +343,9 @@ def test_an_unknown_name_is_nothing() -> None:
 
 
 @given(st.sampled_from(SPECS), st.floats(width=32) | st.integers(-(2**31), 2**31 - 1))
-def test_set_clamps_keeps_the_type_and_ignores_what_is_not_finite(spec, value) -> None:  # type: ignore[no-untyped-def]
+def test_set_clamps_keeps_the_type_and_ignores_what_is_not_finite(
+    spec: ParameterSpec, value: float
+) -> None:
     store = Parameters()
     heard: list[float] = []
     store.on_change(lambda: heard.append(store[spec.name]))

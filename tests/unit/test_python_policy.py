@@ -1,6 +1,7 @@
 """A policy that a user writes as a class in a file of his own."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,9 +47,10 @@ def file(tmp_path: Path) -> Path:
 def test_it_is_found_and_made_anew_for_each_flight(file: Path) -> None:
     known = find_policy(f"{file}:Follow")
     assert (known.name, known.description, known.card) == ("Follow", "Counts.", None)
-    first, second = load_policy(known, 0.5), load_policy(known, 0.5)
-    first.act("observation")  # type: ignore[arg-type]
-    assert (first.seen, second.seen) == ([0], [])  # type: ignore[attr-defined]
+    made: list[Any] = [load_policy(known, 0.5), load_policy(known, 0.5)]
+    first, second = made
+    first.act("observation")
+    assert (first.seen, second.seen) == ([0], [])
 
 
 def test_another_file_is_another_policy(file: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from airl_mav.cli import entry, listing
-from airl_mav.profiles.loading import list_profiles, profiles_dir
+from airl_mav.profiles.loading import Kind, list_profiles, profiles_dir
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT
 from tests.support.run_demo import write_demo_run
@@ -50,10 +50,10 @@ def refuse(
     ("option", "kind"),
     [("--vehicle", "vehicles"), ("--arena", "arenas"), ("--computer", "computers")],
 )
-def test_unknown_profile_lists_those_that_exist(refuse: Run, option: str, kind: str) -> None:
+def test_unknown_profile_lists_those_that_exist(refuse: Run, option: str, kind: Kind) -> None:
     line = refuse(entry.sitl, option, "zeppelin")
     assert "'zeppelin'" in line
-    for name in list_profiles(kind):  # type: ignore[arg-type]
+    for name in list_profiles(kind):
         assert name in line
 
 
