@@ -156,4 +156,4 @@ def test_nobody_there(tmp_path: Path) -> None:
     url = f"udpin://{LOOPBACK}:{port}"
     with conformance(tmp_path, "--connect", url, "--connect-timeout-s", "1") as command:
         assert command.wait() == 2, command.text()
-        assert f"connect {url!r}: no flight controller heard in 1 s" in command.text()
+        assert f"--connect {url}: no flight controller heard in 1 s" in command.text()

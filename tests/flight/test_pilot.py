@@ -337,7 +337,7 @@ def test_persist_keeps_the_last_command(watched: list[Flight]) -> None:
     """PX4's and MAVSDK's semantics: nothing happens between two commands."""
     clock = WallClock(SPEED)
     settings, slow = PilotSettings(hold_s=0.2), FixedSampler(800_000)
-    patient = WatchdogSettings(decision_timeout_s=600.0)
+    patient = WatchdogSettings(decision_timeout_s=60.0)
     flight = Flight(clock, Script(*[forward()] * 3), settings, slow, patient)
     watched.append(flight)
     flight.watch()
@@ -351,7 +351,7 @@ def test_hover_after_zeroes_between_commands(watched: list[Flight]) -> None:
     """AirSim's semantics: an action ends, whether or not the next one is ready."""
     clock = WallClock(SPEED)
     settings, slow = PilotSettings(hold_s=0.2), FixedSampler(2_500_000)
-    hover = WatchdogSettings(decision_timeout_s=600.0, hover_after_s=0.1)
+    hover = WatchdogSettings(decision_timeout_s=60.0, hover_after_s=0.1)
     flight = Flight(clock, Script(*[forward()] * 2), settings, slow, hover)
     watched.append(flight)
     flight.watch()
@@ -408,7 +408,7 @@ def test_decision_that_comes_late_but_in_time_flies_on(watched: list[Flight]) ->
         wait_for(lambda: flight.watchdog.notes)
         return Action(2.0, 0.0, 0.0)
 
-    bounds = WatchdogSettings(decision_timeout_s=0.8, leave_after_s=600.0)
+    bounds = WatchdogSettings(decision_timeout_s=0.8, leave_after_s=60.0)
     flight = Flight(clock, Script(forward(), late, late), watchdog=bounds)
     watched.append(flight)
     flight.watch()
