@@ -188,9 +188,14 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
 def test_two_at_once_are_refused(tmp_path: Path) -> None:
     with running(sweep(tmp_path, "--workers", "1"), tmp_path) as first:
         wait_until(lambda: (tmp_path / "out" / "sweep.json").exists(), "the first")
-        with running(sweep(tmp_path), tmp_path) as second:
-            assert second.wait() == 2, second.text()
-            assert "another run flies into it" in second.text()
+        # Stopped, so that it cannot end while the second waits for its processes.
+        first.process.send_signal(signal.SIGSTOP)
+        try:
+            with running(sweep(tmp_path), tmp_path) as second:
+                assert second.wait() == 2, second.text()
+                assert "another run flies into it" in second.text()
+        finally:
+            first.process.send_signal(signal.SIGCONT)
         assert first.process.poll() is None
 
 
