@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
@@ -11,16 +12,17 @@ from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.policy.registry import find_policy, policy_names
-from airl_mav.profiles.loading import describe_profile, list_profiles
+from airl_mav.profiles.loading import Kind, describe_profile, list_profiles
 
+
+def _profiles(kind: Kind) -> list[tuple[str, str]]:
+    return [(name, describe_profile(kind, name)) for name in list_profiles(kind)]
+
+
+PROFILES: tuple[Kind, ...] = ("vehicles", "arenas", "computers", "training", "sweeps")
 KINDS: dict[str, Callable[[], list[tuple[str, str]]]] = {
     "policies": lambda: [(name, find_policy(name).description) for name in policy_names()],
-    **{
-        kind: lambda kind=kind: [  # type: ignore[misc]  # bound now, not when it is called
-            (name, describe_profile(kind, name)) for name in list_profiles(kind)
-        ]
-        for kind in ("vehicles", "arenas", "computers", "training", "sweeps")
-    },
+    **{kind: partial(_profiles, kind) for kind in PROFILES},
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
+from functools import partial
 
 from airl_mav.conformance.checklist import CheckFailedError, Checklist, Line, Transcript, require
 from airl_mav.conformance.flight_checks import (
@@ -102,7 +103,7 @@ def check_conformance(
         for name in STEP_NAMES:
             if name in settings.steps:
                 found, stored = result.steps.get(name), result.reference
-                checklist.perform(f"step {name}", lambda: judge(found, stored))  # noqa: B023
+                checklist.perform(f"step {name}", partial(judge, found, stored))
     return result
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.flight.judge import TIME_LIMIT_S
 
 DEFAULT_POLICY = "static-obstacles"
 """The shipped policy that flies by default."""
@@ -336,7 +337,7 @@ class Flights(Workers):
         None,
     )
     time_limit_s: float = quantity(
-        "longest flight from the start of navigation", "s", ge=1, le=3600, default=120.0
+        "longest flight from the start of navigation", "s", ge=1, le=3600, default=TIME_LIMIT_S
     )
     speed: Annotated[float | None, FREE] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"

@@ -11,6 +11,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
+from airl_mav.flight.judge import TIME_LIMIT_S
 from airl_mav.scenario.checks import check_firmware, check_ports
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
@@ -113,7 +114,7 @@ class StandAloneVehicle(Aircraft):
         "s",
         ge=1,
         le=3600,
-        default=120.0,
+        default=TIME_LIMIT_S,
     )
     tlog: Path | None = Field(
         default=None, description="write the MAVLink log of the onboard link to this file"
