@@ -31,15 +31,9 @@ def ned_to_enu(v: Vector) -> Vector:
     return np.stack([v[..., 1], v[..., 0], -v[..., 2]], axis=-1)
 
 
-enu_to_ned = ned_to_enu
-
-
 def frd_to_flu(v: Vector) -> Vector:
     """Swap a body vector (..., 3) between FRD and FLU. Its own inverse."""
     return np.stack([v[..., 0], -v[..., 1], -v[..., 2]], axis=-1)
-
-
-flu_to_frd = frd_to_flu
 
 
 def quat_multiply(a: Vector, b: Vector) -> Vector:
@@ -54,11 +48,6 @@ def quat_multiply(a: Vector, b: Vector) -> Vector:
             w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
         ]
     )
-
-
-def quat_conjugate(q: Vector) -> Vector:
-    """Return the inverse rotation of a unit quaternion (4,)."""
-    return np.array([q[0], -q[1], -q[2], -q[3]])
 
 
 def quat_normalize(q: Vector) -> Vector:
@@ -79,12 +68,6 @@ def quat_to_matrix(q: Vector) -> Vector:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def quat_rotate(q: Vector, v: Vector) -> Vector:
-    """Rotate a body vector (3,) into the world by a unit quaternion (4,)."""
-    rotated: Vector = quat_to_matrix(q) @ v
-    return rotated
 
 
 def quat_from_euler(roll: float, pitch: float, yaw: float) -> Vector:
@@ -148,11 +131,6 @@ def quat_ned_frd_to_enu_flu(q: Vector) -> Vector:
 def quat_wxyz_to_xyzw(q: Vector) -> tuple[float, float, float, float]:
     """Reorder to pybullet's and scipy's scalar-last quaternion."""
     return float(q[1]), float(q[2]), float(q[3]), float(q[0])
-
-
-def quat_xyzw_to_wxyz(q: tuple[float, float, float, float]) -> Vector:
-    """Reorder from pybullet's and scipy's scalar-last quaternion (4,)."""
-    return np.array([q[3], q[0], q[1], q[2]])
 
 
 def ned_to_heading(v: Vector, yaw: float | Vector) -> Vector:

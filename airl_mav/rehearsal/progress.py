@@ -22,31 +22,6 @@ OUTCOME_STYLES = {
 }
 
 
-class EpisodeCounter:
-    """A bar over the episodes of a run, with the success rate so far. Implements nothing else."""
-
-    def __init__(
-        self, progress: Progress, title: str, done: tuple[EpisodeRecord, ...], episodes: int
-    ) -> None:
-        """Begin with the episodes that were flown before, of so many in all."""
-        self.finished_records: list[EpisodeRecord] = []
-        """Those that have ended while it looked on, in that order."""
-        self._outcomes = [record.outcome for record in done]
-        self._bar = progress.bar(title, episodes, completed=len(done), unit="episodes")
-
-    def finished(self, record: EpisodeRecord) -> None:
-        """Count an episode that has just been saved."""
-        self.finished_records.append(record)
-        self._outcomes.append(record.outcome)
-        reached = self._outcomes.count(Outcome.SUCCESS) / len(self._outcomes)
-        self._bar.update(postfix=f"{100.0 * reached:.1f} % reached the goal")
-        self._bar.advance()
-
-    def close(self) -> None:
-        """Remove the bar."""
-        self._bar.close()
-
-
 class LiveObserver:
     """Shows a rehearsal as it flies. Implements `rehearsal.Observer`."""
 

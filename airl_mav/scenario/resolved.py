@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel
 
 from airl_mav.core.constants import Level
 from airl_mav.flight.judge import Task
@@ -190,7 +190,3 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
-
-
-RESOLVED: TypeAdapter[ResolvedScenario] = TypeAdapter(ResolvedScenario)
-"""Writes a resolved scenario as JSON and reads it back, bit by bit the same."""

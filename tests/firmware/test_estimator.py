@@ -26,7 +26,6 @@ from airl_mav.core.frames import (
     geodetic_to_local,
     local_to_geodetic,
     quat_wxyz_to_xyzw,
-    quat_xyzw_to_wxyz,
 )
 from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
 from firmware_sim.autopilot import error_state as es
@@ -265,7 +264,7 @@ def test_measurement_jacobians(seed: int) -> None:
     witness, state = estimator.filter, estimator.state
     assert isinstance(witness, Witness)
     r = Rotation.from_euler("ZYX", rng.uniform([-3, -0.8, -0.8], [3, 0.8, 0.8]))
-    state[es.Q : es.RATES] = quat_xyzw_to_wxyz(tuple(r.as_quat()))
+    state[es.Q : es.RATES] = np.roll(r.as_quat(), 1)
     p, v = rng.normal(0, 3, 3), rng.normal(0, 3, 3)
     state[es.P : es.V], state[es.V : es.Q] = p, v
     assert estimator.origin is not None
@@ -297,7 +296,7 @@ def test_transition_matrix(seed: int) -> None:
     rng = np.random.default_rng(seed)
     before = es.new_state()
     x, y, z, w = Rotation.random(rng=rng).as_quat()
-    before[es.Q : es.RATES] = quat_xyzw_to_wxyz((x, y, z, w))
+    before[es.Q : es.RATES] = (w, x, y, z)
     before[es.P : es.Q] = rng.normal(0, 3, 6)
     before[es.GYRO_BIAS : es.BARO_OFFSET] = rng.normal(0, 0.1, 6)
     gyro, accel = rng.normal(0, 1, 3), rng.normal(0, 3, 3) - [0, 0, 9.8]

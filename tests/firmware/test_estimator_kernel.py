@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import quat_xyzw_to_wxyz
 from airl_mav.scenario.model import WindSettings
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
@@ -224,7 +223,7 @@ def random_state(rng: np.random.Generator) -> np.ndarray:
     state = es.new_state()
     state[es.P : es.Q] = rng.normal(0, 5, 6)
     x, y, z, w = Rotation.random(rng=rng).as_quat()
-    state[es.Q : es.RATES] = quat_xyzw_to_wxyz((x, y, z, w))
+    state[es.Q : es.RATES] = (w, x, y, z)
     state[es.GYRO_BIAS : es.ACCELERATION] = rng.normal(0, 0.1, 7)
     return state
 

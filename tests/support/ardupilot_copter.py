@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.frames import local_to_geodetic, quat_conjugate, quat_normalize, quat_rotate
+from airl_mav.core.frames import local_to_geodetic, quat_normalize, quat_to_matrix
 from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -115,7 +115,7 @@ class Copter:
             np.mean([s.gyro for s in self._imu], axis=0),
             temperature_c(HOME.altitude_m),
             _BATTERY,
-            quat_rotate(quat_conjugate(attitude), MAGNETIC_FIELD_NED),
+            quat_to_matrix(attitude).T @ MAGNETIC_FIELD_NED,
             pressure,
             gps,
         )

@@ -29,6 +29,9 @@ quaternions = (
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
+INVERTED = np.array([1.0, -1.0, -1.0, -1.0])
+"""A unit quaternion times these signs is the inverse rotation."""
+
 
 def to_scipy(q: np.ndarray) -> Rotation:
     return Rotation.from_quat(frames.quat_wxyz_to_xyzw(q))
@@ -57,7 +60,7 @@ def test_identity_and_inverse(q: np.ndarray) -> None:
     identity = np.array([1.0, 0.0, 0.0, 0.0])
     np.testing.assert_array_equal(frames.quat_multiply(q, identity), q)
     np.testing.assert_array_equal(frames.quat_multiply(identity, q), q)
-    conjugate = frames.quat_conjugate(q)
+    conjugate = q * INVERTED
     np.testing.assert_allclose(frames.quat_multiply(q, conjugate), identity, atol=1e-12)
     np.testing.assert_allclose(frames.quat_multiply(conjugate, q), identity, atol=1e-12)
 
@@ -78,16 +81,15 @@ def test_a_zero_quaternion_is_refused() -> None:
 # --- scipy
 
 
-@given(quaternions, vectors)
-def test_matrix_and_rotation_of_vectors(q: np.ndarray, v: np.ndarray) -> None:
+@given(quaternions)
+def test_matrix(q: np.ndarray) -> None:
     np.testing.assert_allclose(frames.quat_to_matrix(q), to_scipy(q).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(frames.quat_rotate(q, v), to_scipy(q).apply(v), atol=1e-9)
 
 
 @given(quaternions, quaternions)
 def test_product(a: np.ndarray, b: np.ndarray) -> None:
     ours = frames.quat_multiply(a, b)
-    theirs = frames.quat_xyzw_to_wxyz(tuple((to_scipy(a) * to_scipy(b)).as_quat()))
+    theirs = np.roll((to_scipy(a) * to_scipy(b)).as_quat(), 1)
     assert same_rotation(ours, theirs)
 
 
@@ -95,7 +97,7 @@ def test_product(a: np.ndarray, b: np.ndarray) -> None:
 def test_euler_angles_are_the_aerospace_sequence(roll: float, pitch: float, yaw: float) -> None:
     q = frames.quat_from_euler(roll, pitch, yaw)
     reference = Rotation.from_euler("ZYX", [yaw, pitch, roll])
-    assert same_rotation(q, frames.quat_xyzw_to_wxyz(tuple(reference.as_quat())))
+    assert same_rotation(q, np.roll(reference.as_quat(), 1))
     euler = frames.quat_to_euler(q)
     # Near the pole two angles melt into one: compare the rotation, not the angles.
     assert same_rotation(q, frames.quat_from_euler(*euler))
@@ -121,8 +123,8 @@ def test_euler_at_the_poles_is_finite_and_the_same_rotation(pitch: float) -> Non
 def test_axis_swaps(v: np.ndarray) -> None:
     np.testing.assert_array_equal(frames.ned_to_enu(v), ENU_FROM_NED @ v)
     np.testing.assert_array_equal(frames.frd_to_flu(v), FLU_FROM_FRD @ v)
-    np.testing.assert_array_equal(frames.enu_to_ned(frames.ned_to_enu(v)), v)
-    np.testing.assert_array_equal(frames.flu_to_frd(frames.frd_to_flu(v)), v)
+    np.testing.assert_array_equal(frames.ned_to_enu(frames.ned_to_enu(v)), v)
+    np.testing.assert_array_equal(frames.frd_to_flu(frames.frd_to_flu(v)), v)
 
 
 def test_axis_swaps_take_stacks() -> None:
@@ -235,13 +237,13 @@ def test_millimetres_survive_the_way_over_the_globe() -> None:
 @given(quaternions, quaternions, vectors)
 def test_kernels_agree(a: np.ndarray, b: np.ndarray, v: np.ndarray) -> None:
     ta, tb, tv = tuple(a), tuple(b), tuple(v)
-    np.testing.assert_allclose(kernels.rotate(ta, tv), frames.quat_rotate(a, v), atol=1e-10)
+    np.testing.assert_allclose(kernels.rotate(ta, tv), frames.quat_to_matrix(a) @ v, atol=1e-10)
     np.testing.assert_allclose(kernels.multiply(ta, tb), frames.quat_multiply(a, b), atol=1e-12)
-    np.testing.assert_array_equal(kernels.conjugate(ta), frames.quat_conjugate(a))
+    np.testing.assert_array_equal(kernels.conjugate(ta), a * INVERTED)
     np.testing.assert_allclose(kernels.normalize(tuple(3.0 * a)), a, atol=1e-12)
     assert kernels.yaw_of(ta) == pytest.approx(frames.quat_yaw(a), abs=1e-12)
     r = 0.03 * v
-    exponential = frames.quat_xyzw_to_wxyz(tuple(Rotation.from_rotvec(r).as_quat()))
+    exponential = np.roll(Rotation.from_rotvec(r).as_quat(), 1)
     assert same_rotation(np.array(kernels.exponential(tuple(r))), exponential)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from rich.console import Console
 
@@ -21,7 +21,7 @@ from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.file import load_scenario, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.scenario.resolved import RESOLVED
+from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import StandAloneCompanion, StandAloneVehicle
 from tests.support.processes import ROOT
 
@@ -79,10 +79,11 @@ BUSY: dict[str, Any] = {
 )
 def test_a_resolved_scenario_survives_json_bit_by_bit(fields: dict[str, Any]) -> None:
     resolved = resolve(Scenario.model_validate(fields))
-    text = RESOLVED.dump_json(resolved)
-    again = RESOLVED.validate_json(text)
+    adapter = TypeAdapter(ResolvedScenario)
+    text = adapter.dump_json(resolved)
+    again = adapter.validate_json(text)
     assert again == resolved
-    assert RESOLVED.dump_json(again) == text
+    assert adapter.dump_json(again) == text
     # What flies is decided the same way on both sides of the pipe.
     assert (again.companion_pilot, again.setup, again.rules) == (
         resolved.companion_pilot,
