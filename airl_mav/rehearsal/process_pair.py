@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import queue
+import sys
+import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
-from airl_mav.core.child_process import Exited
+from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.channel import Begin, Event, Failed, Ready
-from airl_mav.rehearsal.process import Child
+from airl_mav.rehearsal.channel import Begin, Event, Failed, Ready, parse_event
 
 FIRMWARE, COMPANION = "firmware", "companion"
 
@@ -45,6 +47,62 @@ class LostError(Exception):
         self.what, self.detail = what, detail
 
 
+class Child(ChildProcess):
+    """One of our programs; its events and its end arrive in a shared queue."""
+
+    def __init__(
+        self,
+        name: str,
+        module: str,
+        log: Path,
+        events: queue.Queue[tuple[str, Event | Exited]],
+        *,
+        keeps: Sequence[int] = (),
+    ) -> None:
+        """Start `python -m module`.
+
+        Args:
+            name: What it is called in messages and in the queue.
+            module: Python module with a `__main__` guard.
+            log: Its standard error goes here.
+            events: Gets (name, event); after the last one (name, Exited).
+            keeps: File descriptors that it inherits and never uses: locks.
+        """
+        super().__init__([sys.executable, "-m", module], log, capture_stdout=True, inherited=keeps)
+        self.name = name
+        self.ending = False
+        """Its end is wanted: no surprise when it comes."""
+        self._events = events
+        self._reader = threading.Thread(target=self._read, name=f"{name}-events", daemon=True)
+        self._reader.start()
+
+    def send(self, request: BaseModel) -> None:
+        """Send a request; a dead child's end is reported through the queue."""
+        if self.stdin is not None:
+            with suppress(BrokenPipeError, ValueError):
+                self.stdin.write(request.model_dump_json().encode() + b"\n")
+                self.stdin.flush()
+
+    def stop(self) -> None:
+        """End it; see `ChildProcess.stop`. All its events are in the queue then."""
+        self.ending = True
+        super().stop()
+        self._reader.join(GRACE_S)
+
+    def kill(self) -> None:
+        """End it at once; does not wait."""
+        self.ending = True
+        super().kill()
+
+    def _read(self) -> None:
+        if self.stdout is not None:
+            for line in self.stdout:
+                with suppress(ValidationError):  # a line that is not ours: nothing to act on
+                    self._events.put((self.name, parse_event(line)))
+            self.stdout.close()
+        self._events.put((self.name, self.wait()))
+
+
 class ProcessPair:
     """Two processes that fly together; after a loss a new pair takes over."""
 
@@ -66,7 +124,7 @@ class ProcessPair:
         """
         for name, module in MODULES.items():
             log = logs / f"{name}.log"
-            self._children[name] = child = Child(name, module, [], log, self._events, keeps=keeps)
+            self._children[name] = child = Child(name, module, log, self._events, keeps=keeps)
             child.send(begin)
         ready: set[str] = set()
 

@@ -29,7 +29,7 @@ from airl_mav.rehearsal.channel import (
     Shutdown,
     parse_event,
 )
-from airl_mav.rehearsal.process import Child
+from airl_mav.rehearsal.process_pair import Child
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 
@@ -240,7 +240,7 @@ def test_child_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = str(Path(__file__).resolve().parents[2])
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([root, str(tmp_path)]))
     events: queue.Queue[Any] = queue.Queue()
-    child = Child("c", "chatterbox", [], tmp_path / "c.log", events)
+    child = Child("c", "chatterbox", tmp_path / "c.log", events)
     try:
         assert events.get(timeout=60.0) == ("c", Ready())
         child.send(FinishEpisode())
