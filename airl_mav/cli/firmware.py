@@ -9,8 +9,8 @@ from rich.console import Console
 
 from airl_mav.cli.options import run_command
 from airl_mav.core.errors import EXIT_BROKEN
-from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
+from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.stand_alone import Listener, fly_vehicle
 from airl_mav.scenario.resolved import FIRMWARE_TITLES
 from airl_mav.scenario.stand_alone import StandAloneVehicle

@@ -16,7 +16,7 @@ from airl_mav.core.cpu_quota import remove_left
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.evaluation import open_folder
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import LiveObserver
@@ -95,7 +95,7 @@ def fly_live(
         try:
             if asked.level == "lockstep":
                 # Imported here: level sitl starts its processes sooner without the simulator.
-                from airl_mav.lockstep.rehearsal import rehearse
+                from airl_mav.lockstep.flight import rehearse
 
                 rehearse(scenario, folder, observer, indices)
             else:

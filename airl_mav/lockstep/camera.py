@@ -1,4 +1,4 @@
-"""The camera's frames in lockstep: from the plant to the companion through memory."""
+"""The camera's frames in lockstep: held back until the companion may see them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from companion.camera import ReceivedFrame
+from companion.tokens import NO_FRAME
+from firmware_sim.firmware import FrameServer
 
 
 class UnderWay:
@@ -91,3 +93,42 @@ class MemoryCamera:
             else:
                 under_way.published.clear()
                 clock.sleep_until(deadline_us, under_way.published)
+
+
+class TokenCamera:
+    """The camera of a companion in another process. Implements `firmware.FrameServer`.
+
+    Only the newest frame that has arrived when a turn begins is sent: the companion could not see
+    any other.
+    """
+
+    def __init__(self, server: FrameServer, transport_us: int) -> None:
+        """Take where the frames go, and the time from a frame's exposure until it arrives [µs]."""
+        self.under_way = UnderWay(transport_us)
+        self.endpoint = server.endpoint
+        self._server = server
+        self._newest: Frame | None = None
+
+    def publish(self, frame: Frame) -> None:
+        """Send a frame on its way, in simulated time."""
+        self.under_way.send(frame)
+
+    def arrive(self, now_us: int) -> bool:
+        """Take in what has arrived by `now_us` [µs]; return whether that is anything."""
+        arrived = self.under_way.arrived(now_us)
+        self._newest = arrived or self._newest
+        return arrived is not None
+
+    @property
+    def sequence(self) -> int:
+        """Sequence of the newest frame that has arrived."""
+        return NO_FRAME if self._newest is None else self._newest.sequence
+
+    def send(self) -> None:
+        """Send that frame, by the wall clock; also again, to whoever may have missed it."""
+        if self._newest is not None:
+            self._server.publish(self._newest)
+
+    def close(self) -> None:
+        """Forget all frames; the server is its owner's to close."""
+        self.under_way.clear()

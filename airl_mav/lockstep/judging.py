@@ -43,11 +43,6 @@ class Judge:
         """What has been hit so far."""
         return self._crash.hit
 
-    def begin(self, started_us: int) -> None:
-        """The episode begins, at a simulated time [µs]."""
-        if self._supervisor is not None:
-            self._supervisor.started_us = started_us
-
     def enter(self, phase: str, time_us: int) -> None:
         """The companion has entered a phase, at a simulated time [µs]."""
         if self._supervisor is None or phase != "navigating":

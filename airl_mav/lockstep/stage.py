@@ -12,10 +12,9 @@ from airl_mav.core.errors import UsageError
 from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
 from airl_mav.lockstep.threaded import ThreadPartner
-from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.mavsdk_link import RAW_URL, MavsdkLink
 from firmware_sim.firmware import BuiltinFlightStack, Firmware

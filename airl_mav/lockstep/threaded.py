@@ -16,9 +16,8 @@ from queue import Empty, SimpleQueue
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.frames import newest_heartbeat
-from airl_mav.lockstep.turns import Turn
+from airl_mav.lockstep.turns import LockstepError, Turn
 from companion.conducted import Abandoned
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.errors import LockstepError
+from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.frames import datagrams, newest_heartbeat
-from airl_mav.lockstep.token_camera import TokenCamera
-from airl_mav.lockstep.turns import Turn
+from airl_mav.lockstep.turns import LockstepError, Turn
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
@@ -42,16 +41,6 @@ _TURN_BACK = re.compile(r"D\d+\b")
 
 
 @dataclass(frozen=True)
-class TokenSettings:
-    """How patient the vehicle is with its companion."""
-
-    turn_us: int = TURN_US
-    """A companion that does not say when it wants the next turn has it so long after [µs]."""
-    patience_s: float = COMPANION_TIMEOUT_S
-    """Longest turn of the companion [s of wall time, while this process runs]."""
-
-
-@dataclass(frozen=True)
 class _Rest:
     """What the companion waits for."""
 
@@ -67,8 +56,9 @@ class TokenPartner:
         self,
         endpoint: UdpEndpoint,
         camera: TokenCamera,
-        settings: TokenSettings,
         *,
+        turn_us: int = TURN_US,
+        patience_s: float = COMPANION_TIMEOUT_S,
         broken_off: Callable[[], bool] = lambda: False,
         phase: Callable[[str, int], None] = lambda _phase, _time_us: None,
     ) -> None:
@@ -77,14 +67,16 @@ class TokenPartner:
         Args:
             endpoint: Where the companion is, or will be.
             camera: Its frames.
-            settings: How patient to be.
+            turn_us: A companion that does not say when it wants the next turn has it so long
+                after [µs].
+            patience_s: Longest turn of the companion [s of wall time, while this process runs].
             broken_off: Asked again and again while waiting for the companion; True ends the wait
                 and, for this flight, the companion.
             phase: Called with each phase that the companion tells, and the simulated time [µs].
         """
         self._endpoint = endpoint
         self._camera = camera
-        self._settings = settings
+        self._turn_us, self._patience_s = turn_us, patience_s
         self._broken_off = broken_off
         self._phase = phase
         self._order: Word = ""
@@ -165,7 +157,7 @@ class TokenPartner:
     def _understood(self, back: TurnBack, now_us: int) -> _Rest:
         wake_us = back.wake_us
         if wake_us is None:
-            wake_us = now_us + self._settings.turn_us
+            wake_us = now_us + self._turn_us
         elif wake_us <= now_us:
             raise LockstepError(
                 f"the companion's {back.text()!r}: accepted: a time after now, {now_us} µs"
@@ -213,7 +205,7 @@ class TokenPartner:
         """Give the turn, again and again, until it comes back; None: broken off."""
         again = False
         # Counted in repetitions, not read off a clock: a process that was stopped has not waited.
-        for again_s in _repeats(self._settings.patience_s):
+        for again_s in _repeats(self._patience_s):
             if again:
                 self._repeat()
             if again or self._unseen:
@@ -230,7 +222,7 @@ class TokenPartner:
                     return None
         raise LockstepError(
             f"the companion is gone: it did not give back turn {given.number} in "
-            f"{self._settings.patience_s:g} s"
+            f"{self._patience_s:g} s"
         )
 
     def _repeat(self) -> None:

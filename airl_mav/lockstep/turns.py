@@ -13,6 +13,10 @@ COMPANION_STARTS_US = US_PER_S // 10
 """The companion begins so long after the flight controller has booted [µs]."""
 
 
+class LockstepError(Exception):
+    """The companion does not keep to the turns; the message says how."""
+
+
 @dataclass(frozen=True)
 class Turn:
     """How the companion gave its turn back."""

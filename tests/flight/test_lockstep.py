@@ -21,11 +21,11 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.digest import LANES
-from airl_mav.lockstep.errors import LockstepError
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.lockstep.stage import Stage
 from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.vehicle import load_vehicle

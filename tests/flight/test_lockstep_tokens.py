@@ -27,11 +27,10 @@ import pytest
 from pymavlink import mavutil
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.lockstep.flight import Watching, fly
-from airl_mav.lockstep.remote import RemotePlan, RemoteStage
-from airl_mav.lockstep.tokens import TokenSettings
-from airl_mav.scenario.piloting import TRANSPORT_US
+from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.remote import RemoteStage
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.stand_alone import StandAloneVehicle
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
@@ -65,13 +64,10 @@ class Reference:
 def fly_here(**changes: Any) -> Reference:
     resolved = demo_scenario(**({"arena": ARENA, "seed": SEED, "time_limit_s": 120.0} | changes))
     seed = resolved.scenario.seed
-    goals: list[tuple[float, float]] = []
-    seen: list[Any] = []
-    watching = Watching(begin=goals.append, tick=lambda simulation, _: seen.append(simulation))
-    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed, watching=watching)
+    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
     lanes = {name: (flown.record.sha256 or {})[name] for name in LANES}
-    episode = EpisodeSetup(resolved.vehicle, seen[-1]._arena, seed, resolved.scenario)
-    return Reference(lanes, goals[0], flown.record.outcome, resolved, episode)
+    episode = EpisodeSetup(resolved.vehicle, resolved.arena_of(seed), seed, resolved.scenario)
+    return Reference(lanes, flown.record.goal, flown.record.outcome, resolved, episode)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +170,7 @@ def test_stopped_and_loaded_processes_fly_the_same(
 
 
 @contextmanager
-def staged(reference: Reference, plan: RemotePlan) -> Iterator[tuple[RemoteStage, TestPorts]]:
+def staged(reference: Reference) -> Iterator[tuple[RemoteStage, TestPorts]]:
     ports = choose_ports()
     endpoint = UdpEndpoint(
         (LOOPBACK, ports.api_local),
@@ -183,25 +179,19 @@ def staged(reference: Reference, plan: RemotePlan) -> Iterator[tuple[RemoteStage
         remote_option="remote",
     )
     camera = CameraServer(f"tcp://{LOOPBACK}:{ports.camera}")
+    asked = StandAloneVehicle(
+        lockstep=True,
+        goal_radius_m=reference.scenario.pilot.goal_radius_m,
+        time_limit_s=reference.scenario.scenario.time_limit_s,
+    )
     with (
         closing(endpoint),
         closing(camera),
-        closing(RemoteStage(endpoint, camera, plan, broken_off=lambda: False)) as stage,
+        closing(RemoteStage(asked, endpoint, camera)) as stage,
     ):
         warm_up(reference.scenario.vehicle)
         stage.load(reference.setup, None)
         yield stage, ports
-
-
-def remote_plan(reference: Reference, patience_s: float = 60.0) -> RemotePlan:
-    resolved = reference.scenario
-    return RemotePlan(
-        TRANSPORT_US,
-        TokenSettings(patience_s=patience_s),
-        None,
-        resolved.pilot.goal_radius_m,
-        resolved.scenario.time_limit_s,
-    )
 
 
 def fly_staged(stage: RemoteStage) -> dict[str, str]:
@@ -225,7 +215,7 @@ def test_orders_of_the_referee_arrive_in_their_turn(
     successful, reference = reference, fly_here(**changes)
     assert reference.outcome is outcome
     with (
-        staged(reference, remote_plan(reference)) as (stage, ports),
+        staged(reference) as (stage, ports),
         running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
     ):
         lanes = fly_staged(stage)
@@ -280,7 +270,7 @@ class Relay:
 
 
 def test_lost_words_do_not_change_the_flight(reference: Reference, tmp_path: Path) -> None:
-    with staged(reference, remote_plan(reference)) as (stage, ports):
+    with staged(reference) as (stage, ports):
         far = choose_ports().api
         with (
             closing(Relay(ports.api, far)) as relay,
@@ -308,7 +298,7 @@ def test_companion_that_dies_ends_the_flight(reference: Reference, tmp_path: Pat
 
 
 def test_simulator_that_dies_ends_the_companion(reference: Reference, tmp_path: Path) -> None:
-    with staged(reference, remote_plan(reference)) as (stage, ports):
+    with staged(reference) as (stage, ports):
         words = companion_words(ports.api, ports.camera, reference, "--connect-timeout", "2")
         with running(words, tmp_path) as companion:
             while stage.time_us < 2_000_000:
@@ -318,7 +308,7 @@ def test_simulator_that_dies_ends_the_companion(reference: Reference, tmp_path: 
 
 
 def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path: Path) -> None:
-    with staged(reference, remote_plan(reference)) as (stage, ports):
+    with staged(reference) as (stage, ports):
         words = companion_words(ports.api, ports.camera, reference)
         with running(words, tmp_path) as companion:
             while stage.time_us < 2_000_000:

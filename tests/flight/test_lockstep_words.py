@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import Any
 
@@ -14,11 +14,9 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
-from airl_mav.lockstep.errors import LockstepError
-from airl_mav.lockstep.remote import plan_of
-from airl_mav.lockstep.token_camera import TokenCamera
-from airl_mav.lockstep.tokens import TokenPartner, TokenSettings
-from airl_mav.lockstep.turns import Turn
+from airl_mav.lockstep.camera import TokenCamera
+from airl_mav.lockstep.tokens import TokenPartner
+from airl_mav.lockstep.turns import LockstepError, Turn
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from companion.tokens import Phase, TurnBack, TurnGiven
@@ -130,9 +128,7 @@ class Mate:
 
 
 @contextmanager
-def partner(
-    mate: Mate, settings: TokenSettings | None = None, **callbacks: Callable[..., Any]
-) -> Iterator[TokenPartner]:
+def partner(mate: Mate, **settings: Any) -> Iterator[TokenPartner]:
     server: FrameServer = NoCamera()
     remote = mate.socket.getsockname()
     with (
@@ -140,9 +136,7 @@ def partner(
             UdpEndpoint((LOOPBACK, 0), remote, local_option="local", remote_option="remote")
         ) as endpoint,
         closing(mate),
-        closing(
-            TokenPartner(endpoint, TokenCamera(server, 0), settings or TokenSettings(), **callbacks)
-        ) as made,
+        closing(TokenPartner(endpoint, TokenCamera(server, 0), **settings)) as made,
     ):
         made.send(heartbeat())
         yield made
@@ -174,7 +168,7 @@ def test_turn_back_says_when_the_next_one_comes(text: str, wake_us: int, sent: i
 def test_turn_period_is_an_option() -> None:
     mate = Mate("D1")
     mate.start()
-    with partner(mate, TokenSettings(turn_us=5_000)) as vehicle:
+    with partner(mate, turn_us=5_000) as vehicle:
         assert vehicle.turn(NOW_US, lambda _: None).wake_us == NOW_US + 5_000
 
 
@@ -237,7 +231,7 @@ def test_answers_are_not_repeated() -> None:
     mate.start()
     answer = Encoder().pack(dialect.MAVLink_command_ack_message(400, 0))
     with (
-        partner(mate, TokenSettings(patience_s=0.5)) as vehicle,
+        partner(mate, patience_s=0.5) as vehicle,
         pytest.raises(LockstepError, match="the companion is gone"),
     ):
         vehicle.turn(NOW_US, lambda _: vehicle.send(answer))
@@ -270,13 +264,12 @@ def test_phases_are_told_once() -> None:
     told: list[tuple[str, int]] = []
     mate = Mate("P1 arming")
     mate.start()
-    settings = TokenSettings(patience_s=0.5)
 
     def note(name: str, time_us: int) -> None:
         told.append((name, time_us))
 
     with (
-        partner(mate, settings, phase=note) as vehicle,
+        partner(mate, patience_s=0.5, phase=note) as vehicle,
         pytest.raises(LockstepError, match="the companion is gone"),
     ):
         vehicle.turn(NOW_US, lambda _: None)
@@ -307,6 +300,4 @@ def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("speed", "paced"), [(None, None), ("max", None), (2.0, 2.0)])
 def test_pace_is_as_fast_as_it_goes_unless_asked(speed: Any, paced: float | None) -> None:
-    plan = plan_of(StandAloneVehicle(lockstep=True, transport_ms=7.0, speed=speed))
-    assert plan.speed == paced
-    assert plan.transport_us == 7_000
+    assert StandAloneVehicle(lockstep=True, speed=speed).pace == paced
