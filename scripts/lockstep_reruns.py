@@ -116,8 +116,8 @@ def busy(processes: int) -> Iterator[None]:
 
 def fly(command: Reruns, flights: int) -> None:
     """Fly, and print when each flight begins and what its fingerprint is."""
-    from airl_mav.lockstep.flight import Watching
     from airl_mav.lockstep.flight import fly as fly_episode
+    from airl_mav.rehearsal.progress import Observer
     from airl_mav.scenario.model import Scenario
     from airl_mav.scenario.resolve import resolve
 
@@ -125,12 +125,16 @@ def fly(command: Reruns, flights: int) -> None:
         level="lockstep", policy=command.policy, arena=command.arena, seed=command.seed
     )
     resolved = resolve(scenario)
-    watching = Watching(begin=lambda _: say(BEGINS))
+
+    class Speaking(Observer):
+        def episode(self, *_: object) -> None:
+            say(BEGINS)
+
     # What is compiled or loaded late is so before the first that counts.
     fly_episode(resolved, resolved.fresh_policy(command.seed + 1), 0, command.seed + 1)
     for _ in range(flights):
         policy = resolved.fresh_policy(command.seed)
-        record = fly_episode(resolved, policy, 0, command.seed, watching=watching).record
+        record = fly_episode(resolved, policy, 0, command.seed, observer=Speaking()).record
         assert record.sha256 is not None
         say(record.sha256["flight"])
 

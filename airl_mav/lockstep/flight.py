@@ -1,43 +1,60 @@
-"""One episode in lockstep: everything of it is made here, flown, and thrown away."""
+"""Episodes in lockstep: everything of one is made here, flown, and thrown away."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
-from airl_mav.arena.generate import generate
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.lockstep.digest import FlightDigest, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.stage import Stage
 from airl_mav.policy.actions import Policy
-from airl_mav.rehearsal.episode import join_stamps, judged_record
-from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.rehearsal.channel import Text
+from airl_mav.rehearsal.episode import join_stamps, judged_record, part_of
+from airl_mav.rehearsal.progress import Observer
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Order, Supervisor
+from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import MissionResult, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.warm_up import warm_up
+
+SHOW_EVERY = 125
+"""The observer sees the true state every so many ticks: twice a simulated second."""
 
 
-@dataclass
-class Watching:
-    """Who looks on. All calls come from the conductor's thread, or while it waits."""
+def rehearse(
+    scenario: ResolvedScenario, folder: RunFolder, observer: Observer, done: Collection[int] = ()
+) -> None:
+    """Fly episodes one after the other; each is saved as it ends.
 
-    begin: Callable[[tuple[float, float]], None] = field(default=lambda _goal: None)
-    """The episode begins; its goal (north, east) [m]."""
-    phase: Callable[[str, int], None] = field(default=lambda _phase, _time_us: None)
-    """The companion has entered a phase, at a simulated time [µs]."""
-    text: Callable[[Message, int], None] = field(default=lambda _message, _time_us: None)
-    """The autopilot said something, at a simulated time [µs]."""
-    tick: Callable[[Simulation, str | None], None] = field(default=lambda _simulation, _hit: None)
-    """A tick has been flown; what has been hit so far."""
+    Args:
+        scenario: What is flown.
+        folder: Where everything goes.
+        observer: Who looks on.
+        done: Numbers of the episodes that need not be flown.
+
+    Raises:
+        UsageError: The policy cannot use the camera; no arena can be made of a seed.
+        LockstepError: The companion hangs, or broke.
+    """
+    observer.waiting("loading")
+    warm_up(scenario.vehicle)
+    for index, seed in enumerate(scenario.seeds):
+        if index in done:
+            continue
+        policy, tlog = scenario.fresh_policy(seed), folder.tlog_path(index)
+        flown = fly(scenario, policy, index, seed, tlog=tlog, observer=observer)
+        folder.save_episodes([flown])
+        observer.finished(flown.record)
 
 
 def fly(
@@ -47,7 +64,7 @@ def fly(
     seed: int,
     *,
     tlog: Path | None = None,
-    watching: Watching | None = None,
+    observer: Observer | None = None,
 ) -> FlownEpisode:
     """Fly one episode; the same scenario, policy and seed give the same flight, bit by bit.
 
@@ -57,30 +74,30 @@ def fly(
         index: Number of the episode in its run.
         seed: Of arena, sensors, wind and latency.
         tlog: Where its MAVLink log goes; None: no log.
-        watching: Who looks on.
+        observer: Who looks on.
 
     Raises:
         UsageError: The policy cannot use the camera; no arena can be made of the seed.
         LockstepError: The companion hangs, or broke.
     """
-    return _Flight(resolved, policy, seed, watching or Watching()).fly(index, tlog)
+    return _Flight(resolved, policy, index, seed, observer or Observer()).fly(tlog)
 
 
 class _Flight:
     """The parts of one flight."""
 
     def __init__(
-        self, resolved: ResolvedScenario, policy: Policy, seed: int, watching: Watching
+        self,
+        resolved: ResolvedScenario,
+        policy: Policy,
+        index: int,
+        seed: int,
+        observer: Observer,
     ) -> None:
-        self._resolved, self._policy, self._seed = resolved, policy, seed
-        self._watching = watching
-        self._arena_seed = resolved.scenario.arena_seed_of(seed)
-        self._arena = generate(
-            resolved.arena,
-            self._arena_seed,
-            name=resolved.scenario.arena,
-            vehicle_width_m=resolved.vehicle.body.width_m,
-        )
+        self._resolved, self._policy, self._index, self._seed = resolved, policy, index, seed
+        self._observer = observer
+        self._ticks = 0
+        self._arena = resolved.arena_of(seed)
         self._goal = (float(self._arena.goal[0]), float(self._arena.goal[1]))
         self._digest = FlightDigest()
         self._stop = threading.Event()
@@ -88,7 +105,7 @@ class _Flight:
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
-    def fly(self, index: int, tlog: Path | None) -> FlownEpisode:
+    def fly(self, tlog: Path | None) -> FlownEpisode:
         resolved = self._resolved
         setup = EpisodeSetup(resolved.vehicle, self._arena, self._seed, resolved.scenario)
         with Stage(
@@ -97,11 +114,11 @@ class _Flight:
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
             simulation = self._stage.run(setup, self._program, tlog=tlog, begun=self._begun)
-            return self._flown(index, simulation)
+            return self._flown(simulation)
 
     def _begun(self, started_us: int) -> None:
         self._supervisor.started_us = started_us
-        self._watching.begin(self._goal)
+        self._observer.episode(self._index, self._seed, self._goal)
 
     # --- the companion's thread
 
@@ -125,7 +142,7 @@ class _Flight:
 
     def _announce(self, phase: str) -> None:
         now_us = self._stage.clock.time_us()
-        self._watching.phase(phase, now_us)
+        self._observer.phase(phase, now_us)
         self._judge.enter(phase, now_us)
 
     # --- the conductor's thread
@@ -133,7 +150,9 @@ class _Flight:
     def _look(self, simulation: Simulation) -> None:
         """Take the true state after a tick."""
         self._judge.look(simulation)
-        self._watching.tick(simulation, self._judge.hit)
+        self._ticks += 1
+        if self._ticks % SHOW_EVERY == 0:
+            self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
 
     def _order(self, order: Order) -> None:
         if order is Order.ABANDON:
@@ -141,12 +160,14 @@ class _Flight:
         self._stop.set()
 
     def _decided(self, verdict: Verdict) -> None:
-        self._watching.phase(verdict.outcome.value, verdict.time_us)
+        self._observer.phase(verdict.outcome.value, verdict.time_us)
 
     def _hear(self, message: Message) -> None:
-        self._watching.text(message, self._stage.conductor.clock.time_us())
+        now_us = self._stage.conductor.clock.time_us()
+        severity = int(message.severity)
+        self._observer.text(Text(time_us=now_us, severity=severity, text=message.text))
 
-    def _flown(self, index: int, simulation: Simulation) -> FlownEpisode:
+    def _flown(self, simulation: Simulation) -> FlownEpisode:
         result = self._result
         assert result is not None  # noqa: S101 (nothing broke)
         referee = self._supervisor.referee
@@ -155,26 +176,20 @@ class _Flight:
             battery = simulation.plant.battery_remaining
             referee.abort(simulation.time_us, result.reason)
         arrays = simulation.arrays()
-        parts = {
-            name: {key.partition("/")[2]: v for key, v in arrays.items() if key.startswith(name)}
-            for name in ("trajectory/", "setpoints/")
-        }
-        trajectory = Trajectory.from_arrays(parts["trajectory/"])
-        setpoints = parts["setpoints/"]
+        trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
+        setpoints = part_of(arrays, "setpoints")
         self._digest.add_setpoints(setpoints)
-        latency = {key: v for key, v in arrays.items() if key.startswith("estimate/")}
+        latency = part_of(arrays, "estimate", keep_prefix=True)
         latency |= join_stamps(result.log.columns(), setpoints, np.zeros((0, 2), np.int64))
         record = judged_record(
+            self._resolved,
             referee,
             trajectory,
             referee.navigation_us,
-            index=index,
+            index=self._index,
             seed=self._seed,
-            arena=self._resolved.scenario.arena,
-            arena_seed=self._arena_seed,
             goal=self._goal,
             started_us=self._supervisor.started_us,
-            computer_watts=self._resolved.computer.watts,
             wall_s=None,
             slipped_us=0,
             battery_remaining=battery,

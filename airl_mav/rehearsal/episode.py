@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -82,12 +83,12 @@ def save_episode(
         decisions_path: The companion's decision log; may be missing; removed afterwards.
     """
     arrays = _read(record_path)
-    trajectory = Trajectory.from_arrays(_part(arrays, "trajectory"))
-    latency = _part(arrays, "estimate", keep_prefix=True)
+    trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
+    latency = part_of(arrays, "estimate", keep_prefix=True)
     latency[TICK_LATENESS] = arrays["tick/lateness_us"]
     if decisions_path.exists():
         latency |= join_stamps(
-            _read(decisions_path), _part(arrays, "setpoints"), arrays["tick/slips_us"]
+            _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
         )
     record = _record(episode, scenario, trajectory, arrays["tick/slips_us"])
     folder.save_episode(record, trajectory, latency)
@@ -101,17 +102,15 @@ def _record(
 ) -> EpisodeRecord:
     state, loaded, began_us = episode.verdict_state, episode.loaded, episode.navigating_us
     return judged_record(
+        scenario,
         episode.referee,
         trajectory,
         # What the referee knew in flight was the time given up by its newest state, an older one.
         None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
         index=episode.index,
         seed=episode.seed,
-        arena=scenario.scenario.arena,
-        arena_seed=scenario.scenario.arena_seed_of(episode.seed),
         goal=loaded.goal,
         started_us=loaded.time_us,
-        computer_watts=scenario.computer.watts,
         wall_s=None if episode.wall_us is None else episode.wall_us / US_PER_S,
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,
@@ -120,50 +119,45 @@ def _record(
 
 
 def judged_record(
+    scenario: ResolvedScenario,
     referee: Referee,
     trajectory: Trajectory,
     navigation_us: int | None,
     *,
-    index: int,
     seed: int,
-    arena: str,
-    arena_seed: int,
-    goal: tuple[float, float],
     started_us: int,
-    computer_watts: float,
-    wall_s: float | None,
-    slipped_us: int,
-    battery_remaining: float | None,
-    notes: tuple[str, ...],
-    sha256: dict[str, str] | None = None,
+    **known: Any,
 ) -> EpisodeRecord:
-    """Return the record of a flight that a referee has watched; see `EpisodeRecord`.
+    """Return the record of a flight that a referee has watched.
 
-    `navigation_us` is when navigation began, by the clock of the trajectory [µs].
+    Args:
+        scenario: What was flown.
+        referee: Who judged; a flight without a verdict is aborted.
+        trajectory: The true path.
+        navigation_us: When navigation began, by the clock of the trajectory [µs]; None: never.
+        seed: Of the episode.
+        started_us: When it began, by the same clock [µs].
+        known: The fields of `EpisodeRecord` that neither scenario nor referee tells.
     """
     verdict = referee.verdict or referee.abort(started_us, "no verdict")
     quality = None
     if navigation_us is not None and verdict.time_us >= navigation_us:
-        quality = measure_quality(trajectory, navigation_us, verdict.time_us, computer_watts)
+        quality = measure_quality(
+            trajectory, navigation_us, verdict.time_us, scenario.computer.watts
+        )
     return EpisodeRecord(
-        index=index,
         seed=seed,
-        arena=arena,
-        arena_seed=arena_seed,
+        arena=scenario.scenario.arena,
+        arena_seed=scenario.scenario.arena_seed_of(seed),
         outcome=verdict.outcome,
         reason=verdict.reason,
-        goal=goal,
         goal_radius_m=referee.task.goal_radius_m,
         time_limit_s=referee.task.time_limit_s,
         started_us=started_us,
         navigation_us=navigation_us,
         ended_us=verdict.time_us,
-        wall_s=wall_s,
-        slipped_us=slipped_us,
-        battery_remaining=battery_remaining,
         quality=quality,
-        notes=notes,
-        sha256=sha256,
+        **known,
     )
 
 
@@ -219,8 +213,9 @@ def _read(path: Path) -> dict[str, NDArray[Any]]:
         return {key: archive[key] for key in archive.files}
 
 
-def _part(
-    arrays: dict[str, NDArray[Any]], prefix: str, *, keep_prefix: bool = False
+def part_of(
+    arrays: Mapping[str, NDArray[Any]], prefix: str, *, keep_prefix: bool = False
 ) -> dict[str, NDArray[Any]]:
+    """Return the arrays whose names begin with `prefix/`, by the rest of their names."""
     cut = 0 if keep_prefix else len(prefix) + 1
     return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}

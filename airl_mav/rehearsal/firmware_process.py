@@ -14,7 +14,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from airl_mav.arena.generate import generate
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
@@ -145,14 +144,9 @@ class Service:
         return True
 
     def _load(self, request: LoadEpisode) -> None:
-        scenario, seed = self._scenario, request.seed
-        arena = generate(
-            scenario.arena,
-            scenario.scenario.arena_seed_of(seed),
-            name=scenario.scenario.arena,
-            vehicle_width_m=scenario.vehicle.body.width_m,
-        )
-        episode = EpisodeSetup(scenario.vehicle, arena, seed, scenario.scenario)
+        scenario = self._scenario
+        arena = scenario.arena_of(request.seed)
+        episode = EpisodeSetup(scenario.vehicle, arena, request.seed, scenario.scenario)
         tlog = Path(request.tlog) if request.tlog else None
         self._crash = CrashDetector()
         loaded = self._firmware.load(episode, tlog, unix_us())

@@ -22,8 +22,36 @@ OUTCOME_STYLES = {
 }
 
 
-class LiveObserver:
-    """Shows a rehearsal as it flies. Implements `rehearsal.Observer`."""
+class Observer:
+    """Looks on while episodes are flown; by itself it passes everything over.
+
+    All calls come from one thread, or while it waits.
+    """
+
+    def waiting(self, what: str) -> None:
+        """Something is being waited for."""
+
+    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+        """An episode begins; its goal (north, east) [m]."""
+
+    def phase(self, phase: str, time_us: int) -> None:
+        """The companion has entered a phase, at a simulated time [µs]."""
+
+    def state(self, state: State, started_us: int) -> None:
+        """The vehicle's true state, and when the episode began [µs]."""
+
+    def text(self, text: Text) -> None:
+        """The autopilot said something."""
+
+    def finished(self, record: EpisodeRecord) -> None:
+        """An episode has been saved."""
+
+    def lost(self, what: str) -> None:
+        """An episode was lost and begins again."""
+
+
+class LiveObserver(Observer):
+    """Shows a rehearsal as it flies."""
 
     def __init__(self, progress: Progress, done: tuple[EpisodeRecord, ...], episodes: int) -> None:
         """Begin with the episodes that were flown before, of so many in all."""

@@ -7,12 +7,10 @@ by two new ones, from its seed: nothing of the lost one enters the records but a
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Protocol
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import (
     Abort,
     Begin,
@@ -29,6 +27,7 @@ from airl_mav.rehearsal.channel import (
 )
 from airl_mav.rehearsal.episode import Episode, save_episode
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, ProcessPair
+from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -40,38 +39,6 @@ WRAP_UP_S = 90.0
 
 class RehearsalError(Exception):
     """The run cannot go on; the message says why."""
-
-
-class Observer(Protocol):
-    """Whoever shows the progress. All calls come from one thread."""
-
-    def waiting(self, what: str) -> None:
-        """Something is being waited for."""
-        ...
-
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
-        """An episode begins."""
-        ...
-
-    def phase(self, phase: str, time_us: int) -> None:
-        """The companion has entered a phase."""
-        ...
-
-    def state(self, state: State, started_us: int) -> None:
-        """The vehicle's true state."""
-        ...
-
-    def text(self, text: Text) -> None:
-        """The autopilot said something."""
-        ...
-
-    def finished(self, record: EpisodeRecord) -> None:
-        """An episode has been saved."""
-        ...
-
-    def lost(self, what: str) -> None:
-        """An episode was lost and begins again."""
-        ...
 
 
 class Rehearsal:

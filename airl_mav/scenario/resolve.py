@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from airl_mav.arena.generate import generate
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
@@ -17,11 +16,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.checks import check_firmware, check_level, check_ports
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.piloting import (
-    NATIVE_T2_US,
-    check_quota,
-    decide_piloting,
-)
+from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
@@ -45,8 +40,6 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )
     arena = load_profile("arenas", scenario.arena, ArenaSpec)
-    first = scenario.arena_seed_of(scenario.seed)
-    generate(arena, first, name=scenario.arena, vehicle_width_m=vehicle.body.width_m)
     computer = load_computer(scenario.computer)
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
@@ -62,7 +55,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         pilot=pilot,
         watchdog=watchdog,
     )
-    # What cannot be run is better found here than by a process that is already flying.
+    # What cannot be flown is better found here than by a process that is already flying.
+    resolved.arena_of(scenario.seed)
     resolved.fresh_policy(scenario.seed)
     return resolved
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import Level
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
@@ -119,6 +120,18 @@ class ResolvedScenario:
     def companion_pilot(self) -> PilotSettings:
         """How the companion flies the policy: closer to the goal than the referee asks for."""
         return replace(self.pilot, goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m)
+
+    def arena_of(self, seed: int) -> Arena:
+        """Return the arena of the episode of a seed. Raises UsageError if none can be made."""
+        # Imported here: it takes scipy, which a companion has no need of.
+        from airl_mav.arena.generate import generate
+
+        return generate(
+            self.arena,
+            self.scenario.arena_seed_of(seed),
+            name=self.scenario.arena,
+            vehicle_width_m=self.vehicle.body.width_m,
+        )
 
     def task(self, goal: tuple[float, float]) -> Task:
         """Return what the referee asks of a flight to a goal (north, east) [m]."""

@@ -37,6 +37,7 @@ from airl_mav.rehearsal.channel import (
     Text,
 )
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE
+from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RunFolder, load
 from airl_mav.scenario.model import Scenario
@@ -184,18 +185,13 @@ def write_record(path: Path, slips: Sequence[tuple[int, int]]) -> None:
     np.savez(path, **arrays)
 
 
-class Silent:
+class Silent(Observer):
     """An observer that keeps the records."""
 
     def __init__(self) -> None:
         self.records: list[EpisodeRecord] = []
         self.texts: list[str] = []
         self.losses: list[str] = []
-
-    def waiting(self, what: str) -> None: ...
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None: ...
-    def phase(self, phase: str, time_us: int) -> None: ...
-    def state(self, state: State, started_us: int) -> None: ...
 
     def text(self, text: Text) -> None:
         self.texts.append(text.text)
