@@ -17,7 +17,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
+from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED, ArenaName
 
 
 class ArenaOptions(ProfileModel):
@@ -28,9 +28,7 @@ class ArenaOptions(ProfileModel):
         airl arena my-arena.toml --zone 0
     """
 
-    name: Annotated[str, POSITIONAL] = Field(
-        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
-    )
+    name: Annotated[ArenaName, POSITIONAL] = DEFAULT_ARENA
     seed: int | None = quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )

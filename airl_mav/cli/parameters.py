@@ -14,6 +14,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.scenario.model import DEFAULT_VEHICLE, VehicleName
 from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,
@@ -48,9 +49,7 @@ class ParametersOptions(ProfileModel):
     firmware: Annotated[Literal["px4", "px4-hitl", "ardupilot"], POSITIONAL] = Field(
         description="whose parameters"
     )
-    vehicle: str = Field(
-        default="quad", description="vehicle profile: a shipped name, or a path to a .toml"
-    )
+    vehicle: VehicleName = DEFAULT_VEHICLE
     out: Path | None = Field(default=None, description="file to write; by default printed")
 
 

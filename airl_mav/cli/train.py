@@ -40,8 +40,8 @@ class TrainOptions(BaseModel):
     )
     computer: str | None = Field(
         default=None,
-        description="decide as late as this computer in training: a shipped profile, or a path to"
-        " a .toml; takes --workload; by default the configuration's",
+        description="decide as late as this computer in training: a shipped profile, or a path to a"
+        " .toml; takes --workload; by default the configuration's",
     )
     workload: str | None = Field(
         default=None,

@@ -82,14 +82,21 @@ def quantity(
 
 def unit_of(field: FieldInfo) -> str | None:
     """Return the unit a field was declared with."""
-    extra = field.json_schema_extra
-    return str(extra["unit"]) if isinstance(extra, dict) and "unit" in extra else None
+    for declared in (field, *_branch_marks(field.annotation)):
+        extra = getattr(declared, "json_schema_extra", None)
+        if isinstance(extra, dict) and "unit" in extra:
+            return str(extra["unit"])
+    return None
 
 
 def range_of(field: FieldInfo) -> str:
     """Return the accepted range of a field as text: "0 < value <= 10 kg", or "" when unbounded."""
     low = high = ""
-    for bound in (*field.metadata, *_branch_metadata(field.annotation)):
+    marks = _branch_marks(field.annotation)
+    inner = (
+        b for mark in marks for b in (mark.metadata if isinstance(mark, FieldInfo) else [mark])
+    )
+    for bound in (*field.metadata, *inner):
         for sign, name in (("<", "gt"), ("<=", "ge")):
             if getattr(bound, name, None) is not None:
                 low = f"{shown(getattr(bound, name))} {sign} "
@@ -102,12 +109,11 @@ def range_of(field: FieldInfo) -> str:
     return f"{low}value{high}" + (f" {unit}" if unit and unit != "1" else "")
 
 
-def _branch_metadata(annotation: Any) -> list[Any]:
+def _branch_marks(annotation: Any) -> list[Any]:
     """Return what the branches of a union are annotated with: Annotated[float, Field(gt=0)]."""
     if get_origin(annotation) not in (Union, UnionType):
         return []
-    marks = [mark for each in get_args(annotation) for mark in getattr(each, "__metadata__", ())]
-    return [b for mark in marks for b in (mark.metadata if isinstance(mark, FieldInfo) else [mark])]
+    return [mark for each in get_args(annotation) for mark in getattr(each, "__metadata__", ())]
 
 
 def validated(model: type[Model], data: object, source: object = None) -> Model:

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.envs.rewards import RewardName
-from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S
+from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import LayoutName
 from airl_mav.profiles.arena import Each
@@ -19,16 +19,8 @@ from airl_mav.profiles.arena import Each
 class EpisodeRules(ProfileModel):
     """Rules of an episode and the decision period."""
 
-    goal_radius_m: float = quantity(
-        "the goal is reached closer than this, seen from above",
-        "m",
-        ge=0.2,
-        le=50,
-        default=GOAL_RADIUS_M,
-    )
-    time_limit_s: float = quantity(
-        "longest flight from the start of navigation", "s", ge=1, le=3600, default=TIME_LIMIT_S
-    )
+    goal_radius_m: GoalRadius = GOAL_RADIUS_M
+    time_limit_s: TimeLimit = TIME_LIMIT_S
     hold_s: float = quantity(
         "t3: how long an action is held before the next observation",
         "s",

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.fields import quantity
 
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m]: that of the paper's code, seen from above."""
@@ -15,6 +16,13 @@ GOAL_RADIUS_M = 3.0
 TIME_LIMIT_S = 120.0
 """Default longest flight from the start of navigation [s]. The paper's code counts 750 steps; its
 slowest policies took 48 s on average."""
+
+GoalRadius = Annotated[
+    float, quantity("the goal is reached closer than this, seen from above", "m", ge=0.2, le=50)
+]
+TimeLimit = Annotated[
+    float, quantity("longest flight from the start of navigation", "s", ge=1, le=3600)
+]
 
 
 class Outcome(str, Enum):

@@ -257,7 +257,7 @@ class ChildChannel:
                 for line in self._incoming:
                     try:
                         request = _REQUESTS.validate_json(line)
-                    except ValidationError:
+                    except (ValidationError, UsageError):
                         sys.stderr.write(f"not a request: {line[:200]!r}\n")
                         continue
                     handle(request)

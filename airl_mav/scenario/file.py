@@ -9,8 +9,9 @@ from typing import Any
 import tomli_w
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file
+from airl_mav.policy.python_policy import names_python
+from airl_mav.policy.registry import policy_names
 from airl_mav.scenario.model import Scenario
 
 if sys.version_info >= (3, 11):
@@ -32,12 +33,23 @@ def read_scenario_file(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path}: not valid TOML: {error}") from None
 
 
-def load_scenario(path: Path) -> Scenario:
-    """Return the scenario of a file. Raises UsageError that names the file, field and range."""
-    return validated(Scenario, read_scenario_file(path), path)
-
-
 def save_scenario(scenario: Scenario, path: Path) -> None:
-    """Write a scenario with all its fields; what is left open stays out."""
-    data = scenario.model_dump(mode="json", exclude_none=True)
+    """Write a scenario with all its fields and absolute paths; what is left open stays out."""
+    data = anchored(scenario).model_dump(mode="json", exclude_none=True)
     replace_file(path, tomli_w.dumps(data).encode())
+
+
+def anchored(scenario: Scenario) -> Scenario:
+    """Return a scenario whose paths are absolute: they mean the same wherever it is flown again."""
+    policy, latency = scenario.policy, scenario.latency or ""
+    named = {name: getattr(scenario, name) for name in ("vehicle", "arena", "computer")}
+    paths = {name: value for name, value in named.items() if value.endswith(".toml")}
+    if names_python(policy) or (policy not in policy_names() and Path(policy).is_dir()):
+        paths["policy"] = policy
+    if ".toml/" in latency or Path(latency).is_file():
+        paths["latency"] = latency
+    real = {name: value.absolute() for name, value in scenario.real if isinstance(value, Path)}
+    changes: dict[str, Any] = {name: f"{Path(value).absolute()}" for name, value in paths.items()}
+    return scenario.model_copy(
+        update={**changes, "real": scenario.real.model_copy(update=real)}
+    )

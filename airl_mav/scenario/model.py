@@ -10,16 +10,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.flight.judge import TIME_LIMIT_S
+from airl_mav.core.fields import ProfileModel, field_error, quantity
+from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 
-DEFAULT_POLICY = "static-obstacles"
-"""The shipped policy that flies by default."""
+VehicleName = Annotated[
+    str, Field(description="vehicle profile: a shipped name, or a path to a .toml")
+]
+ArenaName = Annotated[str, Field(description="arena profile: a shipped name, or a path to a .toml")]
+PolicyName = Annotated[
+    str,
+    Field(
+        description="policy that decides: a name, a path to a folder with policy.onnx and"
+        " card.json, or a Python class as FILE.py:CLASS"
+    ),
+]
 
-DEFAULT_ARENA = "static-obstacles"
-"""The shipped arena that is flown in by default."""
+DEFAULT_VEHICLE, DEFAULT_POLICY, DEFAULT_ARENA = "quad", "static-obstacles", "static-obstacles"
+"""What is shipped and flies, and is flown in, by default."""
 
 GREATEST_SEED = 2**31
 GREATEST_PORT = 65_535
@@ -81,10 +90,8 @@ class WatchdogSettings(ProfileModel):
     )
     hover_after_s: float | None = quantity(
         "zero the velocity this long after an action's hold time, whether or not a decision has"
-        " come"
-        " (AirSim: 0.06); by default as the policy's card says, or never: the last setpoint"
-        " persists,"
-        " as with PX4 and MAVSDK",
+        " come (AirSim: 0.06); by default as the policy's card says, or never: the last setpoint"
+        " persists, as with PX4 and MAVSDK",
         "s",
         ge=0,
         le=60,
@@ -179,9 +186,7 @@ class RealFirmware(ProfileModel):
 class Aircraft(ProfileModel):
     """What flies, and how it is reached."""
 
-    vehicle: str = Field(
-        default="quad", description="vehicle profile: a shipped name, or a path to a .toml"
-    )
+    vehicle: VehicleName = DEFAULT_VEHICLE
     wind: WindSettings = Field(default_factory=WindSettings, description="wind")
     estimator: EstimatorName = Field(
         default="kernel",
@@ -213,8 +218,7 @@ class Inference(ProfileModel):
     trust: bool = Field(
         default=False,
         description="run policy.pt2 of a folder that is not shipped: loading it can execute code"
-        " that"
-        " its author wrote",
+        " that its author wrote",
     )
 
 
@@ -231,8 +235,7 @@ class Decisions(Inference):
     )
     hold_s: float | None = quantity(
         "t3: how long an action is held before the next observation; by default that of the"
-        " policy's"
-        " card, or 0.5",
+        " policy's card, or 0.5",
         "s",
         ge=0,
         le=10,
@@ -245,14 +248,10 @@ class Decisions(Inference):
         le=100,
         default=None,
     )
-    goal_radius_m: float | None = quantity(
-        "the goal is reached closer than this, seen from above; by default that of the policy's"
-        " card,"
-        " or 3",
-        "m",
-        ge=0.2,
-        le=50,
+    goal_radius_m: GoalRadius | None = Field(
         default=None,
+        description="the goal is reached closer than this, seen from above; by default that of the"
+        " policy's card, or 3",
     )
     max_speed_m_s: float | None = quantity(
         "horizontal speed limit of all actions; by default the fastest action of the policy's card,"
@@ -281,10 +280,8 @@ class Lateness(ProfileModel):
     workload: str | None = Field(
         default=None,
         description="workload of the computer profile whose latency t2 is injected; estimate:"
-        " scaled"
-        " to this policy; by default what was measured for this very policy, or else what this"
-        " machine"
-        " takes (sitl) or 1 ms (gym, lockstep)",
+        " scaled to this policy; by default what was measured for this very policy, or else what"
+        " this machine takes (sitl) or 1 ms (gym, lockstep)",
     )
     latency: str | None = Field(
         default=None,
@@ -325,10 +322,9 @@ class Flights(Workers):
     level: LevelName = Field(
         default="sitl",
         description="rung of the fidelity ladder. gym: the batch twin, some hundred episodes a"
-        " second."
-        " lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the same"
-        " flight"
-        " every time, bit by bit. sitl: two processes over UDP, in real time times the speed",
+        " second. lockstep: plant, autopilot and MAVSDK in one process on one simulated clock, the"
+        " same flight every time, bit by bit. sitl: two processes over UDP, in real time times the"
+        " speed",
     )
     episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
     seed: int = _seed("episode i uses seed + i for arena, sensors, wind and latency")
@@ -336,9 +332,7 @@ class Flights(Workers):
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,
     )
-    time_limit_s: float = quantity(
-        "longest flight from the start of navigation", "s", ge=1, le=3600, default=TIME_LIMIT_S
-    )
+    time_limit_s: TimeLimit = TIME_LIMIT_S
     speed: Annotated[float | None, FREE] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
         " to 1000 (default: as fast as it goes)",
@@ -367,17 +361,20 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
     None is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
 
     Raises:
-        pydantic.ValidationError: A field is unknown, of the wrong type, or out of range.
+        FieldError: A field is unknown, of the wrong type, or out of range.
     """
 
-    policy: str = Field(
-        default=DEFAULT_POLICY,
-        description="policy that decides: a name, a path to a folder with policy.onnx and"
-        " card.json, or a Python class as FILE.py:CLASS",
-    )
-    arena: str = Field(
-        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
-    )
+    policy: PolicyName = DEFAULT_POLICY
+    arena: ArenaName = DEFAULT_ARENA
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _told_in_one_line(cls, data: Any, handler: ModelWrapValidatorHandler[Scenario]) -> Scenario:
+        """Raise the error of a field that `resolve` raises, too: one line instead of pydantic's."""
+        try:
+            return handler(data)
+        except ValidationError as error:
+            raise field_error(error, cls) from None
 
     @property
     def seeds(self) -> tuple[int, ...]:

@@ -24,6 +24,7 @@ from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.file import anchored
 from airl_mav.scenario.model import FirmwareName, PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator, load_asked_policy
 
@@ -79,7 +80,7 @@ class ResolvedScenario:
     def config(self) -> dict[str, Any]:
         """All that is written down of a run, as plain values.
 
-        The scenario with what was left open decided, so that a default and the same value asked
+        The scenario with absolute paths, and what was left open decided, so that a default and the same value asked
         for are one run; and the content of profiles and policy: a name does not tell a changed one.
         """
         pilot = asdict(self.pilot)
@@ -91,7 +92,7 @@ class ResolvedScenario:
         if self.injection.latency is not None:
             profiles["latency"] = self.injection.latency
         return {
-            **self.scenario.model_dump(mode="json", exclude=set(pilot)),
+            **anchored(self.scenario).model_dump(mode="json", exclude=set(pilot)),
             "speed": self.speed,
             "pilot": pilot,
             "watchdog": self.watchdog.model_dump(mode="json"),

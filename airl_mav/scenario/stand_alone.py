@@ -11,15 +11,17 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.flight.judge import TIME_LIMIT_S
+from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.checks import check_firmware, check_ports
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
     GREATEST_SEED,
     Aircraft,
+    ArenaName,
     Decisions,
     Lateness,
+    PolicyName,
 )
 from airl_mav.scenario.piloting import TRANSPORT_US
 
@@ -46,9 +48,7 @@ FARTHEST_M = 10_000.0
 class StandAloneVehicle(Aircraft):
     """Flight controller, vehicle and camera by themselves, for any client."""
 
-    arena: str = Field(
-        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
-    )
+    arena: ArenaName = DEFAULT_ARENA
     seed: int = quantity("seed of arena, sensors and wind", "1", ge=0, le=GREATEST_SEED, default=1)
     speed: float | Literal["max"] | None = Field(
         default=None,
@@ -75,9 +75,9 @@ class StandAloneVehicle(Aircraft):
     lockstep: bool = Field(
         default=False,
         description="simulated time waits for one companion that passes turns (airl-companion"
-        " --lockstep, or any program that keeps to"
-        " docs/reference/lockstep-protocol.md): the same flight every time,"
-        " bit by bit; there is no ground station then, and the companion's end ends the flight",
+        " --lockstep, or any program that keeps to docs/reference/lockstep-protocol.md): the same"
+        " flight every time, bit by bit; there is no ground station then, and the companion's end"
+        " ends the flight",
     )
     transport_ms: float = quantity(
         "in lockstep: from a frame's exposure until the companion sees it",
@@ -101,20 +101,14 @@ class StandAloneVehicle(Aircraft):
         le=3600,
         default=COMPANION_TIMEOUT_S,
     )
-    goal_radius_m: float | None = quantity(
-        "in lockstep: judge the flight, and tell the companion when it is lost; the goal is reached"
-        " closer than this, seen from above; by default nobody judges",
-        "m",
-        ge=0.2,
-        le=50,
+    goal_radius_m: GoalRadius | None = Field(
         default=None,
+        description="in lockstep: judge the flight, and tell the companion when it is lost; the"
+        " goal is reached closer than this, seen from above; by default nobody judges",
     )
-    time_limit_s: float = quantity(
-        "with a goal radius: longest flight from the start of navigation",
-        "s",
-        ge=1,
-        le=3600,
+    time_limit_s: TimeLimit = Field(
         default=TIME_LIMIT_S,
+        description="with a goal radius: longest flight from the start of navigation",
     )
     tlog: Path | None = Field(
         default=None, description="write the MAVLink log of the onboard link to this file"
@@ -144,11 +138,7 @@ class CompanionAddresses(ProfileModel):
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     """What flies a policy, by itself: on an onboard computer, or against any simulator."""
 
-    policy: str = Field(
-        default=DEFAULT_POLICY,
-        description="policy that decides: a name, a path to a folder with policy.onnx and"
-        " card.json, or a Python class as FILE.py:CLASS",
-    )
+    policy: PolicyName = DEFAULT_POLICY
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
     )

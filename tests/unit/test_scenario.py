@@ -18,7 +18,7 @@ from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.scenario.file import load_scenario, save_scenario
+from airl_mav.scenario.file import anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -202,12 +202,55 @@ def options(*words: str) -> sitl.SitlOptions:
     return read_options(sitl.SitlOptions, "airl-sitl", words, renamed=renamed)
 
 
+def read_file(path: Path) -> Scenario:
+    return validated(Scenario, read_scenario_file(path), path)
+
+
 def test_a_scenario_survives_its_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     for fields in ({}, BUSY):
         scenario = Scenario.model_validate(fields)
         save_scenario(scenario, path)
-        assert load_scenario(path) == scenario
+        assert read_file(path) == anchored(scenario)
+
+
+def test_paths_in_the_file_of_a_run_are_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in ("pi.txt", "mine/card.json", "static-obstacles/card.json"):
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).touch()
+    fields = {"vehicle": "v.toml", "arena": "static-obstacles", "latency": "pi.txt"}
+    here = {"vehicle": f"{tmp_path}/v.toml", "latency": f"{tmp_path}/pi.txt"}
+    for policy, absolute in (
+        ("mine", f"{tmp_path}/mine"),
+        ("static-obstacles", "static-obstacles"),
+        ("mine.py:Pilot", f"{tmp_path}/mine.py:Pilot"),
+    ):
+        saved = anchored(Scenario(**fields, policy=policy))
+        assert saved == Scenario(**fields | here | {"policy": absolute})
+    for latency, absolute in (
+        ("80ms", "80ms"),
+        ("ras-pi-4/template-5x32", "ras-pi-4/template-5x32"),
+        ("pi.toml/fast", f"{tmp_path}/pi.toml/fast"),
+    ):
+        assert anchored(Scenario(latency=latency)).latency == absolute
+
+
+@pytest.mark.parametrize(
+    ("fields", "line"),
+    [
+        ({"episodes": 0}, "episodes 0: accepted: 1 <= value <= 100000"),
+        ({"wind": {"north_m_s": 99}}, "wind.north_m_s 99: accepted: -50 <= value <= 50 m/s"),
+        ({"goal_radius_m": 0.1}, "goal_radius_m 0.1: accepted: 0.2 <= value <= 50 m"),
+        ({"episode": 3}, "episode: unknown field; did you mean 'episodes'?"),
+    ],
+)
+def test_a_wrong_field_is_told_in_one_line(fields: dict[str, Any], line: str) -> None:
+    with pytest.raises(FieldError) as refused:
+        Scenario(**fields)
+    assert str(refused.value) == line
 
 
 def test_options_lie_over_the_file(tmp_path: Path) -> None:
@@ -238,7 +281,7 @@ def test_errors_in_a_file_name_it_and_the_field(tmp_path: Path, text: str, line:
     path = tmp_path / "mine.toml"
     path.write_text(text)
     reads: list[Callable[[], object]] = [
-        lambda: load_scenario(path),
+        lambda: read_file(path),
         lambda: options(str(path)),
     ]
     for read in reads:
