@@ -50,6 +50,4 @@ def anchored(scenario: Scenario) -> Scenario:
         paths["latency"] = latency
     real = {name: value.absolute() for name, value in scenario.real if isinstance(value, Path)}
     changes: dict[str, Any] = {name: f"{Path(value).absolute()}" for name, value in paths.items()}
-    return scenario.model_copy(
-        update={**changes, "real": scenario.real.model_copy(update=real)}
-    )
+    return scenario.model_copy(update={**changes, "real": scenario.real.model_copy(update=real)})

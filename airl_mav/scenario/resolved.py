@@ -80,8 +80,9 @@ class ResolvedScenario:
     def config(self) -> dict[str, Any]:
         """All that is written down of a run, as plain values.
 
-        The scenario with absolute paths, and what was left open decided, so that a default and the same value asked
-        for are one run; and the content of profiles and policy: a name does not tell a changed one.
+        The scenario with absolute paths, and with what was left open decided, so that a default and
+        the same value asked for are one run; and the content of profiles and policy: a name does
+        not tell a changed one.
         """
         pilot = asdict(self.pilot)
         profiles: dict[str, BaseModel] = {

@@ -1,0 +1,83 @@
+"""What a training is asked for: a configuration, and what changes in it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel, Field
+
+from airl_mav.profiles.loading import load_profile
+
+if TYPE_CHECKING:
+    from airl_mav.training.config import TrainingConfig
+
+
+class TrainRequest(BaseModel):
+    """A training, and the folder of its run."""
+
+    config: str = Field(
+        default="static-obstacles",
+        description="training configuration: a shipped name, or a path to a .toml",
+    )
+    out: Path | None = Field(
+        default=None, description="folder of the run; by default runs/train-<config>"
+    )
+    seed: int | None = Field(
+        default=None,
+        description="seed of weights, exploration and episodes; by default the configuration's",
+    )
+    computer: str | None = Field(
+        default=None,
+        description="decide as late as this computer in training: a shipped profile, or a path to a"
+        " .toml; takes --workload; by default the configuration's",
+    )
+    workload: str | None = Field(
+        default=None,
+        description="workload of that computer whose latency t2 is drawn in every decision",
+    )
+    latency: tuple[str, ...] = Field(
+        default=(),
+        description="sources of t2 in place of computer and workload, as airl evaluate takes them:"
+        " 150ms, lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE; of several, each episode draws one",
+    )
+    sensing_distance_m: float | None = Field(
+        default=None,
+        description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
+        " longest latency, stops within so many metres; by default the configuration's, or not",
+    )
+    max_acceleration_m_s2: float | None = Field(
+        default=None,
+        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance-m;"
+        " by default what the vehicle's tilt limit and thrust permit",
+    )
+    steps: int | None = Field(
+        default=None,
+        description="decisions of all vehicles together; by default the configuration's",
+    )
+    name: str | None = Field(
+        default=None, description="name of the policy on its card; by default the configuration's"
+    )
+    resume: bool = Field(
+        default=False,
+        description="continue the run in --out from its newest checkpoint; start it if there is"
+        " none",
+    )
+
+    @property
+    def stem(self) -> str:
+        """Name of the configuration."""
+        return Path(self.config).stem
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run."""
+        return self.out or Path("runs") / f"train-{self.stem}"
+
+    def configured(self) -> TrainingConfig:
+        """Return the configuration with what was given put into it. Raises UsageError."""
+        # Imported here: it takes what the extras install, and they are looked for first.
+        from airl_mav.training.config import TrainingConfig, configured
+
+        changes = self.model_dump(exclude={"config", "out", "name", "resume"})
+        return configured(load_profile("training", self.config, TrainingConfig), **changes)
