@@ -28,7 +28,7 @@ from rich.table import Table
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import WallClock
-from airl_mav.core.progress import SilentProgress
+from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Kinematics, Observation
@@ -120,7 +120,7 @@ def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
 def flown(request: ProfileRequest, policy: PolicyUnderTest) -> Flight:
     """Fly, and pair each t2 with the work inside it."""
     with Watch() as watch:
-        (stamps,) = hil.measure(request, policy, SilentProgress()).flights
+        (stamps,) = hil.measure(request, policy, Bar()).flights
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     inside_us = np.array(watch.took_ns[WARM_UP : WARM_UP + len(t2_us)]) / 1e3
     return Flight(t2_us - inside_us, inside_us)

@@ -1,13 +1,12 @@
 """Progress of long work: bars and lines on a terminal, or nothing for callers of the Python API.
 
 Whoever does the work is given a `Progress`: it opens a `Bar` for what can be counted and notes what
-a person should read. `RichProgress` draws, `SilentProgress` passes everything over.
+a person should read. `RichProgress` draws.
 """
 
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Protocol
 
 from rich.console import Console
 from rich.progress import (
@@ -28,27 +27,29 @@ PACE_S = 600.0
 """The remaining time is estimated from the pace over this interval [wall s]."""
 
 
-class Bar(Protocol):
-    """One countable piece of work."""
+class Bar:
+    """One countable piece of work; by itself it shows nothing."""
 
     def advance(self, amount: float = 1.0) -> None:
         """Add to what is completed."""
-        ...
 
     def update(self, *, completed: float | None = None, postfix: str | None = None) -> None:
         """Set what is completed, or the text after the bar; None leaves it as it is."""
-        ...
 
     def close(self) -> None:
         """Remove the bar."""
-        ...
 
 
-class Progress(Protocol):
-    """Where long work says how far it is."""
+class Progress:
+    """Where long work says how far it is; by itself it passes everything over."""
 
     def bar(
-        self, label: str, total: float, *, completed: float = 0.0, unit: str | None = None
+        self,
+        label: str,  # noqa: ARG002 (for those who draw)
+        total: float,  # noqa: ARG002
+        *,
+        completed: float = 0.0,  # noqa: ARG002
+        unit: str | None = None,  # noqa: ARG002
     ) -> Bar:
         """Open a bar.
 
@@ -58,7 +59,7 @@ class Progress(Protocol):
             completed: How much of it had been done before; does not count for the pace.
             unit: What is counted, in the plural: shows the count and the pace. None: neither.
         """
-        ...
+        return Bar()
 
     def note(self, text: str, style: str | None = None) -> None:
         """Print a line for a person; it stays when the bars are gone.
@@ -67,37 +68,9 @@ class Progress(Protocol):
             text: The line, taken literally.
             style: A style of rich: "yellow" for what a person should know.
         """
-        ...
 
 
-class SilentProgress:
-    """Shows nothing. Implements `Progress` and `Bar`."""
-
-    def bar(
-        self,
-        label: str,  # noqa: ARG002 (a Protocol's names)
-        total: float,  # noqa: ARG002
-        *,
-        completed: float = 0.0,  # noqa: ARG002
-        unit: str | None = None,  # noqa: ARG002
-    ) -> Bar:
-        """Return a bar that nobody sees."""
-        return self
-
-    def note(self, text: str, style: str | None = None) -> None:
-        """Pass a line over."""
-
-    def advance(self, amount: float = 1.0) -> None:
-        """Pass it over."""
-
-    def update(self, *, completed: float | None = None, postfix: str | None = None) -> None:
-        """Pass it over."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-class RichProgress:
+class RichProgress(Progress):
     """Draws bars on an interactive console; notes are printed to any. Use as a context manager."""
 
     def __init__(self, console: Console, clock: Clock | None = None) -> None:
@@ -151,8 +124,8 @@ class RichProgress:
         self._console.file.flush()
 
 
-class _RichBar:
-    """A task of rich's as a `Bar`."""
+class _RichBar(Bar):
+    """A task of rich's."""
 
     def __init__(
         self, bars: RichBars, label: str, total: float, completed: float, unit: str | None

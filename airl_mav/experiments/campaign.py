@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from airl_mav.core.progress import Progress, SilentProgress
+from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
 from airl_mav.experiments.fliers import Flier, FlyEpisodes
 from airl_mav.experiments.gym_flier import GymFlier
@@ -105,7 +105,7 @@ def run_cell(
         UsageError: The folder holds another run; no arena can be made of a seed. What was flown
             before is kept.
     """
-    return _run({cell.name: out}, [cell], executor, progress or SilentProgress(), stop)
+    return _run({cell.name: out}, [cell], executor, progress or Progress(), stop)
 
 
 def run_cells(
@@ -134,7 +134,7 @@ def run_cells(
     first_of = shared_flights(cells)
     unique = [cell for cell in cells if first_of[cell.name] is cell]
     paths = {cell.name: store.cell_path(cell.name) for cell in unique}
-    run = _run(paths, unique, executor, progress or SilentProgress(), stop, ended)
+    run = _run(paths, unique, executor, progress or Progress(), stop, ended)
     flown = {each.cell.name: each for each in run.cells}
     shown = [
         CellRun(cell, held.path, held.episodes, held.new)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from airl_mav.core.progress import Progress, RichProgress, SilentProgress
+from airl_mav.core.progress import Progress, RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import Executor, ExecutorSettings
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
@@ -93,7 +93,7 @@ def rehearse(scenario: Scenario, *, out: Path | str | None = None, progress: boo
 def shown(progress: bool) -> Iterator[Progress]:
     """Give a progress that draws on standard error, or one that is silent."""
     if not progress:
-        yield SilentProgress()
+        yield Progress()
         return
     with RichProgress(Console(stderr=True)) as drawn:
         yield drawn

@@ -12,7 +12,7 @@ import numpy as np
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.machine import MachineState, machine_state
-from airl_mav.core.progress import Bar, Progress, SilentProgress
+from airl_mav.core.progress import Bar, Progress
 from airl_mav.core.provenance import describe_machine
 from airl_mav.profiles.computer import (
     LONGEST_MS,
@@ -54,7 +54,7 @@ def profile(
         ImportError: Level sitl or a random network without the extra that it needs.
         KeyboardInterrupt: Ctrl-C; nothing was written, and a vehicle in flight is being landed.
     """
-    progress = progress or SilentProgress()
+    progress = progress or Progress()
     machine = describe_machine()
     computer = request.on or _file_name(str(machine["cpu"]))
     cpu = f"{machine['cores']} x {machine['cpu']}"

@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.progress import Bar, SilentProgress
+from airl_mav.core.progress import Bar, Progress
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiling.bare import cold_start
 from airl_mav.profiling.measurement import ProfilingError, Recording, Stamps
@@ -39,7 +39,7 @@ class DecisionEstimate(LiveObserver):
 
     def __init__(self, bar: Bar, period_s: float, before: int) -> None:
         """Begin with the decisions of earlier flights; one more is made every period."""
-        super().__init__(SilentProgress(), (), 1)
+        super().__init__(Progress(), (), 1)
         self._decisions, self._period_us, self._before = bar, period_s * US_PER_S, before
         self._navigating_us: int | None = None
 

@@ -103,7 +103,6 @@ class Ready(_Line):
     """The process can take requests."""
 
     type: Literal["ready"] = "ready"
-    details: dict[str, str | float | int] = Field(default_factory=dict)
 
 
 class Loaded(_Line):
@@ -161,7 +160,6 @@ class Progress(_Line):
     type: Literal["progress"] = "progress"
     phase: str
     time_us: int
-    detail: str = ""
 
 
 class Ended(_Line):
@@ -169,7 +167,6 @@ class Ended(_Line):
 
     type: Literal["ended"] = "ended"
     reason: str
-    detail: str = ""
     notes: tuple[str, ...] = ()
     path: str
     """Of the decision log."""

@@ -19,7 +19,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.run_folder import TICK_LATENESS, RunFolder
+from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, LINK_LOST
@@ -91,7 +91,7 @@ def save_episode(
             _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
         )
     record = _record(episode, scenario, trajectory, arrays["tick/slips_us"])
-    folder.save_episode(record, trajectory, latency)
+    folder.save_episodes([FlownEpisode(record, trajectory, latency)])
     record_path.unlink()
     decisions_path.unlink(missing_ok=True)
     return record

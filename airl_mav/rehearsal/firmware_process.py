@@ -204,7 +204,7 @@ def main() -> int:
         )
         with closing(firmware):
             warm_up(scenario.vehicle)
-            channel.send(Ready(details={"camera": firmware.camera_endpoint}))
+            channel.send(Ready())
             Service(firmware, channel, scenario).run(requests)
     except (UsageError, FirmwareLostError) as error:
         usage = isinstance(error, UsageError)

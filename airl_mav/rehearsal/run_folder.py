@@ -187,12 +187,6 @@ class RunFolder:
         with suppress(OSError):  # Somebody else's files.
             self.path.rmdir()
 
-    def save_episode(
-        self, record: EpisodeRecord, trajectory: Trajectory, latency: Mapping[str, NDArray[Any]]
-    ) -> None:
-        """Save an episode as it ends; on return it is on the disk."""
-        self.save_episodes([FlownEpisode(record, trajectory, latency)])
-
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
         """Save episodes; on return they are on the disk.
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.progress import SilentProgress
+from airl_mav.core.progress import Progress
 from airl_mav.experiments import campaign
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
@@ -34,7 +34,7 @@ from tests.support.processes import ROOT, has_ended, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
 
-class Notes(SilentProgress):
+class Notes(Progress):
     """Keeps what was noted."""
 
     def __init__(self) -> None:

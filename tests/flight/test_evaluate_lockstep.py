@@ -20,7 +20,7 @@ from unittest.mock import patch
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.progress import SilentProgress
+from airl_mav.core.progress import Progress
 from airl_mav.experiments import campaign
 from airl_mav.experiments.live import fly_live
 from airl_mav.flight.judge import Outcome
@@ -86,7 +86,7 @@ def test_one_worker_or_two_or_the_rehearsal_fly_the_same(
     rehearsal = Scenario(
         level="lockstep", policy="greedy", arena=ARENA, episodes=EPISODES, seed=SEED
     )
-    assert fly_live(resolve(rehearsal), tmp_path / "sitl", SilentProgress()).ended == "complete"
+    assert fly_live(resolve(rehearsal), tmp_path / "sitl", Progress()).ended == "complete"
     assert same_runs(load(tmp_path / "sitl"), one)
     # One line says the same of whole runs; by hand, as a shell would do it.
     lines = (tmp_path / "two" / "episodes.jsonl").read_text().splitlines()

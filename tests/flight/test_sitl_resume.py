@@ -26,7 +26,7 @@ from airl_mav.experiments.live import FlownRun
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import RehearsalError
-from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.scenario.model import Ports
 from airl_mav.scenario.resolved import ResolvedScenario
 from tests.support.processes import write_arena
@@ -78,7 +78,7 @@ class Rehearsal:
                 raise self.stage.ends.pop(index)
             record, path, stamps = demo_episode(index, demo_arena(index + 1))
             record = replace(record, seed=seed, arena=self.asked.arena)
-            self.folder.save_episode(record, path, stamps)
+            self.folder.save_episodes([FlownEpisode(record, path, stamps)])
             self.stage.flown.append(index)
             self.observer.finished(record)
 

@@ -348,7 +348,7 @@ def rehearsed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compariso
                 + [0.6 + aside, 0.8, 5.0],
             }
             estimate["estimate/position"][path.time_us[:-1] > record.ended_us] += 50.0
-            folder.save_episode(record, path, latency | estimate)
+            folder.save_episodes([FlownEpisode(record, path, latency | estimate)])
     levels = [RunEntry(level, level, planned=3) for level in ("lockstep", "sitl")]
     return root, ladder_of(root, {"policy": "scout", "arena": "static-obstacles"}, levels)
 
@@ -493,10 +493,10 @@ def test_a_level_without_any_success_still_has_a_page(
     runs = load(rehearsed[0] / "sitl")
     folder = RunFolder.create(tmp_path / "sitl", "demo", {}, setup=runs.info.setup)
     failed = replace(runs.episodes[0], outcome=Outcome.COLLISION, quality=None, navigation_us=None)
-    folder.save_episode(failed, runs.trajectories[0], {})
+    folder.save_episodes([FlownEpisode(failed, runs.trajectories[0], {})])
     folder = RunFolder.create(tmp_path / "lockstep", "demo", {}, setup=runs.info.setup)
     reached = load(rehearsed[0] / "lockstep").episodes[0]
-    folder.save_episode(reached, runs.trajectories[0], runs.latency[0])
+    folder.save_episodes([FlownEpisode(reached, runs.trajectories[0], runs.latency[0])])
     entries = [RunEntry(n, n, planned=1) for n in ("lockstep", "sitl")]
     ladder, loaded = build_comparison(tmp_path, "ladder", {}, entries)
     rows = comparison_tables(ladder)[0].rows[1:]

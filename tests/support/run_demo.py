@@ -18,7 +18,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
-from airl_mav.rehearsal.run_folder import RunFolder
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 
 TICK_US = 20_000
 TAKEOFF_US = 5_000_000
@@ -141,7 +141,7 @@ def write_demo_run(
     )
     for index, arena in arenas.items():
         limit_s = 12.0 if index == 3 else 40.0
-        folder.save_episode(*demo_episode(index, arena, time_limit_s=limit_s))
+        folder.save_episodes([FlownEpisode(*demo_episode(index, arena, time_limit_s=limit_s))])
     return folder, arenas
 
 

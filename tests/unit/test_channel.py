@@ -148,8 +148,8 @@ def test_other_bytes_are_no_event(line: bytes) -> None:
     "line",
     [
         b'{"type":"lunch"}',
-        b'{"type":"ready","details":{},"more":1}',
-        b'{"details":{}}',
+        b'{"type":"ready","more":1}',
+        b'{"more":1}',
         b'{"type":"text","time_us":"soon","severity":1,"text":""}',
         b'{"type":"shutdown"}',  # a request is no event
     ],

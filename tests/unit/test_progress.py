@@ -8,7 +8,7 @@ from rich.console import Console
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.progress import Progress, RichProgress, SilentProgress
+from airl_mav.core.progress import Progress, RichProgress
 
 
 def drawn(*, terminal: bool) -> str:
@@ -43,7 +43,7 @@ def test_without_a_terminal_only_notes_are_printed() -> None:
 
 
 def test_silence_takes_everything() -> None:
-    progress: Progress = SilentProgress()
+    progress: Progress = Progress()
     bar = progress.bar("anything", 3, completed=1, unit="flights")
     bar.advance()
     bar.update(completed=2, postfix="text")

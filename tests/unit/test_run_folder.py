@@ -16,7 +16,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import add_arrays, json_line, replace_file
 from airl_mav.core.provenance import git_state
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.rehearsal.run_folder import EPISODES_FILE, LATENCY_FILE, RunFolder, load
+from airl_mav.rehearsal.run_folder import EPISODES_FILE, LATENCY_FILE, FlownEpisode, RunFolder, load
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup, write_demo_run
 
 
@@ -92,7 +92,7 @@ def test_a_line_cut_short_is_passed_over_and_cut_off(tmp_path: Path) -> None:
         resumed, run = RunFolder.resume(folder.path)
         assert len(run.episodes) == 2
         assert lines.read_bytes() == whole
-    resumed.save_episode(record, trajectory, latency)
+    resumed.save_episodes([FlownEpisode(record, trajectory, latency)])
     assert [episode.index for episode in load(folder.path).episodes] == [0, 1, 2]
 
 
@@ -113,7 +113,7 @@ def test_an_episode_without_its_line_never_happened_and_can_be_flown_again(tmp_p
     assert set(run.trajectories) == set(run.latency) == {0}
     other = demo_episode(5, demo_arena(6))
     again = (replace(other[0], index=1), other[1], {"sent_us": np.arange(3)})
-    RunFolder.resume(folder.path)[0].save_episode(*again)
+    RunFolder.resume(folder.path)[0].save_episodes([FlownEpisode(*again)])
     run = load(folder.path)
     assert same_path(run.trajectories[1], other[1])
     assert list(run.latency[1]) == ["sent_us"]
@@ -152,7 +152,7 @@ else:
     folder, start = RunFolder.create(path, "killed", {}, setup=demo_setup()), 0
 record, trajectory, latency = demo_episode(0, demo_arena(1))
 for index in range(start, 10_000):
-    folder.save_episode(replace(record, index=index), trajectory, latency)
+    folder.save_episodes([FlownEpisode(replace(record, index=index), trajectory, latency)])
     print(index, flush=True)
 """
 
