@@ -13,8 +13,7 @@ from airl_mav.core.files import save_arrays
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import Abandoned
 from companion.interfaces import LinkError
-from companion.mission import MissionResult
-from companion.program import Mission, fly_alone, prepare
+from companion.program import fly_alone, prepare
 
 
 class CompanionOptions(StandAloneCompanion):
@@ -49,11 +48,28 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
+    what = "simulator" if options.lockstep else "flight controller"
+
+    def waiting() -> None:
+        console.print(f"waiting for a {what} on {options.connect}", markup=False)
+
+    def progress(phase: str, time_us: int) -> None:
+        console.print(f"{time_us / 1e6:8.2f} s  {phase}")
+
+    sha256: dict[str, str] = {}
     try:
-        result = _fly(options, mission, stop, abandon, console)
+        if options.lockstep:
+            # Imported here: a companion on a drone needs nothing of it.
+            from airl_mav.lockstep.token_companion import fly_in_lockstep
+
+            result, sha256 = fly_in_lockstep(options, mission, stop, abandon, waiting, progress)
+        else:
+            result = fly_alone(options, mission, stop, abandon, waiting, progress)
     except (LinkError, Abandoned) as error:
         console.print(f"error: {error}", style="red", markup=False)
         return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
+    for name, digest in sha256.items():
+        console.print(f"{name:<13} {digest}", highlight=False)
     if options.log is not None:
         save_arrays(options.log, result.log.columns())
     for note in result.notes:
@@ -62,40 +78,6 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
     if result.reason == "goal reached":
         return 0
     return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
-
-
-def _fly(
-    options: CompanionOptions,
-    mission: Mission,
-    stop: threading.Event,
-    abandon: threading.Event,
-    console: Console,
-) -> MissionResult:
-    def progress(phase: str, time_us: int) -> None:
-        console.print(f"{time_us / 1e6:8.2f} s  {phase}")
-
-    def waiting() -> None:
-        what = "simulator" if options.lockstep else "flight controller"
-        console.print(f"waiting for a {what} on {options.connect}", markup=False)
-
-    if not options.lockstep:
-        return fly_alone(options, mission, stop, abandon, waiting, progress)
-    # Imported here: a companion on a drone needs nothing of it.
-    from airl_mav.lockstep.token_companion import fly
-
-    result, sha256 = fly(
-        mission,
-        options.connect,
-        options.camera,
-        options.connect_timeout,
-        stop,
-        abandon,
-        waiting,
-        progress,
-    )
-    for name, digest in sha256.items():
-        console.print(f"{name:<13} {digest}", highlight=False)
-    return result
 
 
 if __name__ == "__main__":

@@ -17,16 +17,15 @@ from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import SEEN, FlightDigest
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
+from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.stand_alone import Listener, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.firmware import BuiltinFlightStack, Firmware, FrameServer, Loaded
+from firmware_sim.firmware import FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
-from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
@@ -67,8 +66,7 @@ class RemoteStage:
         )
         memory = MemoryEndpoint()
         self._conductor = Conductor(memory, self._partner, self._digest, asked.pace)
-        server = MavlinkServer([lockstep_link(memory)], boot_unix_us=BOOT_UNIX_US)
-        self.firmware = Firmware(BuiltinFlightStack(server), camera, self._conductor)
+        self.firmware = conducted_firmware(memory, camera, self._conductor)
         self._judge = Judge(None, self._digest, order=self._partner.order)
 
     @property

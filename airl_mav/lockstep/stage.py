@@ -12,14 +12,12 @@ from airl_mav.core.errors import UsageError
 from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.link import BOOT_UNIX_US, lockstep_link
+from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.mavsdk_link import RAW_URL, MavsdkLink
-from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
-from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 HEARD_TIMEOUT_S = 10.0
@@ -35,7 +33,6 @@ class Stage:
         transport_us: int = 0,
         digest: FlightDigest | None = None,
         speed: float | None = None,
-        partner: ThreadPartner | None = None,
     ) -> None:
         """Put everything together; nothing moves yet.
 
@@ -43,9 +40,8 @@ class Stage:
             transport_us: From a frame's exposure until it lies decoded in the companion [µs].
             digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
             speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
-            partner: Runs the companion; None: as it should be run.
         """
-        self._partner = partner or ThreadPartner()
+        self._partner = ThreadPartner()
         self.abandon = threading.Event()
         """Makes the link break off whatever it waits for."""
         endpoint = MemoryEndpoint()
@@ -55,8 +51,7 @@ class Stage:
         self.camera = MemoryCamera(transport_us)
         """The companion's source of frames."""
         self.camera.clock = self.clock
-        server = MavlinkServer([lockstep_link(endpoint)], boot_unix_us=BOOT_UNIX_US)
-        self.firmware = Firmware(BuiltinFlightStack(server), self.camera, self.conductor)
+        self.firmware = conducted_firmware(endpoint, self.camera, self.conductor)
         self._open = ExitStack()
 
     def __enter__(self) -> Stage:
@@ -86,7 +81,6 @@ class Stage:
         *,
         tlog: Path | None = None,
         begun: Callable[[int], None] = lambda _started_us: None,
-        linger_us: int = 0,
     ) -> Simulation:
         """Fly until the companion's program has ended.
 
@@ -96,7 +90,6 @@ class Stage:
                 simulated time moves only while it sleeps by `clock`.
             tlog: Where the MAVLink log goes; None: no log.
             begun: Called with the simulated time of the reset [µs].
-            linger_us: Fly on for so long when the program has ended [µs].
 
         Returns:
             The simulation as it stands at the end; closed with the stage.
@@ -118,9 +111,6 @@ class Stage:
         while not conductor.ended:
             firmware.step()
         self._raise_what_broke()
-        until_us = conductor.clock.time_us() + linger_us
-        while conductor.clock.time_us() < until_us:
-            firmware.step()
         assert firmware.simulation is not None  # noqa: S101 (loaded above)
         return firmware.simulation
 

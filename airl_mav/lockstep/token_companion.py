@@ -9,6 +9,7 @@ from contextlib import closing
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.digest import SEEN, FlightDigest, WitnessedPolicy
 from airl_mav.scenario.piloting import NATIVE_T2_US
+from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import open_camera
 from companion.conducted import ConductedClock
 from companion.mavsdk_link import MavsdkLink
@@ -23,11 +24,9 @@ never in a flight, also when a process is stopped for a while, but it notices a 
 gone."""
 
 
-def fly(
+def fly_in_lockstep(
+    asked: StandAloneCompanion,
     mission: Mission,
-    connect: str,
-    camera_address: str,
-    timeout_s: float,
     stop: threading.Event,
     abandon: threading.Event,
     waiting: Callable[[], None],
@@ -36,10 +35,9 @@ def fly(
     """Fly one mission; the same simulator and mission give the same flight, bit by bit.
 
     Args:
+        asked: How the simulator and the camera are reached, and how long to wait for the
+            simulator, and for each turn.
         mission: What is flown.
-        connect: MAVSDK connection to the simulator.
-        camera_address: ZeroMQ address of the camera.
-        timeout_s: How long to wait for it, and for each turn [wall s].
         stop: Set to end the flight early; the simulator sets it, too.
         abandon: Set to end it without landing; the simulator sets it, too.
         waiting: Called once the simulator is waited for.
@@ -54,7 +52,7 @@ def fly(
         Abandoned: The simulator gives no turn any more.
     """
     digest = FlightDigest()
-    turns = TokenTurns(stop, abandon, timeout_s)
+    turns = TokenTurns(stop, abandon, asked.connect_timeout)
     clock = ConductedClock(turns.clock, turns.sleep)
 
     def announce(phase: str) -> None:
@@ -62,13 +60,13 @@ def fly(
         progress(phase, clock.time_us())
 
     with (
-        closing(open_camera(camera_address, clock)) as frames,
+        closing(open_camera(asked.camera, clock)) as frames,
         # Who gives turns is heard, however long the wall clock says that it was silent.
-        closing(MavsdkLink(connect, clock, abandon, heard=lambda: True)) as link,
+        closing(MavsdkLink(asked.connect, clock, abandon, heard=lambda: True)) as link,
     ):
         link.set_timeout(ANSWER_TIMEOUT_S)
         waiting()
-        link.connect(timeout_s, stop)
+        link.connect(asked.connect_timeout, stop)
         camera = TokenFrameSource(frames, turns, clock)
         with turns.taken(link):
             check_camera(mission.policy, camera, stop)

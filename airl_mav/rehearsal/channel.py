@@ -8,6 +8,7 @@ gone: the child ends. Because it is only pipes, the same channel runs through `s
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
 from airl_mav.scenario.resolved import ResolvedScenario
 
@@ -262,3 +263,28 @@ class ChildChannel:
                 gone()
 
         threading.Thread(target=loop, name="channel", daemon=True).start()
+
+
+def serve(work: Callable[[Begin, ChildChannel], None], lost: type[Exception]) -> int:
+    """Be a child process: take its first line, work, and say why it failed.
+
+    Args:
+        work: What it does, from its first line to its end.
+        lost: What `work` raises where a new process may do better.
+
+    Returns:
+        Its exit status.
+    """
+    channel = ChildChannel.on_stdio()
+    # The rehearsal decides when to end, also on Ctrl-C: it closes the pipe.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        begin = channel.begin()
+        if begin is None:
+            return EXIT_BROKEN
+        work(begin, channel)
+    except (UsageError, lost) as error:
+        usage = isinstance(error, UsageError)
+        channel.send(Failed(message=str(error), usage=usage))
+        return EXIT_USAGE if usage else EXIT_BROKEN
+    return 0

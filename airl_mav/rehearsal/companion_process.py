@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import queue
-import signal
 import sys
 import threading
 from contextlib import closing
@@ -16,18 +15,19 @@ from typing import Any
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
+from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.rehearsal.channel import (
     Abort,
+    Begin,
     ChildChannel,
     Ended,
-    Failed,
     Fly,
     Progress,
     Ready,
     Shutdown,
+    serve,
 )
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.camera import open_camera
@@ -112,25 +112,14 @@ class Missions:
         self._channel.send(Progress(phase=phase, time_us=self._clock.time_us()))
 
 
-def main() -> int:
+def fly(begin: Begin, channel: ChildChannel) -> None:
     """Fly missions on request, until the pipe ends."""
-    channel = ChildChannel.on_stdio()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        begin = channel.begin()
-        if begin is None:
-            return EXIT_BROKEN
-        missions = Missions(begin.scenario, channel)
-        # Without its rehearsal a companion has no business in the air, whatever it is doing: its
-        # setpoints end and the flight controller's offboard-loss failsafe takes over.
-        channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
-        missions.run()
-    except (UsageError, LinkError) as error:
-        usage = isinstance(error, UsageError)
-        channel.send(Failed(message=str(error), usage=usage))
-        return EXIT_USAGE if usage else EXIT_BROKEN
-    return 0
+    missions = Missions(begin.scenario, channel)
+    # Without its rehearsal a companion has no business in the air, whatever it is doing: its
+    # setpoints end and the flight controller's offboard-loss failsafe takes over.
+    channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
+    missions.run()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(serve(fly, LinkError))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -16,12 +15,12 @@ from typing import Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
+from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.channel import (
+    Begin,
     ChildChannel,
-    Failed,
     FinishEpisode,
     Loaded,
     LoadEpisode,
@@ -29,6 +28,7 @@ from airl_mav.rehearsal.channel import (
     Saved,
     Shutdown,
     Text,
+    serve,
 )
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.model import Aircraft
@@ -184,34 +184,22 @@ def unix_us() -> int:
     return int(utc_now().timestamp() * US_PER_S)
 
 
-def main() -> int:
+def fly(begin: Begin, channel: ChildChannel) -> None:
     """Fly episodes on request, until the pipe ends."""
-    channel = ChildChannel.on_stdio()
-    # The rehearsal decides when to end, also on Ctrl-C: it closes the pipe.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     requests: queue.Queue[Any] = queue.Queue()
-    try:
-        begin = channel.begin()
-        if begin is None:
-            return EXIT_BROKEN
-        channel.listen(requests.put, lambda: requests.put(Shutdown()))
-        scenario = begin.scenario
-        firmware = build_firmware(
-            scenario.scenario,
-            scenario.vehicle,
-            WallPacing(scenario.speed or 1.0),
-            log=None if begin.log is None else Path(begin.log),
-        )
-        with closing(firmware):
-            warm_up(scenario.vehicle)
-            channel.send(Ready())
-            Service(firmware, channel, scenario).run(requests)
-    except (UsageError, FirmwareLostError) as error:
-        usage = isinstance(error, UsageError)
-        channel.send(Failed(message=str(error), usage=usage))
-        return EXIT_USAGE if usage else EXIT_BROKEN
-    return 0
+    channel.listen(requests.put, lambda: requests.put(Shutdown()))
+    scenario = begin.scenario
+    firmware = build_firmware(
+        scenario.scenario,
+        scenario.vehicle,
+        WallPacing(scenario.speed or 1.0),
+        log=None if begin.log is None else Path(begin.log),
+    )
+    with closing(firmware):
+        warm_up(scenario.vehicle)
+        channel.send(Ready())
+        Service(firmware, channel, scenario).run(requests)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(serve(fly, FirmwareLostError))

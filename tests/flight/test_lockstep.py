@@ -230,6 +230,13 @@ def policy_hangs(stage: Stage) -> None:
     assert len(result.notes) == 2
 
 
+def fly_on(stage: Stage, seconds: float) -> None:
+    """Fly on for a while when the companion's program has ended."""
+    until_us = stage.conductor.clock.time_us() + int(seconds * US_PER_S)
+    while stage.conductor.clock.time_us() < until_us:
+        stage.firmware.step()
+
+
 def nobody_takes_off(stage: Stage) -> None:
     stage.link.arm(20.0, stage.abandon)
 
@@ -269,7 +276,8 @@ def test_failsafes_come_at_the_same_tick_at_every_speed(
         with Stage(speed=speed) as stage:
             firmware, now_us = stage.firmware, stage.conductor.clock.time_us
             firmware.on_message = lambda message: found.append((now_us(), message.text))
-            stage.run(setup, lambda: program(stage), linger_us=12 * US_PER_S)
+            stage.run(setup, lambda: program(stage))
+            fly_on(stage, 12.0)
         return found
 
     by_speed = {speed: events(speed) for speed in (None, 60.0, 20.0)}
@@ -287,7 +295,8 @@ def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
         stage.firmware.on_message = lambda message: (
             told.append(now_us()) if "Failsafe" in message.text else None
         )
-        simulation = stage.run(setup, lambda: companion_dies(stage), linger_us=2 * US_PER_S)
+        simulation = stage.run(setup, lambda: companion_dies(stage))
+        fly_on(stage, 2.0)
         assert simulation.recorder is not None
         last_us = int(simulation.recorder.setpoints.arrays()["accepted_us"][-1])
     assert len(told) == 1
