@@ -32,11 +32,7 @@ OPTIONS = CompanionOptions
 def run(options: CompanionOptions, console: Console | None = None) -> int:
     """Fly one mission.
 
-    Returns:
-        Exit status: 0 the goal was reached, 1 it was not, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0 the goal was reached, 1 it was not, 130 Ctrl-C.
     """
     console = console or Console(soft_wrap=True)
     mission = prepare(options)

@@ -63,11 +63,7 @@ RENAMED_OPTIONS = RENAMED
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """Evaluate.
 
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
     """
     console = console or Console()
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)

@@ -35,11 +35,7 @@ OPTIONS = FirmwareOptions
 def run(options: FirmwareOptions, console: Console | None = None) -> int:
     """Fly whatever the clients ask for, until Ctrl-C; in lockstep until the companion has ended.
 
-    Returns:
-        Exit status: 0, or 1 when real firmware or the companion in lockstep was lost.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0, or 1 when real firmware or the companion in lockstep was lost.
     """
     console = console or Console(soft_wrap=True)
     stop = threading.Event()

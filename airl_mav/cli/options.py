@@ -205,9 +205,10 @@ def _help(field: FieldInfo) -> str:
 def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> NoReturn:
     """Run the command of a module and exit with its status.
 
-    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`; and where
-    there are any, `RENAMED_OPTIONS` and `EXTRAS`, what it needs beside the simulator. Usage errors
-    become one line and exit status 2, a machine that fails one line and 1.
+    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`, which raises
+    UsageError for input that cannot be used; and where there are any, `RENAMED_OPTIONS` and
+    `EXTRAS`, what it needs beside the simulator. Usage errors become one line and exit status 2, a
+    machine that fails one line and 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed

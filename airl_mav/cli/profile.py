@@ -44,11 +44,7 @@ RENAMED_OPTIONS = {**RENAMED, "--price": ("--price-usd",)}
 def run(options: ProfileOptions, console: Console | None = None) -> int:
     """Measure, print the report, and write the profile.
 
-    Returns:
-        Exit status: 0 measured, 1 it broke off, 130 Ctrl-C; only with 0 is anything written.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0 measured, 1 it broke off, 130 Ctrl-C; only with 0 is anything written.
     """
     console = console or Console()
     if options.level == "sitl":

@@ -45,11 +45,7 @@ RENAMED_OPTIONS = {**RENAMED, "--lockstep": ("--level", "lockstep")}
 def run(options: SitlOptions, console: Console | None = None) -> int:
     """Fly what is left of the episodes and write the report.
 
-    Returns:
-        Exit status: 0 all episodes flown, 1 an episode was lost too often, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0 all episodes flown, 1 an episode was lost too often, 130 Ctrl-C.
     """
     console = console or Console()
     scenario = resolve(scenario_of(options))

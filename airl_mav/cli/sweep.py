@@ -43,11 +43,7 @@ OPTIONS = SweepOptions
 def run(options: SweepOptions, console: Console | None = None) -> int:
     """Carry out what is left of a sweep, and show what came out.
 
-    Returns:
-        Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
+    Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
     """
     console = console or Console()
     config, settings = options.config(), options.executor_settings()

@@ -22,8 +22,6 @@ less than this is not slowed at all."""
 PERIOD_US = 10_000
 """Period for a core or more [µs]."""
 
-LEAST_PERCENT, MOST_PERCENT = 1.0, 6400.0
-
 PREFIX = "airl-quota-"
 OPTION = "--cpu-quota"
 
@@ -95,13 +93,8 @@ def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup 
 
 def check_permitted(percent: float | None, root: Path = Path("/")) -> None:
     """Raise UsageError, with the reason, unless this process can be limited to the share."""
-    if percent is None:
-        return
-    if not LEAST_PERCENT <= percent <= MOST_PERCENT:
-        raise UsageError(
-            f"{OPTION} {percent:g}: accepted: {LEAST_PERCENT:g} <= value <= {MOST_PERCENT:g} %"
-        )
-    _made(_home(root), percent).path.rmdir()
+    if percent is not None:
+        _made(_home(root), percent).path.rmdir()
 
 
 def remove_left(root: Path = Path("/")) -> None:

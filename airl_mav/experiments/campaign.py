@@ -21,9 +21,8 @@ from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
-from airl_mav.rehearsal.evaluation import another_config, open_folder
 from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, another_config, open_folder
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {

@@ -17,11 +17,10 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, Usag
 from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
-from airl_mav.rehearsal.evaluation import open_folder
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.progress import LiveObserver
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
-from airl_mav.rehearsal.run_folder import RUN_FILE
+from airl_mav.rehearsal.run_folder import RUN_FILE, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.external.programs import check_program

@@ -118,11 +118,7 @@ class Inbound:
         """
         again = setpoints_sent > self._counted and self._setpoint is not None
         self._counted = setpoints_sent
-        return self._deliver(now_us) if again else None
-
-    def repeat(self, now_us: int) -> bytes:
-        """Return the newest setpoint as MAVSDK repeats it; call when `next_repeat_us` is due."""
-        return self._deliver(now_us)
+        return self.repeat(now_us) if again else None
 
     def end(self) -> None:
         """The companion has gone, and MAVSDK with it: nothing is repeated any more."""
@@ -135,7 +131,7 @@ class Inbound:
             return NOTHING
         self._body, self._setpoint = body, message
         self._counted += 1
-        return Passed((self._deliver(now_us),))
+        return Passed((self.repeat(now_us),))
 
     def _take_command(self, message: WireMessage, now_us: int) -> Passed:
         result = _ASKED_BY_THE_WALL_CLOCK.get((message.command, message.param1))
@@ -146,14 +142,15 @@ class Inbound:
             if self.next_repeat_us is None and self._setpoint is not None:
                 # Offboard needs a setpoint that is fresh. MAVSDK has just sent one; should it be
                 # the same as in the last offboard flight, it was taken for a repetition.
-                before = (self._deliver(now_us),)
+                before = (self.repeat(now_us),)
         elif message.command in _ENDS_OFFBOARD:
             self.next_repeat_us = None
         if message.command in _RATES_AND_REQUESTS:
             return Passed((self._pack(message, self._aside),), of_the_flight=False)
         return Passed((*before, self._pack(message)))
 
-    def _deliver(self, now_us: int) -> bytes:
+    def repeat(self, now_us: int) -> bytes:
+        """Return the newest setpoint as MAVSDK repeats it; call when `next_repeat_us` is due."""
         assert self._setpoint is not None  # noqa: S101 (there is one whenever it is due)
         self.next_repeat_us = now_us + REPEAT_US
         self._setpoint.time_boot_ms = now_us // US_PER_MS

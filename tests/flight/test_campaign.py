@@ -27,8 +27,7 @@ from airl_mav.experiments.store import (
 )
 from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
-from airl_mav.rehearsal.evaluation import CAMPAIGN_FILE
-from airl_mav.rehearsal.run_folder import FlownEpisode, load
+from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, FlownEpisode, load
 from tests.support.campaign_kit import cells, declared, gym_cell, same_runs
 from tests.support.processes import ROOT, has_ended, running, wait_until
 from tests.support.worker_jobs import PaperFlier

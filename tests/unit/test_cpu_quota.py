@@ -156,7 +156,7 @@ def test_refused_where_no_group_can_be_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize("percent", [0.5, 10_000.0, float("nan")])
 def test_refused_out_of_range(percent: float) -> None:
     with pytest.raises(UsageError, match="accepted: 1 <= value <= 6400 %"):
-        check_permitted(percent)
+        Scenario(cpu_quota=percent)
 
 
 def test_it_is_refused_where_the_companions_time_does_not_count() -> None:

@@ -143,7 +143,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
-from airl_mav.rehearsal.run_folder import RunFolder
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 path = Path(sys.argv[1])
 if (path / "run.json").exists():
     folder, run = RunFolder.resume(path)
