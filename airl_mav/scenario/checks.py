@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from airl_mav.core.errors import FieldError
-from airl_mav.scenario.model import Aircraft, LevelName, Ports, Scenario
+from airl_mav.scenario.model import NO_TWIN, Aircraft, LevelName, Ports, Scenario
 
 SITL_SPEEDS = 0.5, 10.0
 """Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
@@ -28,9 +28,11 @@ def check_level(scenario: Scenario) -> None:
             raise FieldError("speed", scenario.speed, f"{low:g} <= value <= {high:g} at level sitl")
     elif level == "gym":
         usual = Scenario()
-        for field in ("wind", "estimator", "max_speed_m_s", "speed"):
+        for field, declared in Scenario.model_fields.items():
+            if NO_TWIN not in declared.metadata:
+                continue
             if (value := getattr(scenario, field)) != getattr(usual, field):
-                raise FieldError(field, value, "at level lockstep or sitl; the twin has none")
+                raise FieldError(field, value, NO_TWIN)
     if level != "lockstep" and scenario.tlogs:
         raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
     if level == "sitl" and scenario.workers is not None:

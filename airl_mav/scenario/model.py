@@ -45,6 +45,9 @@ AblationName = Literal["depth", "velocity", "goal"]
 FREE = "decides no flight"
 """Marks a field that may differ when a run is resumed."""
 
+NO_TWIN = "at level lockstep or sitl; the twin has none"
+"""Marks a field that must be left as it is at level gym."""
+
 
 def _seed(description: str, default: Any = 1) -> Any:
     return quantity(description, "1", ge=0, le=GREATEST_SEED, default=default)
@@ -187,8 +190,8 @@ class Aircraft(ProfileModel):
     """What flies, and how it is reached."""
 
     vehicle: VehicleName = DEFAULT_VEHICLE
-    wind: WindSettings = Field(default_factory=WindSettings, description="wind")
-    estimator: EstimatorName = Field(
+    wind: Annotated[WindSettings, NO_TWIN] = Field(default_factory=WindSettings, description="wind")
+    estimator: Annotated[EstimatorName, NO_TWIN] = Field(
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
         " some twenty times slower",
@@ -253,7 +256,7 @@ class Decisions(Inference):
         description="the goal is reached closer than this, seen from above; by default that of the"
         " policy's card, or 3",
     )
-    max_speed_m_s: float | None = quantity(
+    max_speed_m_s: Annotated[float | None, NO_TWIN] = quantity(
         "horizontal speed limit of all actions; by default the fastest action of the policy's card,"
         " or 5",
         "m/s",
@@ -333,7 +336,7 @@ class Flights(Workers):
         None,
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
-    speed: Annotated[float | None, FREE] = quantity(
+    speed: Annotated[float | None, FREE, NO_TWIN] = quantity(
         "simulated seconds per wall second: level sitl 0.5 to 10 (default 1), level lockstep 0.01"
         " to 1000 (default: as fast as it goes)",
         "1",
