@@ -73,16 +73,8 @@ RENAMED_OPTIONS = {"--altitude": ("--altitude-m",), "--connect-timeout": ("--con
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result.
 
-    Args:
-        options: What is asked for.
-        console: Where to print; None means standard output.
-
-    Returns:
-        Exit status: 0 it conforms, 1 a check failed or a figure lies outside its tolerance, 130
-        Ctrl-C, after landing.
-
-    Raises:
-        UsageError: As `check_conformance`, or --out cannot be written.
+    Exit status: 0 it conforms, 1 a check failed or a figure lies outside its tolerance, 130 Ctrl-C,
+    after landing. Raises UsageError as `check_conformance`, and for a folder that is not there.
     """
     from airl_mav.conformance.report import check_table, line_text, step_table
     from airl_mav.conformance.run import check_conformance

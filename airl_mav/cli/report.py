@@ -52,9 +52,8 @@ OPTIONS = ReportOptions
 def run(options: ReportOptions, console: Console | None = None) -> int:
     """Build the report. Returns exit status 0.
 
-    Raises:
-        UsageError: A folder holds nothing to report, an arena of it cannot be made any more, or
-            runs cannot be compared.
+    Raises UsageError for a folder that holds nothing to report or whose arenas cannot be made any
+    more, and for runs that cannot be compared.
     """
     console = console or Console()
     if not options.runs:

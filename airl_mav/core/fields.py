@@ -7,6 +7,7 @@ says of wrong input into one line.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterator
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
@@ -170,16 +171,26 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
     return FieldError(field, first["input"], accepted + tail)
 
 
-def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
-    """Return the dotted path of a location, without the branches of unions of plain values."""
-    here, parts, plain = model, [], False
+def _steps(
+    model: type[BaseModel] | None, path: tuple[int | str, ...]
+) -> Iterator[tuple[int | str, FieldInfo | None, type[BaseModel] | None]]:
+    """Yield each part of a location, the field that it names, and the model that this leads to."""
+    here = model
     for part in path:
-        if plain and not isinstance(part, int):
-            continue
-        parts.append(str(part))
         field = here.model_fields.get(str(part)) if here else None
         if field is not None:
             here = _model_in(field.annotation)
+        yield part, field, here
+
+
+def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
+    """Return the dotted path of a location, without the branches of unions of plain values."""
+    parts, plain = [], False
+    for part, field, here in _steps(model, path):
+        if plain and not isinstance(part, int):
+            continue
+        parts.append(str(part))
+        if field is not None:
             plain = here is None and get_origin(field.annotation) in (Union, UnionType)
     return ".".join(parts)
 
@@ -199,29 +210,14 @@ def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:
 
 def _declared_range(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
     """Return the declared range of the innermost field on the way to a location, "" for none."""
-    for depth in range(len(path), 0, -1):
-        owner = _model_at(model, path[: depth - 1])
-        field = owner.model_fields.get(str(path[depth - 1])) if owner else None
-        if field is not None:
-            return range_of(field)
-    return ""
+    fields = [field for _, field, _ in _steps(model, path) if field is not None]
+    return range_of(fields[-1]) if fields else ""
 
 
 def _field_names(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> list[str]:
-    owner = _model_at(model, path)
+    """Return the names of the fields of the model at a location."""
+    *_, owner = model, *(here for _, _, here in _steps(model, path))
     return list(owner.model_fields) if owner else []
-
-
-def _model_at(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> type[BaseModel] | None:
-    """Return the model that a location inside `model` points at."""
-    here = model
-    for part in path:
-        if here is None:
-            return None
-        field = here.model_fields.get(str(part))
-        if field is not None:
-            here = _model_in(field.annotation)
-    return here
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
