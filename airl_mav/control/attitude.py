@@ -15,15 +15,6 @@ from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize,
 
 
 @kernel
-def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
-    """Return the attitude whose body -z lies along the thrust vector NED, with a heading [rad].
-
-    PX4's ControlMath::bodyzToAttitude.
-    """
-    return attitude_towards(thrust, math.cos(yaw), math.sin(yaw))
-
-
-@kernel
 def heading_of(q: Quat) -> tuple[float, float]:
     """Return cosine and sine of the heading of q."""
     north = 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3])
@@ -36,8 +27,11 @@ def heading_of(q: Quat) -> tuple[float, float]:
 
 
 @kernel
-def attitude_towards(thrust: Vec, cy: float, sy: float) -> Quat:
-    """Return `attitude_setpoint` for a heading given by its cosine and sine."""
+def attitude_setpoint(thrust: Vec, cy: float, sy: float) -> Quat:
+    """Return the attitude whose body -z lies along the thrust vector NED.
+
+    PX4's ControlMath::bodyzToAttitude; the heading is given by its cosine and sine.
+    """
     norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if norm < 1e-9:
         half = 0.5 * math.atan2(sy, cy)

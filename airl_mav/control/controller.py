@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from airl_mav.control.cascade import (
     Demand,
     Memory,
-    cascade,
+    cascade_tick,
+    filters,
     new_memory,
     reset_integrals,
     settle_gyro_filter,
@@ -59,14 +60,16 @@ def _fly(
     output: Row,
 ) -> Motors:
     """Run one tick of the cascade; updates `memory` and `output`, returns the motor commands."""
-    out = cascade(
+    known = unpack(gains)
+    out = cascade_tick(
         (state[0], state[1], state[2]),
         (state[3], state[4], state[5]),
         (state[6], state[7], state[8], state[9]),
         (state[10], state[11], state[12]),
         Demand(position, velocity, yaw, yaw_rate),
         memory,
-        unpack(gains),
+        known,
+        filters(known, dt),
         dt,
     )
     for i in range(4):

@@ -75,7 +75,7 @@ class Gains(NamedTuple):
             math.prod(value(each) if isinstance(each, str) else each for each in factors)
             for factors in _FACTORS
         ]
-        return cls(*read, *shares)
+        return cls._make([*read, *shares])
 
 
 _FACTORS = [

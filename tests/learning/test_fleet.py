@@ -10,7 +10,13 @@ import pytest
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.control.cascade import Demand, cascade, new_memory, trim_for_hover
+from airl_mav.control.cascade import (
+    Demand,
+    cascade_tick,
+    filters,
+    new_memory,
+    trim_for_hover,
+)
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from airl_mav.envs.arenas import ArenaBatch, batch_of, empty_batch, move_obstacles, put_arena
@@ -56,12 +62,12 @@ class PlantPilot:
 
     def __init__(self, altitude_m: float, battery: float = 1.0) -> None:
         self.plant = Plant(QUAD, None, np.random.default_rng(0))
-        self.plant._remaining = battery
+        self.plant.battery_remaining = battery
         self.energy = 0.0
         client, body = self.plant.world.client, self.plant._body
         half = math.sqrt(0.5)
         client.resetBasePositionAndOrientation(body, (0, 0, altitude_m), (0, 0, half, half))
-        self.plant._motion = self.plant._read()
+        self.plant.motion = self.plant._read()
         a = VEHICLE.airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()
@@ -79,7 +85,7 @@ class PlantPilot:
             nan = (math.nan,) * 3
             north, east, down = self.velocity
             demand = Demand(nan, (north, east, down), math.nan, float(setpoint[3]))
-            out = cascade(
+            out = cascade_tick(
                 tuple(truth.position),
                 tuple(truth.velocity),
                 tuple(truth.quaternion),
@@ -87,6 +93,7 @@ class PlantPilot:
                 demand,
                 self.memory,
                 VEHICLE.gains,
+                filters(VEHICLE.gains, TICK_S),
                 TICK_S,
             )
             self.plant.step(ActuatorControls(self.time_us, out.motors, True))
