@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
+from firmware_sim.external.px4 import board_link, hitl
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -53,6 +54,12 @@ def router() -> Iterator[Router]:
     router.close()
 
 
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peer on a loaded machine may be silent for longer than a board."""
+    monkeypatch.setattr(hitl, "SILENCE_US", int(PATIENCE_S * 1e6))
+
+
 class Stepper:
     """Steps a bridge with samples of a vehicle at rest."""
 
@@ -77,9 +84,7 @@ class Stepper:
 @contextmanager
 def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepper]:
     """Yield a bridge that has had its board's first motor commands."""
-    bridge = HitlBridge(
-        router, peer.device, **{"reboot": False, "silence_s": PATIENCE_S, **settings}
-    )
+    bridge = HitlBridge(router, peer.device, **{"reboot": False, **settings})
     try:
         bridge.wait_connected(PATIENCE_S, alive)
         stepper = Stepper(bridge)
@@ -93,7 +98,7 @@ def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepp
 
 
 def test_a_board_is_rebooted_and_found_again(router: Router, peer: HitlPeer) -> None:
-    bridge = HitlBridge(router, peer.device, silence_s=PATIENCE_S)
+    bridge = HitlBridge(router, peer.device)
     bridge.wait_connected(PATIENCE_S, alive)
     assert peer.boots == 2
     assert not bridge.armed
@@ -120,7 +125,8 @@ def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
 
     peer.board.armed = True
     monkeypatch.setattr(peer.board, "idle", beat)
-    bridge = HitlBridge(router, peer.device, reboot_s=2.0)
+    monkeypatch.setattr(board_link, "REBOOT_S", 2.0)
+    bridge = HitlBridge(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
         bridge.wait_connected(PATIENCE_S, alive)
     bridge.close()
@@ -265,10 +271,15 @@ def test_ticks_keep_to_250_a_second_however_often_they_are_asked_for(
     ids=["mute", "no controls", "garbled", "unplugged", "no HIL", "flags"],
 )
 def test_a_flight_that_is_over(
-    router: Router, peer: HitlPeer, fault: Callable[[HitlPeer], None], words: str
+    router: Router,
+    peer: HitlPeer,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: Callable[[HitlPeer], None],
+    words: str,
 ) -> None:
-    silence_s = 3.0 if "silent" in words else PATIENCE_S
-    with connected(router, peer, silence_s=silence_s) as stepper:
+    if "silent" in words:
+        monkeypatch.setattr(hitl, "SILENCE_US", 3_000_000)
+    with connected(router, peer) as stepper:
         fault(peer)
         with pytest.raises(FirmwareLostError, match=words):
             stepper.forever()
@@ -309,9 +320,12 @@ def test_newer_boards_mark_their_motors(router: Router, peer: HitlPeer) -> None:
         stepper.step()
 
 
-def test_a_board_that_never_sends_motor_commands(router: Router, peer: HitlPeer) -> None:
+def test_a_board_that_never_sends_motor_commands(
+    router: Router, peer: HitlPeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     peer.controls = False
-    bridge = HitlBridge(router, peer.device, reboot=False, first_controls_s=0.5)
+    monkeypatch.setattr(hitl, "FIRST_CONTROLS_US", 500_000)
+    bridge = HitlBridge(router, peer.device, reboot=False)
     bridge.wait_connected(PATIENCE_S, alive)
     with pytest.raises(FirmwareMissingError, match=r"sends no HIL_ACTUATOR_CONTROLS.*pwm_out_sim"):
         Stepper(bridge).forever()
@@ -325,8 +339,11 @@ def test_noise_between_frames_does_no_harm(router: Router, peer: HitlPeer) -> No
         stepper.until(lambda: stepper.bridge.time_us > first + 1_500_000)
 
 
-def test_a_standstill_of_ours_is_no_silence_of_the_boards(router: Router, peer: HitlPeer) -> None:
-    with connected(router, peer, silence_s=1.5) as stepper:
+def test_a_standstill_of_ours_is_no_silence_of_the_boards(
+    router: Router, peer: HitlPeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hitl, "SILENCE_US", 1_500_000)
+    with connected(router, peer) as stepper:
         time.sleep(0.5)
         router.pump()  # what had come before we stopped
         time.sleep(2.0)  # a board without sensors says nothing more

@@ -25,8 +25,7 @@ from airl_mav.scenario.model import Aircraft, LevelName, RealFirmware
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.external.airframe_check import (
-    ArduPilotAirframe,
-    Px4Airframe,
+    Airframe,
     ardupilot_airframe,
     differences,
     px4_airframe,
@@ -135,9 +134,8 @@ def px4_set_right(vehicle: VehicleProfile) -> dict[str, int | float]:
     return held | {"MPC_THR_HOVER": 0.5, "THR_MDL_FAC": 0.0}
 
 
-def px4(vehicle: VehicleProfile) -> Px4Airframe:
-    assert vehicle.px4 is not None
-    return Px4Airframe(vehicle, vehicle.px4, "PWM_MAIN_FUNC{}")
+def px4(vehicle: VehicleProfile) -> Airframe:
+    return px4_airframe(vehicle, "PWM_MAIN_FUNC{}")
 
 
 def test_a_vehicle_that_says_nothing_of_a_firmware_is_told() -> None:
@@ -188,9 +186,8 @@ def test_a_wrong_px4_frame_is_told(change: dict[str, int | float], words: str) -
     assert re.search(words, problem), problem
 
 
-def ardupilot(vehicle: VehicleProfile) -> ArduPilotAirframe:
-    assert vehicle.ardupilot is not None
-    return ArduPilotAirframe(vehicle.ardupilot)
+def ardupilot(vehicle: VehicleProfile) -> Airframe:
+    return ardupilot_airframe(vehicle)
 
 
 def ardupilot_set_right() -> dict[str, int | float]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.observer import SYSTEM_ID
+from firmware_sim.external.observer import FORCE, SYSTEM_ID
 from firmware_sim.external.px4.board import Board, silence
 from firmware_sim.external.transport.router import Router
 from firmware_sim.external.transport.serial_port import SerialPort
@@ -20,9 +20,6 @@ REBOOT_S = 10.0
 
 SILENCE_S = 1.5
 """A board that is silent for this long is down: its heartbeat is due every second [wall s]."""
-
-FORCE = 21196.0
-"""COMPONENT_ARM_DISARM in any state."""
 
 _POLL_S = 0.02
 _AGAIN_S = 0.2
@@ -36,9 +33,7 @@ class BoardLink:
     Nothing is sent to a board before something was received from it.
     """
 
-    def __init__(
-        self, router: Router, device: str, baud: int, *, budget_bytes_s: int, reboot_s: float
-    ) -> None:
+    def __init__(self, router: Router, device: str, baud: int, budget_bytes_s: int) -> None:
         """Configure the connection; nothing is opened yet.
 
         Args:
@@ -46,7 +41,6 @@ class BoardLink:
             device: Serial device.
             baud: Bits a second.
             budget_bytes_s: Most that clients may send to the board [bytes/s].
-            reboot_s: Longest time from a reboot command until it goes down [wall s].
         """
         self.device = device
         self.clock = WallClock()
@@ -55,7 +49,6 @@ class BoardLink:
         self._router = router
         self._baud = baud
         self._budget_bytes_s = budget_bytes_s
-        self._reboot_us = int(reboot_s * US_PER_S)
         self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_USER1)
         self._line: SerialPort | None = None
         self._beat_due_us = 0
@@ -123,7 +116,7 @@ class BoardLink:
             FirmwareLostError: It stays up.
         """
         board, clock = self.board, self.clock
-        deadline_us = clock.time_us() + self._reboot_us
+        deadline_us = clock.time_us() + int(REBOOT_S * US_PER_S)
         due_us, heard_us, heard = 0, clock.time_us(), -1
         while self._router.lost is None and not board.restarted:
             alive()
@@ -146,8 +139,7 @@ class BoardLink:
         self.close()
 
     def _listen(self, *, beat: bool = True) -> None:
-        select.select([self._router.fileno()], [], [], _POLL_S)
-        self._router.pump()
+        self._router.pump(_POLL_S)
         if beat:
             self.beat()
 
@@ -155,7 +147,7 @@ class BoardLink:
 
     def send(self, layout: Layout, values: Values) -> bool:
         """Send a message of the simulator; False when the line did not accept it."""
-        return self._router.send(self._encoder.frame(layout, layout.payload(values)))
+        return self._router.send_ahead(self._encoder.frame(layout, layout.payload(values)))
 
     def pump(self) -> None:
         """Take the messages received, and pass on those for clients."""
@@ -186,7 +178,7 @@ class BoardLink:
         )
 
     def _tell(self, message: WireMessage) -> None:
-        self._router.send(self._encoder.pack(message))
+        self._router.send_ahead(self._encoder.pack(message))
 
     def close(self) -> None:
         """Close the device; harmless when called again."""

@@ -15,10 +15,9 @@ from contextlib import suppress
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.external.px4.board_link import REBOOT_S, BoardLink
+from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.transport.router import Router
 from firmware_sim.external.transport.serial_port import (
     BITS_PER_BYTE,
@@ -29,11 +28,11 @@ from firmware_sim.external.transport.serial_port import (
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
-SILENCE_S = 1.0
-"""Longest time without motor commands, once there were some [wall s]."""
+SILENCE_US = US_PER_S
+"""Longest time without motor commands, once there were some [wall µs]."""
 
-FIRST_CONTROLS_S = 10.0
-"""Longest time with sensors but without motor commands [wall s]."""
+FIRST_CONTROLS_US = 10 * US_PER_S
+"""Longest time with sensors but without motor commands [wall µs]."""
 
 EPOCH_US = US_PER_S
 """Time in the first sample [µs]; the board takes its own clock's instead."""
@@ -102,9 +101,6 @@ class HitlBridge:
         *,
         reboot: bool = True,
         returning: bool = False,
-        silence_s: float = SILENCE_S,
-        first_controls_s: float = FIRST_CONTROLS_S,
-        reboot_s: float = REBOOT_S,
     ) -> None:
         """Configure the connection; nothing is opened yet.
 
@@ -114,9 +110,6 @@ class HitlBridge:
             baud: Bits a second.
             reboot: Whether the board is rebooted once found: its estimator may hold a flight.
             returning: Whether the device may be absent at first: it was there before.
-            silence_s: Longest time between motor commands [wall s].
-            first_controls_s: Longest time until the first motor commands [wall s].
-            reboot_s: Longest time from a reboot command until it goes down [wall s].
 
         Raises:
             UsageError: The line is too slow.
@@ -125,16 +118,8 @@ class HitlBridge:
         self.time_us = 0
         self.went_down = False
         """Whether others told the board to reboot, and it was down when this was closed."""
-        self._link = BoardLink(
-            router,
-            device,
-            baud,
-            budget_bytes_s=check_line(device, baud),
-            reboot_s=reboot_s,
-        )
+        self._link = BoardLink(router, device, baud, check_line(device, baud))
         self._reboot, self._returning = reboot, returning
-        self._silence_us = int(silence_s * US_PER_S)
-        self._first_us = int(first_controls_s * US_PER_S)
         self._pace = Pace(self._link.clock)
         self._epoch_us: int | None = None
         """Simulated time that is 0 to the board [µs]."""
@@ -175,7 +160,7 @@ class HitlBridge:
             self._epoch_us = sample.time_us - EPOCH_US
             self._began_us = now_us
             link.board.controls = None  # of before
-        if now_us - self._stepped_us > self._silence_us // 2:
+        if now_us - self._stepped_us > SILENCE_US // 2:
             self._resumed_us = now_us  # a board without sensors sends no commands
         self._stepped_us = now_us
         self._check(now_us)
@@ -219,13 +204,13 @@ class HitlBridge:
         if not board.hil:
             raise FirmwareLostError(f"{device}: the board has left HIL mode")
         quiet_us = now_us - max(board.controls_us, self._resumed_us)
-        if board.controls is not None and quiet_us > self._silence_us:
+        if board.controls is not None and quiet_us > SILENCE_US:
             raise FirmwareLostError(
                 f"{device}: board silent: no HIL_ACTUATOR_CONTROLS for "
                 f"{(now_us - board.controls_us) / US_PER_S:.1f} s"
             )
         problem = board.setup_problem()
-        if board.controls is None and now_us - self._began_us > self._first_us:
+        if board.controls is None and now_us - self._began_us > FIRST_CONTROLS_US:
             problem = (
                 "it sends no HIL_ACTUATOR_CONTROLS: does its firmware have pwm_out_sim, does the "
                 "link allow more than 5000 bytes/s (MAV_0_RATE; USB always does)?"
@@ -234,7 +219,7 @@ class HitlBridge:
             raise FirmwareMissingError(f"--serial {device}: the board: {problem}")
         if problem is not None:
             raise FirmwareLostError(f"{device}: the board: {problem}")
-        if self._stuck_us is not None and now_us - self._stuck_us > self._silence_us:
+        if self._stuck_us is not None and now_us - self._stuck_us > SILENCE_US:
             raise FirmwareLostError(f"{device}: the line accepts no more data: the board hangs")
 
     def _send(self, sample: SensorSample, time_us: int, now_us: int) -> None:
@@ -246,69 +231,26 @@ class HitlBridge:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
 
 
-class HitlLauncher:
-    """Finds and reboots the same board for each episode. Implements `boot_sequence.Launcher`."""
+class Boards:
+    """The same board on one device, for episode after episode: makes its bridges."""
 
-    may_set = False
-    reboots = True
-
-    def __init__(
-        self,
-        airframe: Airframe,
-        router: Router,
-        device: str,
-        baud: int,
-        timeout_s: float,
-        *,
-        silence_s: float = SILENCE_S,
-    ) -> None:
-        """Configure the connection.
-
-        Args:
-            airframe: What it must be configured to.
-            router: Where its MAVLink goes.
-            device: Serial device.
-            baud: Bits a second.
-            timeout_s: Longest wait for its heartbeat [wall s].
-            silence_s: Longest time between motor commands [wall s].
-
-        Raises:
-            UsageError: The line is too slow.
-        """
+    def __init__(self, router: Router, device: str, baud: int) -> None:
+        """Take the line; nothing is opened yet. Arguments and errors as of `HitlBridge`."""
         check_line(device, baud)
-        self.airframe = airframe
-        self._router = router
-        self._device, self._baud = device, baud
-        self._timeout_s, self._silence_s = timeout_s, silence_s
-        self._bridge: HitlBridge | None = None
+        self._router, self._device, self._baud = router, device, baud
+        self._last: HitlBridge | None = None
 
-    def launch(self) -> HitlBridge:
-        """Find the board and reboot it; see `boot_sequence.Launcher`."""
-        last = self._bridge
-        self.stop()
-        self._bridge = HitlBridge(
+    def bridge(self) -> HitlBridge:
+        """Return the bridge of the next episode, once that of the last one is closed."""
+        last = self._last
+        self._last = HitlBridge(
             self._router,
             self._device,
             self._baud,
             reboot=last is None or not last.went_down,
             returning=last is not None,
-            silence_s=self._silence_s,
         )
-        try:
-            self._bridge.wait_connected(self._timeout_s, no_process)
-        except BaseException:
-            self.stop()
-            raise
-        return self._bridge
-
-    def stop(self) -> None:
-        """Release the board."""
-        if self._bridge is not None:
-            self._bridge.close()
-
-    def close(self) -> None:
-        """Release the board for good."""
-        self.stop()
+        return self._last
 
 
 def check_line(device: str, baud: int) -> int:
