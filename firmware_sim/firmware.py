@@ -102,6 +102,7 @@ class BuiltinFlightStack:
         self.filenos = server.filenos
         self.receive = server.receive
         self.send = server.send
+        self.log_to = server.log_to
         self.counters = server.counters
         self.close = server.close
 
@@ -115,10 +116,6 @@ class BuiltinFlightStack:
         del tick
         if self._autopilot is not None:
             self._server.attach(self._autopilot)
-
-    def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write the onboard link to a tlog from now on; None ends it."""
-        self._server.log_to(tlog)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from airl_mav.core.clock import Clock
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.filters import filter_named
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import SensorSample, Truth
@@ -41,7 +40,12 @@ class EpisodeSetup:
 def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
     """Boot the built-in autopilot. Raises UsageError for a wrong parameter of the vehicle's."""
     parameters = Parameters(setup.vehicle.autopilot_parameters())
-    return BuiltinAutopilot(parameters, filter_named(setup.aircraft.estimator))
+    if setup.aircraft.estimator == "kernel":
+        return BuiltinAutopilot(parameters)
+    # The library's filter, equal to rounding. Imported late: it brings scipy's statistics along.
+    from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
+
+    return BuiltinAutopilot(parameters, FilterpyFilter)
 
 
 class Simulation:

@@ -17,15 +17,7 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.vehicle.rotation import (
-    Quat,
-    Vec,
-    conjugate,
-    exponential,
-    multiply,
-    normalize,
-    rotate,
-)
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, exponential, multiply, normalize, rotate
 
 N_STATES = 16
 POS, VEL, ATT, GYRO, ACC, BARO = 0, 3, 6, 9, 12, 15

@@ -25,14 +25,7 @@ from firmware_sim.plant.dynamics import (
     power_row,
     supply,
 )
-from firmware_sim.plant.kinematics import (
-    POSITION,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-    WIDTH,
-    from_bullet,
-)
+from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY, WIDTH, from_bullet
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.plant.wind import Wind
 from firmware_sim.plant.world import FLOOR, World

@@ -18,34 +18,29 @@ class WorkingFolders:
             kept: Folder that keeps the working folders; None = temporary ones, one at a time.
             log: Log of what the process prints; None = a file beside the working folders.
         """
-        self._kept = kept
-        self._temporary: Path | None = None
         self._name = name
         self._flights = 0
-        if kept is not None:
-            kept.mkdir(parents=True, exist_ok=True)
-        else:
-            self._temporary = Path(tempfile.mkdtemp(prefix=f"airl-{name}-"))
-        root = kept or self._temporary or Path()
-        self.log = (log or root / f"{name}.log").absolute()
+        self._temporary = kept is None
+        root = Path(tempfile.mkdtemp(prefix=f"airl-{name}-")) if kept is None else kept
+        root.mkdir(parents=True, exist_ok=True)
         self._root = root.absolute()
+        self.log = (log or root / f"{name}.log").absolute()
 
     def fresh(self) -> Path:
         """Return a new, empty working folder: nothing carries over from an earlier flight."""
-        if self._temporary is not None:
-            shutil.rmtree(self._root / self._folder, ignore_errors=True)
-        while True:
+        if self._temporary:
+            shutil.rmtree(self._path, ignore_errors=True)
+        self._flights += 1
+        while self._path.exists():
             self._flights += 1
-            path = self._root / self._folder
-            if not path.exists():
-                path.mkdir()
-                return path
+        self._path.mkdir()
+        return self._path
 
     def close(self) -> None:
         """Remove what is temporary; harmless when called again."""
-        if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+        if self._temporary:
+            shutil.rmtree(self._root, ignore_errors=True)
 
     @property
-    def _folder(self) -> str:
-        return f"{self._name}-{self._flights:03d}"
+    def _path(self) -> Path:
+        return self._root / f"{self._name}-{self._flights:03d}"

@@ -12,10 +12,8 @@ from firmware_sim.flight_controller import FirmwareMissingError
 SIMULATOR_PORT = 4560
 API_PORT, API_LOCAL_PORT = 14540, 14580
 PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
-"""Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink)."""
-
-GREATEST_INSTANCE = 9
-"""Instances above this one share one API port in PX4."""
+"""Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink).
+Instances above 9 share one API port."""
 
 MODEL = "none_iris"
 """PX4_SIM_MODEL without which PX4's scripts would start a simulator of their own."""
