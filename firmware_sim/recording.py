@@ -85,12 +85,9 @@ class FlightRecorder:
         self._slips: list[tuple[int, int]] = []
 
     def began_tick(self, due_us: int, began_us: int, slipped_us: int) -> None:
-        """Note a tick that is paced by the wall clock.
+        """Note a tick that is paced by the wall clock: when it was due, and when it began [µs].
 
-        Args:
-            due_us: When it was due [µs].
-            began_us: When it began [µs].
-            slipped_us: Simulated time that was given up right before it [µs].
+        Simulated time `slipped_us` [µs] was given up right before it.
         """
         self._lateness_us.append(began_us - due_us)
         if slipped_us:

@@ -81,13 +81,9 @@ def _shortest(a: Vec, b: Vec) -> Quat:
 
 @kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
-    """Return the body rates FRD [rad/s] that turn attitude q into q_sp.
+    """Return the body rates FRD [rad/s] that turn attitude q (body -> NED) into q_sp.
 
-    Args:
-        q: Attitude body -> NED.
-        q_sp: Attitude wanted.
-        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
-        gains: Attitude P gains, yaw weight, rate limits.
+    `yaw_rate_ff` is a heading rate about the world's down axis [rad/s].
     """
     down = (0.0, 0.0, 1.0)
     reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)

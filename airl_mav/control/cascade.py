@@ -84,13 +84,7 @@ def new_memory(n: int | None = None) -> Memory:
 
 
 def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
-    """Set the vertical integral to what it settles at in a hover.
-
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        command: Collective command 0..1 that the vehicle hovers at.
-        gains: Holds the hover thrust that the controller counts on.
-    """
+    """Set the vertical integral to what it settles at in a hover at a collective `command` 0..1."""
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     memory[_VEL_INT + 2] = (gains.hover_thrust - command) * GRAVITY_M_S2 / gains.hover_thrust
 

@@ -85,12 +85,7 @@ class Controller:
     """Gains, memory and newest output of one vehicle's cascade."""
 
     def __init__(self, gains: Gains, dt: float) -> None:
-        """Start at rest.
-
-        Args:
-            gains: Gains and limits.
-            dt: Time between two calls of `fly` [s].
-        """
+        """Start at rest; `dt` is the time between two calls of `fly` [s]."""
         self._gains = pack(gains)
         self._gyro_cutoff_hz = gains.gyro_cutoff_hz
         self._dt = dt
@@ -111,10 +106,8 @@ class Controller:
     def fly(self, state: Row, demand: Demand) -> Motors:
         """Run one tick; return the motor commands 0..1.
 
-        Args:
-            state: Begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
-                rates FRD [rad/s]: 13 floats.
-            demand: What to fly.
+        `state` begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
+        rates FRD [rad/s]: 13 floats.
         """
         position, velocity, yaw, yaw_rate = demand
         motors: Motors = _fly(

@@ -54,12 +54,7 @@ class BuiltinAutopilot:
     rate_hz = TICK_HZ
 
     def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
-        """Boot: not armable until the estimator has converged.
-
-        Args:
-            parameters: The parameter store.
-            new_filter: Makes the estimator's filter.
-        """
+        """Boot: not armable until the estimator, whose filter `new_filter` makes, has converged."""
         self.parameters = parameters
         """The parameter store."""
         value = parameters.value

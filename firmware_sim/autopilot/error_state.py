@@ -157,11 +157,9 @@ def observe_heading(
 
 @kernel
 def gate_ratio(innovation: Vector, variance: Vector) -> float:
-    """Return the test ratio of a measurement: 1 = at the gate, NaN = an innovation is not finite.
+    """Return the test ratio of an innovation (m,) by its variance (m,).
 
-    Args:
-        innovation: (m,).
-        variance: (m,) of the innovation.
+    1 = at the gate, NaN = an innovation is not finite.
     """
     worst = 0.0
     for i in range(len(innovation)):

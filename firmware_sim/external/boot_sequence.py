@@ -94,10 +94,7 @@ class ExternalFlightStack:
     def __init__(self, launcher: Launcher, observer: Observer, timeout_s: float) -> None:
         """Compose it; nothing is started yet.
 
-        Args:
-            launcher: Starts the firmware.
-            observer: Listens to its MAVLink.
-            timeout_s: Longest wait for each of its answers during the boot sequence [wall s].
+        `timeout_s` is the longest wait for each of its answers during the boot sequence [wall s].
         """
         self._launcher = launcher
         self._observer = observer

@@ -48,10 +48,8 @@ class DepthCamera:
         Slots lie at whole multiples of the period, so that a rate that the tick does not divide
         is kept on average. Slots that were missed are left out.
 
-        Args:
-            time_us: Simulated time of the exposure [µs].
-            position: (3,) vehicle NED [m].
-            quaternion: (4,) vehicle body -> NED [w, x, y, z].
+        It is exposed at simulated `time_us` [µs], from the vehicle's `position` (3,) NED [m] and
+        `quaternion` (4,) body -> NED [w, x, y, z].
         """
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)

@@ -64,11 +64,8 @@ def simulator_port(instance: int) -> int:
 def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
     """Return program and arguments.
 
-    Args:
-        program: The executable.
-        instance: Its instance number, which moves the simulator's port.
-        links: Ports that it sends MAVLink to.
-        defaults: File of default parameters, relative to its working directory.
+    The instance number moves the simulator's port; `defaults` is a file of default parameters,
+    relative to its working directory.
     """
     home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
     return [
@@ -84,15 +81,7 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
 ) -> StartCommand:
-    """Write its parameter file, and return the command that starts it.
-
-    Args:
-        program: The program itself.
-        instance: Its instance number, which moves the simulator's port.
-        links: Ports that it sends MAVLink to.
-        settings: Parameters, by name.
-        folder: Its working folder, which gets the file.
-    """
+    """Write its parameter file into its working folder; return the command that starts it there."""
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
     return StartCommand(command(str(program), instance, links, PARAMETERS), {})
 

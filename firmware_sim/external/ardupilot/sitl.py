@@ -58,14 +58,10 @@ class ArdupilotBridge:
     """One ArduPilot, one episode. Implements `bridge.Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
-        """Open the port; nothing is sent before ArduPilot sends a packet.
+        """Open a UDP port on the loopback address; nothing is sent before ArduPilot sends a packet.
 
-        Args:
-            port: UDP port on the loopback address, see `program.simulator_port`.
-            silence_s: Longest wait for a packet [wall s].
-
-        Raises:
-            UsageError: The port is taken.
+        `silence_s` is the longest wait for a packet [wall s]. Raises UsageError if the port is
+        taken.
         """
         self.rate_hz = 0
         """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
@@ -104,12 +100,7 @@ class ArdupilotBridge:
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait for the first servo packet; ArduPilot waits for our answer from then on.
 
-        Args:
-            timeout_s: How long [wall s].
-            alive: Called at intervals, here and in `step`; raises when the process has died.
-
-        Raises:
-            FirmwareMissingError: No servo packet arrived in time, or it asks for an invalid rate.
+        See `Bridge`. Raises FirmwareMissingError also when it asks for an invalid rate.
         """
         self._alive = alive
         stopwatch = WallClock()

@@ -28,16 +28,10 @@ class FirmwareProcess(ChildProcess):
     """One process of external firmware; it ends with us, also when we are killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
-        """Start it.
+        """Start it in a folder; what it prints is appended to `log`.
 
-        Args:
-            name: What it is called in messages: PX4.
-            command: How it is started.
-            cwd: Its working directory.
-            log: What it prints is appended here.
-
-        Raises:
-            FirmwareMissingError: The program is not there, or may not be run.
+        `name` is what it is called in messages: PX4. Raises FirmwareMissingError if the program is
+        not there, or may not be run.
         """
         self.name = name
         program = Path(command.argv[0])

@@ -34,13 +34,9 @@ class BoardLink:
     """
 
     def __init__(self, router: Router, device: str, baud: int, budget_bytes_s: int) -> None:
-        """Configure the connection; nothing is opened yet.
+        """Configure the connection; nothing is opened yet. Arguments are as of `HitlBridge`.
 
-        Args:
-            router: Gets the line; its clients stay.
-            device: Serial device.
-            baud: Bits a second.
-            budget_bytes_s: Most that clients may send to the board [bytes/s].
+        Clients may send at most `budget_bytes_s` to the board [bytes/s].
         """
         self.device = device
         self.clock = WallClock()

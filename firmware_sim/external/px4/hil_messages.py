@@ -135,16 +135,10 @@ def lockstep(message: WireMessage) -> bool:
 
 
 def controls(message: WireMessage, time_us: int) -> ActuatorControls:
-    """Return the motor commands of HIL_ACTUATOR_CONTROLS.
+    """Return the motor commands of HIL_ACTUATOR_CONTROLS, which hold from `time_us` on [µs].
 
     Motors are stopped while disarmed, whatever is commanded: PX4 in HITL sends commands then, too.
-
-    Args:
-        message: HIL_ACTUATOR_CONTROLS.
-        time_us: Simulated time at which they hold [µs].
-
-    Raises:
-        ControlsError: While armed, a command is not a number in 0..1.
+    Raises ControlsError when, while armed, a command is not a number in 0..1.
     """
     if not armed(message):
         return ActuatorControls(time_us, STILL, armed=False)

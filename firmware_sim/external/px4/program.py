@@ -33,12 +33,9 @@ class Px4Program:
     """Folder of its start-up scripts."""
 
     def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
-        """Return the command that starts it: in the background, without a shell.
+        """Return the command that starts it in a folder: in the background, without a shell.
 
-        Args:
-            instance: PX4's instance number, which moves all its ports.
-            airframe: SYS_AUTOSTART.
-            folder: Where it runs.
+        The instance number moves all its ports; `airframe` is its SYS_AUTOSTART.
         """
         argv = [
             str(self.binary),

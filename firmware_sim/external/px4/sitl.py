@@ -64,15 +64,10 @@ class Px4Bridge:
     rate_hz = TICK_HZ
 
     def __init__(self, port: int, *, answer_s: float = ANSWER_S, start_s: float = START_S) -> None:
-        """Listen for PX4.
+        """Listen for PX4 on a TCP port: 4560 + instance, 0 = any free one.
 
-        Args:
-            port: TCP port, 4560 + instance; 0 = any free one.
-            answer_s: Longest wait for an answer [wall s].
-            start_s: Longest wait for the first one [wall s].
-
-        Raises:
-            UsageError: The port is taken, or cannot be used.
+        `answer_s` and `start_s` are the longest waits for an answer, and for the first one
+        [wall s]. Raises UsageError if the port is taken, or cannot be used.
         """
         self.armed = False
         self.time_us = 0

@@ -77,12 +77,7 @@ class Budget:
     """A token bucket: a rate in bytes per second, and a burst."""
 
     def __init__(self, bytes_s: int, clock: Clock) -> None:
-        """Start with a full burst.
-
-        Args:
-            bytes_s: Long-term rate [bytes/s].
-            clock: Wall time.
-        """
+        """Start with a full burst; `bytes_s` is the long-term rate [bytes/s]."""
         self._bytes_s = bytes_s
         self._clock = clock
         self._left = float(BURST_BYTES)
@@ -140,12 +135,7 @@ class Router:
     datagrams = True
 
     def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
-        """Take the clients' ends.
-
-        Args:
-            clients: Endpoints by the names of their links; the router closes them.
-            clock: Wall time.
-        """
+        """Take the clients' ends by the names of their links; the router closes them."""
         self.lost: str | None = None
         """Why the line is gone; None while there is one, or none was there yet."""
         self.on_message: Callable[[WireMessage], None] | None = None
@@ -173,11 +163,9 @@ class Router:
     # --- the line
 
     def attach(self, line: Line, budget_bytes_s: int) -> None:
-        """Use a line, in place of another; the caller closes it.
+        """Use a line to the board, in place of another; the caller closes it.
 
-        Args:
-            line: To the board.
-            budget_bytes_s: Most that clients may send to the board [bytes/s].
+        Clients may send at most `budget_bytes_s` to the board [bytes/s].
         """
         self.detach()
         self._line, self._line_fd = line, line.fileno()

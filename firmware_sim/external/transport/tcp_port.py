@@ -44,12 +44,7 @@ class TcpPort:
         self._poll.register(self._listener, _READ)
 
     def accept(self, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Wait for the connection; return whether it was made.
-
-        Args:
-            timeout_s: Longest wait [wall s].
-            alive: Called at intervals; may raise.
-        """
+        """Wait for the connection [wall s]; return whether it was made; `alive` may raise."""
         deadline_us = self._deadline_us(timeout_s)
         while self._connection is None:
             alive()
