@@ -140,11 +140,8 @@ class Firmware:
     ) -> None:
         """Put it together; there is no episode yet.
 
-        Args:
-            flight_stack: The flight controller and its MAVLink.
-            camera: Where frames go; None = no camera.
-            pacing: How simulated time passes.
-            recording: Whether episodes are recorded, to be saved; without, they may last for ever.
+        `camera` is where frames go; None = no camera. Without `recording`, episodes cannot be
+        saved, and may last for ever.
         """
         self.flight_stack = flight_stack
         self.clock = pacing.clock

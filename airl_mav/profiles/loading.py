@@ -53,8 +53,7 @@ def list_profiles(kind: Kind) -> list[str]:
 def describe_profile(kind: Kind, name: str) -> str:
     """Return the line in which a shipped profile describes itself, "" when it has none.
 
-    Raises:
-        UsageError: There is no such profile, or it is no TOML.
+    Raises UsageError when there is no such profile, or it is no TOML.
     """
     return str(_read(kind, _path(kind, name), ()).get("description", ""))
 

@@ -35,8 +35,7 @@ SPECS = tuple(
 def parameter_values(overrides: Mapping[str, int | float]) -> dict[str, int | float]:
     """Return the values of all parameters: the defaults, and a vehicle profile's overrides.
 
-    Raises:
-        UsageError: An override is unknown or out of range.
+    Raises UsageError for an override that is unknown or out of range.
     """
     values = {spec.name: spec.default for spec in SPECS}
     specs = {spec.name: spec for spec in SPECS}

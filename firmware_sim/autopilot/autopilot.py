@@ -241,11 +241,8 @@ class BuiltinAutopilot:
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""
-        if self._snapshot is None:
-            self._snapshot = self._take_snapshot()
-        return self._snapshot
-
-    def _take_snapshot(self) -> AutopilotState:
+        if self._snapshot is not None:
+            return self._snapshot
         sample, demand = self.sample, self._demand
         if sample is None:
             raise RuntimeError("no tick yet: the autopilot has no state")
@@ -256,7 +253,7 @@ class BuiltinAutopilot:
         else:
             position = np.array(demand.position)
             setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
-        return AutopilotState(
+        self._snapshot = AutopilotState(
             time_us=sample.time_us,
             estimate=estimate,
             status=self._status,
@@ -275,6 +272,7 @@ class BuiltinAutopilot:
             home=self._home,
             origin=self.estimator.origin,
         )
+        return self._snapshot
 
 
 def _status(flight: Flight) -> CommanderStatus:

@@ -77,7 +77,7 @@ class Measurement:
     """Buffers of one kind of measurement: innovation, its variance and Jacobian."""
 
     def __init__(self, name: str, ratio: int, h: Vector) -> None:
-        """Allocate them: `ratio` is its index in the estimate's test ratios, h the Jacobian (m, 16)."""
+        """Allocate them: `ratio` is its index in the estimate's ratios, h the Jacobian (m, 16)."""
         self.name = name
         self.slot = es.RATIO + ratio
         self.h = h

@@ -24,7 +24,7 @@ from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
 from firmware_sim.external.boot_sequence import ExternalFlightStack
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
 from firmware_sim.external.px4.hitl import Boards
 from firmware_sim.external.px4.program import find_px4

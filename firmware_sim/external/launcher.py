@@ -7,8 +7,7 @@ from pathlib import Path
 
 from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import Bridge, no_process
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 
 
 class Launcher:

@@ -35,8 +35,7 @@ from firmware_sim.external.ardupilot.program import start as start_arducopter
 from firmware_sim.external.heartbeat_modes import flight_of
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.parameter_client import ParameterClient, same
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.external.programs import how_to_start, load_timeout_s
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -51,7 +50,7 @@ PX4_ID, ARDUPILOT_ID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILO
 HOLDER = """
 import sys, time
 from pathlib import Path
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
+from firmware_sim.external.process import FirmwareProcess, StartCommand
 folder = Path(sys.argv[1])
 child = FirmwareProcess("X", StartCommand(sys.argv[2:], {}), folder, folder / "x.log")
 print("up", flush=True)

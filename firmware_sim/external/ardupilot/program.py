@@ -10,7 +10,7 @@ from pathlib import Path
 from airl_mav.core.location import HOME
 from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.parameter_file import ardupilot_file
-from firmware_sim.external.process.firmware_process import StartCommand
+from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -41,8 +41,7 @@ class Links:
 def find_arducopter(path: Path) -> Path:
     """Return the program of a build or a source tree, or itself.
 
-    Raises:
-        FirmwareMissingError: There is none.
+    Raises FirmwareMissingError when there is none.
     """
     if path.is_file():
         return path.resolve()

@@ -121,13 +121,10 @@ class ArdupilotBridge:
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Answer the pending packet, and return the motor commands of the next one.
+        """Answer the pending packet, and return the motor commands of the next one; see `Bridge`.
 
         The motors are outputs 1 to 4 in this order. ArduCopter's quad X (FRAME_TYPE 1) numbers
         them as PX4 does: front right, rear left, front left, rear right.
-
-        Raises:
-            FirmwareLostError: ArduPilot died, is silent, restarted or sends garbage.
         """
         answered, truth, address = self._packet, self._truth, self._address
         if answered is None or truth is None or address is None:

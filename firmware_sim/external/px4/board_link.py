@@ -108,8 +108,7 @@ class BoardLink:
     def go_down(self, alive: Callable[[], None]) -> None:
         """Reboot a board in HIL mode; return when it is down and the device closed.
 
-        Raises:
-            FirmwareLostError: It stays up.
+        Raises FirmwareLostError when it stays up.
         """
         board, clock = self.board, self.clock
         deadline_us = clock.time_us() + int(REBOOT_S * US_PER_S)

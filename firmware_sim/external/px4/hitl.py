@@ -146,11 +146,10 @@ class HitlBridge:
             self._link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Send a tick's sensors, return the newest motor commands; at first motors are stopped.
+        """Send a tick's sensors, return the newest motor commands; see `Bridge`.
 
-        Raises:
-            FirmwareLostError: The flight is over.
-            FirmwareMissingError: Its first messages show a configuration that cannot be flown.
+        At first motors are stopped. Raises FirmwareMissingError when its first messages show a
+        configuration that cannot be flown.
         """
         self._pace.wait(sample.time_us)
         link = self._link
@@ -256,8 +255,7 @@ class Boards:
 def check_line(device: str, baud: int) -> int:
     """Return what clients may send to the board [bytes/s].
 
-    Raises:
-        UsageError: The line does not carry the sensors.
+    Raises UsageError when the line does not carry the sensors.
     """
     check_baud(baud)
     carries = carries_bytes_s(device, baud)

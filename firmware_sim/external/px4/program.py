@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_sim.external.process.firmware_process import StartCommand
+from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT = 4560
@@ -48,8 +48,7 @@ class Px4Program:
 def find_px4(folder: Path) -> Px4Program:
     """Return the PX4 of a build, a source tree or an unpacked package.
 
-    Raises:
-        FirmwareMissingError: There is none.
+    Raises FirmwareMissingError when there is none.
     """
     for layout in LAYOUTS:
         root = (folder / layout).resolve()
