@@ -26,7 +26,8 @@ from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.process import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
-from firmware_sim.external.px4.hitl import Boards
+from firmware_sim.external.px4.board_link import BoardLink
+from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import Px4Bridge
 from firmware_sim.external.transport.router import Router
@@ -109,11 +110,11 @@ def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
     router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
-        boards = Boards(router, options.serial or "", options.baud)
+        link = BoardLink(router, options.serial or "", options.baud)
     except UsageError:
         router.close()
         raise
-    return Launcher(airframe, boards.bridge, options.firmware_timeout), router
+    return Launcher(airframe, partial(HitlBridge, link), options.firmware_timeout), router
 
 
 _PARTS: dict[FirmwareName, Callable[[Wanted], tuple[Launcher, Endpoint]]] = {

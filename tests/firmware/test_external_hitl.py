@@ -16,6 +16,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from firmware_sim.external.px4 import board_link, hitl
+from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -81,10 +82,17 @@ class Stepper:
         self.until(lambda: False)
 
 
+def bridge_to(router: Router, device: str, *, rebooted: bool = False) -> HitlBridge:
+    """Make a bridge to a board, which is rebooted when found unless it has just been."""
+    link = BoardLink(router, device, 921_600)
+    link.went_down = rebooted
+    return HitlBridge(link)
+
+
 @contextmanager
-def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepper]:
+def connected(router: Router, peer: HitlPeer, *, rebooted: bool = True) -> Iterator[Stepper]:
     """Yield a bridge that has had its board's first motor commands."""
-    bridge = HitlBridge(router, peer.device, **{"reboot": False, **settings})
+    bridge = bridge_to(router, peer.device, rebooted=rebooted)
     try:
         bridge.wait_connected(PATIENCE_S, alive)
         stepper = Stepper(bridge)
@@ -98,7 +106,7 @@ def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepp
 
 
 def test_a_board_is_rebooted_and_found_again(router: Router, peer: HitlPeer) -> None:
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     bridge.wait_connected(PATIENCE_S, alive)
     assert peer.boots == 2
     assert not bridge.armed
@@ -113,7 +121,7 @@ def test_a_board_behind_a_uart_is_rebooted_though_it_does_not_vanish(
     router: Router, peer: HitlPeer
 ) -> None:
     peer.vanishes, peer.down_s = False, 3.0
-    with connected(router, peer, reboot=True):
+    with connected(router, peer, rebooted=False):
         assert peer.boots == 2
 
 
@@ -126,7 +134,7 @@ def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
     peer.board.armed = True
     monkeypatch.setattr(peer.board, "idle", beat)
     monkeypatch.setattr(board_link, "REBOOT_S", 2.0)
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
         bridge.wait_connected(PATIENCE_S, alive)
     bridge.close()
@@ -142,7 +150,7 @@ def decoded(frames: list[bytes], name: str) -> list[Any]:
 
 def test_a_board_that_does_not_come_back(router: Router, peer: HitlPeer) -> None:
     peer.down_s = 1e6
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"did not come back: --serial .*no such device"):
         bridge.wait_connected(4.0, alive)
 
@@ -162,7 +170,7 @@ def test_which_step_is_missing(
 ) -> None:
     peer = HitlPeer(tmp_path)
     vars(peer).update(fault)
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareMissingError, match=f"--serial .* within 2 s: .*{words}"):
         bridge.wait_connected(2.0, alive)
     bridge.close()
@@ -172,7 +180,7 @@ def test_which_step_is_missing(
 
 def test_mavlink_without_an_autopilot(router: Router, peer: HitlPeer) -> None:
     peer.mute = True
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     radio = Encoder(51, 68).pack(dialect.MAVLink_radio_status_message(1, 1, 1, 1, 1, 1, 1))
 
     def talk() -> None:
@@ -197,7 +205,7 @@ def test_a_board_that_is_set_up_otherwise(
 ) -> None:
     peer.mute = True
     frame = Encoder().pack(dialect.MAVLink_heartbeat_message(*beat))
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
 
     def talk() -> None:
         peer.mute = False
@@ -211,7 +219,7 @@ def test_a_board_that_is_set_up_otherwise(
 
 
 def test_a_device_that_is_not_there_is_told_at_once(router: Router, tmp_path: Path) -> None:
-    bridge = HitlBridge(router, str(tmp_path / "ttyACM0"))
+    bridge = bridge_to(router, str(tmp_path / "ttyACM0"))
     with pytest.raises(UsageError, match="no such device"):
         bridge.wait_connected(1e6, alive)
 
@@ -223,7 +231,7 @@ def test_giving_up_while_it_waits(router: Router, peer: HitlPeer) -> None:
         raise StopError
 
     peer.mute = True
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(StopError):
         bridge.wait_connected(1e6, stop)
     bridge.close()
@@ -325,7 +333,7 @@ def test_a_board_that_never_sends_motor_commands(
 ) -> None:
     peer.controls = False
     monkeypatch.setattr(hitl, "FIRST_CONTROLS_US", 500_000)
-    bridge = HitlBridge(router, peer.device, reboot=False)
+    bridge = bridge_to(router, peer.device, rebooted=True)
     bridge.wait_connected(PATIENCE_S, alive)
     with pytest.raises(FirmwareMissingError, match=r"sends no HIL_ACTUATOR_CONTROLS.*pwm_out_sim"):
         Stepper(bridge).forever()

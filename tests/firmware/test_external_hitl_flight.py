@@ -23,7 +23,8 @@ from firmware_sim.external.boot_sequence import ExternalFlightController, Extern
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.px4 import hitl
-from firmware_sim.external.px4.hitl import Boards
+from firmware_sim.external.px4.board_link import BoardLink
+from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.flight_controller import FirmwareMissingError
 from firmware_sim.mavlink.udp_links import bind_udp_links
@@ -58,8 +59,8 @@ class Flight:
             insecure=False,
         )
         self.router = Router(ends.by_name(), WallClock())
-        boards = Boards(self.router, peer.device, 921_600)
-        self.launcher = Launcher(px4_airframe(quad(), HITL_OUTPUT), boards.bridge, PATIENCE_S)
+        bridge = partial(HitlBridge, BoardLink(self.router, peer.device, 921_600))
+        self.launcher = Launcher(px4_airframe(quad(), HITL_OUTPUT), bridge, PATIENCE_S)
         self.observer = Observer(self.router, "observer")
         self.texts: list[str] = []
         self.simulation = self.boot()

@@ -14,17 +14,9 @@ from contextlib import suppress
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
-from airl_mav.core.errors import UsageError
 from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.board_link import BoardLink
-from firmware_sim.external.transport.router import Router
-from firmware_sim.external.transport.serial_port import (
-    BITS_PER_BYTE,
-    DEFAULT_BAUD,
-    carries_bytes_s,
-    check_baud,
-)
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
@@ -36,21 +28,6 @@ FIRST_CONTROLS_US = 10 * US_PER_S
 
 EPOCH_US = US_PER_S
 """Time in the first sample [µs]; the board takes its own clock's instead."""
-
-SENSOR_BYTES, GPS_BYTES = 76, 51
-"""Longest frames of HIL_SENSOR and HIL_GPS."""
-
-GPS_HZ = 10
-
-HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
-"""What the simulator sends [bytes/s]."""
-
-HIL_SHARE = 2 / 3
-"""Largest share of a line's capacity that this may take: companion and ground station need the
-rest."""
-
-USB_CLIENTS_BYTES_S = 100_000
-"""What those may send over USB [bytes/s]: a tenth of its capacity at full speed."""
 
 _CREEP_US = 20
 _BEHIND_US = 20_000
@@ -93,34 +70,12 @@ class HitlBridge:
 
     rate_hz = TICK_HZ
 
-    def __init__(
-        self,
-        router: Router,
-        device: str,
-        baud: int = DEFAULT_BAUD,
-        *,
-        reboot: bool = True,
-        returning: bool = False,
-    ) -> None:
-        """Configure the connection; nothing is opened yet.
-
-        Args:
-            router: Gets its line; its clients stay.
-            device: Serial device.
-            baud: Bits a second.
-            reboot: Whether the board is rebooted once found: its estimator may hold a flight.
-            returning: Whether the device may be absent at first: it was there before.
-
-        Raises:
-            UsageError: The line is too slow.
-        """
+    def __init__(self, link: BoardLink) -> None:
+        """Take the link to the board, which goes from episode to episode; it is not opened yet."""
         self.armed = False
         self.time_us = 0
-        self.went_down = False
-        """Whether others told the board to reboot, and it was down when this was closed."""
-        self._link = BoardLink(router, device, baud, check_line(device, baud))
-        self._reboot, self._returning = reboot, returning
-        self._pace = Pace(self._link.clock)
+        self._link = link
+        self._pace = Pace(link.clock)
         self._epoch_us: int | None = None
         """Simulated time that is 0 to the board [µs]."""
         self._began_us = 0
@@ -140,10 +95,14 @@ class HitlBridge:
             FirmwareMissingError: No board in HIL mode was found within `timeout_s`, each time.
             FirmwareLostError: It does not reboot, or does not come back.
         """
-        self._link.connect(timeout_s, alive, returning=self._returning)
-        if self._reboot:
-            self._link.go_down(alive)
-            self._link.connect(timeout_s, alive, returning=True)
+        link = self._link
+        returning, link.known = link.known, True
+        rebooted, link.went_down = link.went_down, False
+        link.connect(timeout_s, alive, returning=returning)
+        if not rebooted:
+            # Its estimator may hold a flight.
+            link.go_down(alive)
+            link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Send a tick's sensors, return the newest motor commands; see `Bridge`.
@@ -186,7 +145,7 @@ class HitlBridge:
             # Whoever finds it next must not take it for a board that has come up.
             with suppress(FirmwareLostError):
                 link.go_down(no_process)
-                self.went_down = True
+                link.went_down = True
         elif self.armed or link.board.armed:
             link.disarm()
         link.close()
@@ -228,43 +187,3 @@ class HitlBridge:
             self._stuck_us = now_us if self._stuck_us is None else self._stuck_us
         if sample.gps is not None:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
-
-
-class Boards:
-    """The same board on one device, for episode after episode: makes its bridges."""
-
-    def __init__(self, router: Router, device: str, baud: int) -> None:
-        """Take the line; nothing is opened yet. Arguments and errors as of `HitlBridge`."""
-        check_line(device, baud)
-        self._router, self._device, self._baud = router, device, baud
-        self._last: HitlBridge | None = None
-
-    def bridge(self) -> HitlBridge:
-        """Return the bridge of the next episode, once that of the last one is closed."""
-        last = self._last
-        self._last = HitlBridge(
-            self._router,
-            self._device,
-            self._baud,
-            reboot=last is None or not last.went_down,
-            returning=last is not None,
-        )
-        return self._last
-
-
-def check_line(device: str, baud: int) -> int:
-    """Return what clients may send to the board [bytes/s].
-
-    Raises UsageError when the line does not carry the sensors.
-    """
-    check_baud(baud)
-    carries = carries_bytes_s(device, baud)
-    if carries is None:
-        return USB_CLIENTS_BYTES_S
-    if carries * HIL_SHARE < HIL_BYTES_S:
-        raise UsageError(
-            f"--baud {baud}: {TICK_HZ} HIL_SENSOR a second are {HIL_BYTES_S * BITS_PER_BYTE} bit/s,"
-            f" {device} would carry {baud} for everything: accepted: at least "
-            f"{int(HIL_BYTES_S * BITS_PER_BYTE / HIL_SHARE)} (usual: 460800, 921600), or USB"
-        )
-    return carries - HIL_BYTES_S
