@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from types import TracebackType
 
 from airl_mav.core.constants import US_PER_S
 
@@ -67,16 +66,3 @@ class TlogWriter:
         self.flush()
         self._file.close()
         self.partial_path.replace(self.path)
-
-    def __enter__(self) -> TlogWriter:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Complete the log."""
-        self.close()

@@ -39,6 +39,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "MISSION_CURRENT": status.mission_current,
         "HOME_POSITION": position.home_position,
         "GPS_GLOBAL_ORIGIN": position.gps_global_origin,
+        "AUTOPILOT_VERSION": status.autopilot_version,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

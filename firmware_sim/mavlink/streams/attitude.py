@@ -17,27 +17,22 @@ _NO_ROTATION_OFFSET = (0.0, 0.0, 0.0, 0.0)
 def attitude(state: AutopilotState) -> Values:
     """Euler angles [rad] and body rates [rad/s]."""
     estimate = state.estimate
-    roll, pitch, yaw = _euler(estimate.quaternion)
-    rollspeed, pitchspeed, yawspeed = estimate.angular_velocity.tolist()
-    return boot_ms(estimate.time_us), roll, pitch, yaw, rollspeed, pitchspeed, yawspeed
+    angles, rates = _euler(estimate.quaternion), estimate.angular_velocity.tolist()
+    return boot_ms(estimate.time_us), *angles, *rates
 
 
 def attitude_quaternion(state: AutopilotState) -> Values:
     """Quaternion w, x, y, z (body FRD -> NED) and body rates [rad/s]."""
     estimate = state.estimate
-    w, x, y, z = estimate.quaternion.tolist()
-    rollspeed, pitchspeed, yawspeed = estimate.angular_velocity.tolist()
-    time_boot_ms = boot_ms(estimate.time_us)
-    return time_boot_ms, w, x, y, z, rollspeed, pitchspeed, yawspeed, *_NO_ROTATION_OFFSET
+    quaternion, rates = estimate.quaternion.tolist(), estimate.angular_velocity.tolist()
+    return boot_ms(estimate.time_us), *quaternion, *rates, *_NO_ROTATION_OFFSET
 
 
 def attitude_target(state: AutopilotState) -> Values:
     """What the attitude and rate controllers track; collective thrust 0..1."""
     type_mask = 0
-    w, x, y, z = state.attitude_setpoint.tolist()
-    roll_rate, pitch_rate, yaw_rate = state.rate_setpoint.tolist()
-    time_boot_ms, thrust = boot_ms(state.time_us), state.thrust_setpoint
-    return time_boot_ms, type_mask, w, x, y, z, roll_rate, pitch_rate, yaw_rate, thrust
+    quaternion, rates = state.attitude_setpoint.tolist(), state.rate_setpoint.tolist()
+    return boot_ms(state.time_us), type_mask, *quaternion, *rates, state.thrust_setpoint
 
 
 @kernel

@@ -60,16 +60,13 @@ def local_position_ned(state: AutopilotState) -> Values | None:
     estimate = state.estimate
     if not estimate.healthy:
         return None
-    x, y, z = estimate.position.tolist()
-    vx, vy, vz = estimate.velocity.tolist()
-    return boot_ms(estimate.time_us), x, y, z, vx, vy, vz
+    return boot_ms(estimate.time_us), *estimate.position.tolist(), *estimate.velocity.tolist()
 
 
 def global_position_int(state: AutopilotState) -> Values | None:
     """Position on the globe, height above home, NED velocity; nothing without an origin."""
     estimate, origin, home = state.estimate, state.origin, state.home
-    x, y, z = estimate.position.tolist()
-    if origin is None or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+    if origin is None or not all(map(math.isfinite, estimate.position.tolist())):
         return None
     return _on_globe(
         estimate.time_us,
@@ -157,28 +154,17 @@ def home_position(state: AutopilotState) -> Values | None:
     if home is None:
         return None
     local = [NAN, NAN, NAN] if origin is None else geodetic_to_local(home, origin).tolist()
-    return (
-        deg_e7(home.latitude_deg),
-        deg_e7(home.longitude_deg),
-        mm(home.altitude_m),
-        *local,
-        *_UNKNOWN_QUATERNION,
-        *_NO_APPROACH,
-        state.time_us,
-    )
+    return *_wire(home), *local, *_UNKNOWN_QUATERNION, *_NO_APPROACH, state.time_us
 
 
 def gps_global_origin(state: AutopilotState) -> Values | None:
     """The point of the globe where local NED is zero; nothing before it is set."""
-    origin = state.origin
-    if origin is None:
-        return None
-    return (
-        deg_e7(origin.latitude_deg),
-        deg_e7(origin.longitude_deg),
-        mm(origin.altitude_m),
-        state.time_us,
-    )
+    return None if state.origin is None else (*_wire(state.origin), state.time_us)
+
+
+def _wire(place: Geodetic) -> Values:
+    """Return latitude, longitude [degE7] and altitude [mm]."""
+    return deg_e7(place.latitude_deg), deg_e7(place.longitude_deg), mm(place.altitude_m)
 
 
 def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:

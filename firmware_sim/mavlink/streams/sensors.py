@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.core.kernels import kernel
 from airl_mav.vehicle import atmosphere
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams.units import (
@@ -47,20 +46,11 @@ _CHARGE_WARNINGS = (
 def highres_imu(state: AutopilotState) -> Values:
     """Newest IMU sample with the estimated biases removed, as PX4 sends it; mag and baro raw."""
     estimate = state.estimate
-    xacc, yacc, zacc = _difference(state.accel, estimate.accel_bias)
-    xgyro, ygyro, zgyro = _difference(state.gyro, estimate.gyro_bias)
-    xmag, ymag, zmag = state.mag.tolist()
     return (
         state.time_us,
-        xacc,
-        yacc,
-        zacc,
-        xgyro,
-        ygyro,
-        zgyro,
-        xmag,
-        ymag,
-        zmag,
+        *(state.accel - estimate.accel_bias).tolist(),
+        *(state.gyro - estimate.gyro_bias).tolist(),
+        *state.mag.tolist(),
         state.pressure_hpa,
         _NO_AIRSPEED,
         atmosphere.altitude_m(state.pressure_hpa),
@@ -98,13 +88,8 @@ def gps_raw_int(state: AutopilotState) -> Values | None:
     )
 
 
-def battery_status(state: AutopilotState, charge_state: int) -> Values:
-    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge.
-
-    Args:
-        state: The snapshot.
-        charge_state: MAV_BATTERY_CHARGE_STATE.
-    """
+def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
+    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge."""
     battery = state.battery
     number, no_temperature, no_energy, no_time_remaining = 0, INT16_MAX, -1, 0
     return (
@@ -119,11 +104,11 @@ def battery_status(state: AutopilotState, charge_state: int) -> Values:
         no_energy,
         percent(battery.remaining),
         no_time_remaining,
-        charge_state,
+        _charge_state(battery.remaining, parameters),
     )
 
 
-def charge_state(remaining: float, parameters: ParameterStore) -> int:
+def _charge_state(remaining: float, parameters: ParameterStore) -> int:
     """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, by PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
     for name, warning in _CHARGE_WARNINGS:
@@ -143,11 +128,6 @@ def servo_output_raw(state: AutopilotState) -> Values:
         pulses = [_PWM_DISARMED] * len(state.motors)
     port = 0
     return state.time_us & UINT32_MAX, port, *pulses, 0, 0, 0, 0
-
-
-@kernel
-def _difference(a: Vector, b: Vector) -> tuple[float, float, float]:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 def percent(share: float) -> int:
