@@ -254,7 +254,7 @@ def test_bad_server_endpoint_is_refused(endpoint: str) -> None:
 
 @pytest.mark.parametrize("endpoint", ["here", "smoke://signals", "tcp://127.0.0.1"])
 def test_bad_source_endpoint_is_refused(endpoint: str) -> None:
-    with pytest.raises(ValueError, match=r"accepted: tcp://"):
+    with pytest.raises(UsageError, match=r"accepted: tcp://"):
         ZmqFrameSource(endpoint, SimClock())
 
 
