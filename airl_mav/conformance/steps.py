@@ -7,7 +7,6 @@ the stored columns were measured. So each time is late by up to one sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -166,15 +165,6 @@ def step_response(
     )
 
 
-def median_response(responses: Sequence[StepResponse]) -> StepResponse:
-    """Return the median of several flights of one step, figure by figure.
-
-    Not their mean: now and then noise of the estimate alone makes a movement, long before the step
-    does. NaN where one did not get there.
-    """
-    return StepResponse(*np.median(np.array(responses), axis=0).tolist())
-
-
 class MeasuredStep(NamedTuple):
     """A step and its responses, one per repetition."""
 
@@ -183,8 +173,12 @@ class MeasuredStep(NamedTuple):
 
     @property
     def median(self) -> StepResponse:
-        """Median over the repetitions."""
-        return median_response(self.flights)
+        """Median over the repetitions, figure by figure; NaN where one did not get there.
+
+        Not their mean: now and then noise of the estimate alone makes a movement, long before the
+        step does.
+        """
+        return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
 
 STOP_NED = Setpoint("ned")
@@ -249,15 +243,10 @@ def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
 
 
 def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
-    """Return the response to a step.
+    """Return the response to a step, from the motion of `BEFORE_S` before it to its leg's end.
 
-    Args:
-        step: Which one.
-        motion: From `BEFORE_S` before it to the end of its leg.
-        sent_s: When the setpoint reached the vehicle, by its clock [s].
-
-    Raises:
-        ValueError: Telemetry is missing before or after the step.
+    `sent_s` is when the setpoint reached the vehicle, by its clock [s]. Raises ValueError if
+    telemetry is missing before or after the step.
     """
     times_s, values = _samples(step.quantity, motion, sent_s)
     change = VELOCITY_CHANGE if step.unit == "m/s" else ANGLE_CHANGE
