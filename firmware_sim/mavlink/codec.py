@@ -100,12 +100,8 @@ class _ParamValue(dialect.MAVLink_param_value_message):  # type: ignore[misc]
 def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> WireMessage:
     """Return a PARAM_VALUE.
 
-    Args:
-        name: Parameter name, at most 16 characters.
-        raw: The value's four bytes, little endian.
-        kind: MAV_PARAM_TYPE of those bytes.
-        count: Number of parameters.
-        index: The parameter's index; 65535 = it has none.
+    The name has at most 16 characters; `raw` is the value's four bytes, little endian, and `kind`
+    their MAV_PARAM_TYPE; `count` is the number of parameters; index 65535 = it has none.
     """
     message = _ParamValue(name.encode("ascii"), 0.0, kind, count, index)
     message.raw_value = raw
@@ -208,9 +204,8 @@ class Decoder:
     def __init__(self, *, datagrams: bool) -> None:
         """Start empty.
 
-        Args:
-            datagrams: True when every chunk holds whole frames (UDP); False for a byte stream
-                (serial), where a frame may be continued in the next chunk.
+        `datagrams`: every chunk holds whole frames (UDP); else it is a byte stream (serial), where
+        a frame may be continued in the next chunk.
         """
         self.malformed = 0
         """Runs of bytes that belong to no valid frame."""

@@ -73,13 +73,7 @@ class Link:
         builders: Mapping[str, Builder],
         replies: Mapping[str, Builder] | None = None,
     ) -> None:
-        """Open the link.
-
-        Args:
-            config: What it is made of.
-            builders: What can be streamed.
-            replies: Builds the same messages on request; None = the same builders.
-        """
+        """Open a link that can stream `builders`, and reply with `replies`; None = the same."""
         self.name = config.name
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
@@ -115,10 +109,7 @@ class Link:
     def receive(self) -> list[WireMessage]:
         """Return the messages that have arrived, oldest first."""
         messages: list[WireMessage] = []
-        chunks = self._endpoint.receive()
-        if not chunks:
-            return messages
-        for chunk in chunks:
+        for chunk in self._endpoint.receive():
             messages += self._decoder.feed(chunk)
         self._rx += len(messages)
         if self.tap is not None:
@@ -164,10 +155,7 @@ class Link:
     def stream_due(self, names: Iterable[str], state: AutopilotState, payloads: Payloads) -> None:
         """Add streams to this tick's telemetry; as `send` when their values do not fit.
 
-        Args:
-            names: The streams.
-            state: The snapshot of this tick.
-            payloads: What has been built from it so far; gets what is built here.
+        `payloads` is what has been built from this tick's snapshot; gets what is built here.
         """
         frames, encoder = self._pending, self._stream_encoder
         for name in names:

@@ -85,10 +85,9 @@ class MavlinkServer:
             session.link.scheduler.restart()
 
     def receive(self, now_us: int) -> int:
-        """Read and carry out everything that has arrived; return how many messages took effect.
+        """Read and carry out everything that has arrived by simulated `now_us` [µs].
 
-        Args:
-            now_us: Simulated time [µs].
+        Returns how many messages took effect.
         """
         self._now_us = now_us
         effective = 0
@@ -103,10 +102,9 @@ class MavlinkServer:
         return effective
 
     def send(self, now_us: int) -> None:
-        """Send texts, pending parameters and the streams that are due; call once per tick.
+        """Send texts, pending parameters and the streams that are due at simulated `now_us` [µs].
 
-        Args:
-            now_us: Simulated time [µs].
+        To be called once per tick.
         """
         self._now_us = now_us
         port = self._port

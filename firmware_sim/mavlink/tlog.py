@@ -29,11 +29,9 @@ class TlogWriter:
     """
 
     def __init__(self, path: Path, start_unix_us: int) -> None:
-        """Open the file.
+        """Open the file, whose final name is `path`.
 
-        Args:
-            path: Final name.
-            start_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+        `start_unix_us` is the calendar time of simulated time 0 [µs since 1970, UTC].
         """
         self.path = path
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)

@@ -19,24 +19,11 @@ from firmware_sim.mavlink.streams.units import (
     cm_s,
     deg_e7,
     int16,
-    int32,
     mm,
-    saturate,
     uint16,
 )
 
-for _function in (
-    local_to_geodetic,
-    boot_ms,
-    centidegrees,
-    cm_s,
-    deg_e7,
-    int16,
-    int32,
-    mm,
-    saturate,
-):
-    register_jitable(_function)  # so that kernels can call them, as Python can
+register_jitable(local_to_geodetic)  # so that kernels can call it, as Python can
 
 _UNKNOWN_QUATERNION = (NAN, NAN, NAN, NAN)
 _NO_ACCELERATION = (NAN, NAN, NAN)
