@@ -31,14 +31,9 @@ class FrameSource(Protocol):
         ...
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen.
+        """Wait for a frame that is not the one already seen (its sequence; -1 = none).
 
-        Args:
-            newer_than_sequence: Sequence of the frame already seen; -1 = none.
-            timeout_s: Longest wait [wall s].
-
-        Returns:
-            The newest frame, or None when the time is over.
+        Returns the newest frame, or None when the time is over [wall s].
         """
         ...
 

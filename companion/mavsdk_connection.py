@@ -27,10 +27,14 @@ def open_connection(url: str, kind: ComponentType) -> Mavsdk:
     log_subscribe(lambda *_: True)
     mavsdk = Mavsdk(Configuration.create_with_component_type(kind))
     result = mavsdk.add_any_connection(url)
-    if result != ConnectionResult.SUCCESS:
-        mavsdk.destroy()
-        raise UsageError(_problem(url, result))
-    return mavsdk
+    if result == ConnectionResult.SUCCESS:
+        return mavsdk
+    mavsdk.destroy()
+    name = result.name.lower().replace("_", " ")
+    problem = f"{name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"
+    if result == ConnectionResult.BIND_ERROR:
+        problem = "the port is taken (another companion?): choose another (airl-sitl: --api-port)"
+    raise UsageError(f"--connect {url}: {problem}")
 
 
 def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | None = None) -> Any:
@@ -47,13 +51,3 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
         if system is not None:
             return system
     return None
-
-
-def _problem(url: str, result: Any) -> str:
-    name = result.name.lower().replace("_", " ")
-    if result == ConnectionResult.BIND_ERROR:
-        return (
-            f"--connect {url}: the port is taken (another companion?): choose another "
-            "(airl-sitl: --api-port)"
-        )
-    return f"--connect {url}: {name}; accepted: udpin://HOST:PORT, serial://DEVICE:BAUD"

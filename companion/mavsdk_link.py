@@ -71,18 +71,14 @@ class MavsdkLink:
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
     ) -> None:
-        """Open a connection; `connect` waits for the vehicle.
+        """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
         Args:
-            url: MAVSDK connection, `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or
-                `raw://`.
+            url: MAVSDK connection.
             clock: For time-outs.
             abandon: Set from another thread to end any wait.
             heard: Whether the flight controller is received, where wall time cannot tell;
                 None = MAVSDK decides.
-
-        Raises:
-            UsageError: The URL is invalid or its port is taken.
         """
         self.url = url
         self._clock = clock

@@ -47,12 +47,8 @@ class Pilot:
     def fly(self, goal: tuple[float, float], stop: threading.Event) -> str:
         """Decide until the goal is reached, or something ends it; return why, in words.
 
-        Args:
-            goal: North, east [m] from the start.
-            stop: Set from outside to end the flight.
-
-        Raises:
-            LinkError: The flight controller refuses setpoints.
+        The goal lies north, east [m] of the start; `stop`, set from outside, ends the flight.
+        Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
         while not stop.is_set():

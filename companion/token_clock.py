@@ -44,7 +44,6 @@ class TokenTurns:
                 while this process runs].
         """
         self.patience_s = patience_s
-        """Longest wait for anything."""
         self.frame = NO_FRAME
         """Sequence of the newest frame that has reached the companion by now."""
         self.frame_arrived = threading.Event()

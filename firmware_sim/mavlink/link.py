@@ -83,7 +83,7 @@ class Link:
         self.tap: Callable[[bytes], None] | None = None
         """Called with every frame of both directions, if set."""
         self.ignored = 0
-        self._endpoint = config.endpoint
+        self.endpoint = config.endpoint
         self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder()
@@ -103,13 +103,13 @@ class Link:
             tx=self._tx,
             malformed=self._decoder.malformed,
             ignored=self.ignored + self._decoder.unknown,
-            send_errors=self._unsendable + self._endpoint.send_errors,
+            send_errors=self._unsendable + self.endpoint.send_errors,
         )
 
     def receive(self) -> list[WireMessage]:
         """Return the messages that have arrived, oldest first."""
         messages: list[WireMessage] = []
-        for chunk in self._endpoint.receive():
+        for chunk in self.endpoint.receive():
             messages += self._decoder.feed(chunk)
         self._rx += len(messages)
         if self.tap is not None:
@@ -139,7 +139,7 @@ class Link:
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
             self.flush()  # frames leave in the order of their sequence numbers
-        self._endpoint.send(frame)
+        self.endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
             self.tap(frame)
@@ -175,7 +175,7 @@ class Link:
         if not frames:
             return
         self._pending = []
-        self._endpoint.send_streams(frames)
+        self.endpoint.send_streams(frames)
         self._tx += len(frames)
         if self.tap is not None:
             for frame in frames:
@@ -187,14 +187,6 @@ class Link:
         except (struct.error, OverflowError):
             self._unsendable += 1
             return None
-
-    def fileno(self) -> int | None:
-        """Return the endpoint's descriptor, None when there is none."""
-        return self._endpoint.fileno()
-
-    def close(self) -> None:
-        """Close the endpoint."""
-        self._endpoint.close()
 
 
 def _payload(shape: Layout, values: Values | None) -> bytes | None:

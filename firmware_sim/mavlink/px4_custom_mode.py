@@ -65,14 +65,10 @@ def base_mode(status: CommanderStatus) -> int:
 
 def system_status(status: CommanderStatus) -> int:
     """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe."""
-    state: int
     if status.arming is Arming.ARMED:
-        state = dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE
-    elif status.arming is Arming.STANDBY:
-        state = dialect.MAV_STATE_STANDBY
-    else:
-        state = dialect.MAV_STATE_UNINIT
-    return state
+        return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
+    standby = status.arming is Arming.STANDBY
+    return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
 
 
 def requested_mode(base: int, main: int, sub: int) -> Mode | str | None:

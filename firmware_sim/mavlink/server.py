@@ -44,12 +44,10 @@ class MavlinkServer:
     def __init__(
         self, links: Sequence[LinkConfig], port: AutopilotPort | None = None, *, boot_unix_us: int
     ) -> None:
-        """Open the links.
+        """Open the links: each streams its default rates from the first `send` on.
 
-        Args:
-            links: The links; each streams its default rates from the first `send` on.
-            port: The autopilot, None = not yet.
-            boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+        The autopilot may come later (`attach`). `boot_unix_us` is the calendar time of simulated
+        time 0 [µs since 1970, UTC].
         """
         self._port: AutopilotPort | None = None
         self._now_us = 0
@@ -149,13 +147,13 @@ class MavlinkServer:
 
     def filenos(self) -> list[int]:
         """Return the descriptors that become readable when something arrives."""
-        numbers = (session.link.fileno() for session in self._sessions)
+        numbers = (session.link.endpoint.fileno() for session in self._sessions)
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
         """Close the endpoints."""
         for session in self._sessions:
-            session.link.close()
+            session.link.endpoint.close()
 
     def _open(self, config: LinkConfig) -> _Session:
         builders = self._link_builders()

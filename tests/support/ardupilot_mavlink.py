@@ -89,7 +89,7 @@ class Manners:
 
     def close(self) -> None:
         for link in self._links:
-            link.close()
+            link.endpoint.close()
 
     def _say(self, severity: int, text: str) -> None:
         for link in self._links:

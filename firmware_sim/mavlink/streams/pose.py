@@ -1,4 +1,4 @@
-"""Where the vehicle is, where it should be, and where its origin and home are."""
+"""Where the vehicle is and how it points, where and how it should, its origin and home."""
 
 from __future__ import annotations
 
@@ -25,6 +25,9 @@ from firmware_sim.mavlink.streams.units import (
 
 register_jitable(local_to_geodetic)  # so that kernels can call it, as Python can
 
+_NO_ROTATION_OFFSET = (0.0, 0.0, 0.0, 0.0)
+"""PX4 saves bytes: zeros mean the identity (tailsitters alone differ)."""
+
 _UNKNOWN_QUATERNION = (NAN, NAN, NAN, NAN)
 _NO_ACCELERATION = (NAN, NAN, NAN)
 _NO_APPROACH = (0.0, 0.0, 0.0)
@@ -40,6 +43,27 @@ _ACCELERATION_IGNORE: int = (
 )
 _YAW_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
 _YAW_RATE_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+
+
+def attitude(state: AutopilotState) -> Values:
+    """Euler angles [rad] and body rates [rad/s]."""
+    estimate = state.estimate
+    angles, rates = _euler(estimate.quaternion), estimate.angular_velocity.tolist()
+    return boot_ms(estimate.time_us), *angles, *rates
+
+
+def attitude_quaternion(state: AutopilotState) -> Values:
+    """Quaternion w, x, y, z (body FRD -> NED) and body rates [rad/s]."""
+    estimate = state.estimate
+    quaternion, rates = estimate.quaternion.tolist(), estimate.angular_velocity.tolist()
+    return boot_ms(estimate.time_us), *quaternion, *rates, *_NO_ROTATION_OFFSET
+
+
+def attitude_target(state: AutopilotState) -> Values:
+    """What the attitude and rate controllers track; collective thrust 0..1."""
+    type_mask = 0
+    quaternion, rates = state.attitude_setpoint.tolist(), state.rate_setpoint.tolist()
+    return boot_ms(state.time_us), type_mask, *quaternion, *rates, state.thrust_setpoint
 
 
 def local_position_ned(state: AutopilotState) -> Values | None:
@@ -158,6 +182,15 @@ def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> V
     """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else NaN."""
     n = NAN
     return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
+
+
+@kernel
+def _euler(quaternion: Vector) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw [rad] of a quaternion (4,), as `frames.quat_to_euler`."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    return roll, pitch, yaw_of((w, x, y, z))
 
 
 @kernel
