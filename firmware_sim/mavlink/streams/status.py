@@ -9,7 +9,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Lande
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, custom_mode, system_status
 from firmware_sim.mavlink.streams.sensors import percent
-from firmware_sim.mavlink.streams.units import NAN, boot_ms, int16, uint16
+from firmware_sim.mavlink.streams.units import boot_ms, int16, uint16
 
 CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
@@ -125,7 +125,7 @@ def estimator_status(state: AutopilotState) -> Values:
         flags = _ESTIMATOR_GOOD | (_ESTIMATOR_GOOD_GLOBAL if state.origin is not None else 0)
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
-    airspeed = terrain = NAN
+    airspeed = terrain = math.nan
     ratios = (max(horizontal, vertical), horizontal, height, mag, terrain, airspeed)
     return estimate.time_us, flags, *ratios, math.hypot(north, east), down
 

@@ -7,7 +7,6 @@ from typing import Final
 
 from numba.extending import register_jitable
 
-NAN: Final = math.nan
 INT16_MAX: Final = 32_767
 INT32_MAX: Final = 2_147_483_647
 UINT16_MAX: Final = 65_535
