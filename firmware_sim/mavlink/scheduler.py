@@ -34,10 +34,6 @@ class StreamScheduler:
         self._rebase_pending = False
         self._rebase(0)
 
-    def __contains__(self, name: str) -> bool:
-        """Tell whether there is such a stream."""
-        return name in self._index
-
     def interval_us(self, name: str) -> int:
         """Return a stream's interval [µs], `OFF` when it is not sent."""
         return self._interval[self._index[name]]
