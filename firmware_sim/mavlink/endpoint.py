@@ -141,7 +141,11 @@ class UdpEndpoint:
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
-            raise UsageError(_bind_problem(local, local_option, error)) from error
+            problem = f"cannot be used ({error.strerror})"
+            if error.errno == errno.EADDRINUSE:
+                problem = "is taken (another simulator?)"
+            where = f"UDP port {local[1]} on {local[0]}"
+            raise UsageError(f"{where} {problem}: choose another with {local_option}") from error
         self.local: Address = self._socket.getsockname()
 
     def receive(self) -> list[bytes]:
@@ -199,10 +203,3 @@ def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) 
             "unauthenticated (no signing yet): add --insecure to allow it on a trusted network"
         )
     return number, port
-
-
-def _bind_problem(local: Address, option: str, error: OSError) -> str:
-    where = f"UDP port {local[1]} on {local[0]}"
-    if error.errno == errno.EADDRINUSE:
-        return f"{where} is taken (another simulator?): choose another with {option}"
-    return f"{where} cannot be used ({error.strerror}): choose another with {option}"

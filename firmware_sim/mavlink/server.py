@@ -72,7 +72,9 @@ class MavlinkServer:
         autopilot (stale setpoints) are dropped. Simulated time may start anew.
         """
         if self._port is not None:
-            self._discard_received()
+            for session in self._sessions:
+                for _ in range(_DISCARD_CALLS):
+                    session.link.ignored += len(session.link.receive())
         self._port = port
         self._vibration = VibrationMeter()
         for session in self._sessions:
@@ -171,11 +173,6 @@ class MavlinkServer:
             return False
         session.context.now_us = self._now_us
         return handle(message, session.context)
-
-    def _discard_received(self) -> None:
-        for session in self._sessions:
-            for _ in range(_DISCARD_CALLS):
-                session.link.ignored += len(session.link.receive())
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""

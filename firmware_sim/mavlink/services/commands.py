@@ -79,6 +79,10 @@ def _takeoff(command: Command, context: Context) -> Result:
 
 def _set_mode(command: Command, context: Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
+    return _change_mode(base, main, sub, context)
+
+
+def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
     request = requested_mode(base, main, sub)
     if isinstance(request, str):
         context.announce(Message(Severity.CRITICAL, request))
@@ -178,9 +182,7 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     if message.target_system != SYSTEM_ID:
         return False
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-    nan = math.nan
-    params = (float(message.base_mode), float(main), float(sub), nan, nan, nan, nan)
-    _set_mode(Command(dialect.MAV_CMD_DO_SET_MODE, params), context)
+    _change_mode(message.base_mode, main, sub, context)
     return True
 
 
