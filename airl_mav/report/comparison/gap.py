@@ -343,15 +343,6 @@ def gaps_table(comparison: Comparison, arena: str) -> TableView:
     return contrasts_table(comparison, comparison.contrasts_of(arena), "Hardware gap", notes)
 
 
-def gap_tables(comparison: Comparison, arena: str) -> list[TableView]:
-    """Return all tables of an arena."""
-    contrasts = comparison.contrasts_of(arena)
-    tables = [columns_table(comparison, arena)]
-    if contrasts:
-        tables.append(gaps_table(comparison, arena))
-    return [*tables, *(contrast_table(comparison, c, ALL_MEASURES) for c in contrasts)]
-
-
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:
     """Return everything that a hardware gap says."""
     sections = [

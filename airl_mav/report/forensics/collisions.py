@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import measure_leg
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
@@ -107,10 +108,16 @@ def examine_collision(
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
         frame_us = int(frames[-1])
-        before_s, blind_m = (hit_us - frame_us) / US_PER_S, _way(path, frame_us, hit_us)
+        before_s, blind_m = (
+            (hit_us - frame_us) / US_PER_S,
+            measure_leg(path, frame_us, hit_us).distance_m,
+        )
         motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
         if motor_us != NO_STAMP:
-            lag_s, lag_m = (motor_us - frame_us) / US_PER_S, _way(path, frame_us, motor_us)
+            lag_s, lag_m = (
+                (motor_us - frame_us) / US_PER_S,
+                measure_leg(path, frame_us, motor_us).distance_m,
+            )
             answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
         if arena is not None and camera is not None:
             if number is not None:
@@ -137,9 +144,3 @@ def examine_collision(
         view=view,
         seen=seen,
     )
-
-
-def _way(path: Trajectory, start_us: int, end_us: int) -> float:
-    """Return the length [m] of a part of the path."""
-    part = path.between(start_us, end_us)
-    return float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum())
