@@ -10,7 +10,6 @@ from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.experiment import (
     Experiment,
     ExperimentResult,
-    entry_of,
     make_cell,
     run_and_compare,
 )
@@ -63,18 +62,7 @@ def matrix(scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = 
     """Declare a table of policies x arenas. Raises UsageError as `evaluate`."""
     cells = evaluation_cells(scenario, policies, arenas)
     facts = {field: getattr(scenario, field) for field in SHARED}
-    return Experiment(
-        kind="matrix",
-        name=f"{len(policies)}-policies",
-        facts=facts,
-        cells=cells,
-        roles={
-            cell.name: entry_of(
-                cell, label=cell.scenario.policy.name, group=cell.scenario.arena_name
-            )
-            for cell in cells
-        },
-    )
+    return Experiment("matrix", f"{len(policies)}-policies", facts, cells)
 
 
 def evaluation_cells(
@@ -98,6 +86,8 @@ def evaluation_cells(
             f"{policy.name}-{Path(arena).stem}",
             f"{policy.name} in {Path(arena).stem}",
             scenario.model_copy(update={"policy": path, "arena": arena}),
+            label=policy.name,
+            group=Path(arena).stem,
         )
         for path, policy in zip(policies, found, strict=True)
         for arena in arenas

@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
 from airl_mav.report.comparison.show import build_comparison, write_comparison
-from airl_mav.report.table import OUTCOME_LABELS
+from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
 
@@ -43,15 +43,13 @@ class Experiment:
     facts: dict[str, Any]
     """What heads the comparison."""
     cells: tuple[Cell, ...]
-    roles: Mapping[str, RunEntry] = field(default_factory=dict)
-    """What the run of a cell is in the comparison, by the cell's name; its folder is filled in."""
     remarks: tuple[str, ...] = ()
     """What a person should know before it flies."""
 
     def root(self, out: Path | None) -> Path:
         """Return the folder: as asked, or a new one under `runs`."""
-        plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in self.name)
-        return out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{plain}"
+        name = f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{file_name(self.name)}"
+        return out or Path("runs") / name
 
     @property
     def declaration(self) -> Declaration:
@@ -65,8 +63,8 @@ class Experiment:
                     title=cell.title,
                     settings=cell.scenario.config,
                     folder=None if shared[cell.name] is cell else shared[cell.name].name,
-                    role=self.roles[cell.name].role,
-                    group=self.roles[cell.name].group,
+                    role=cell.role,
+                    group=cell.group,
                 )
                 for cell in self.cells
             },
@@ -99,16 +97,11 @@ class ExperimentRun:
         Raises:
             UsageError: No cell has flights, or the folder cannot be written.
         """
+        here, experiment = self.path.absolute(), self.experiment
         entries = [
-            replace(
-                self.experiment.roles[flown.cell.name],
-                folder=flown.path.relative_to(self.path.absolute()).as_posix()
-                if flown.path.is_absolute()
-                else flown.path.relative_to(self.path).as_posix(),
-            )
+            entry_of(flown.cell, flown.path.absolute().relative_to(here).as_posix())
             for flown in self.cells
         ]
-        experiment = self.experiment
         comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
         return comparison, loaded, write_comparison(comparison, loaded, self.path)
 
@@ -127,22 +120,29 @@ class ExperimentResult:
     """The report."""
 
 
-def make_cell(name: str, title: str, scenario: Scenario) -> Cell:
+def file_name(text: str) -> str:
+    """Return a text as the name of a folder."""
+    return "".join(c if c.isalnum() or c in "._-" else "-" for c in text)
+
+
+def make_cell(
+    name: str, title: str, scenario: Scenario, *, label: str = "", role: str = "", group: str = ""
+) -> Cell:
     """Resolve a scenario as a cell. Raises UsageError if it cannot be flown."""
     # A copy without the loaded network: many large ones would fill the memory.
-    return Cell(name, title, replace(resolve(scenario)))
+    return Cell(name, title, replace(resolve(scenario)), label, role, group)
 
 
-def entry_of(cell: Cell, *, label: str = "", role: str = "", group: str = "") -> RunEntry:
-    """Return what the run of a cell is in a comparison."""
+def entry_of(cell: Cell, folder: str) -> RunEntry:
+    """Return what the run of a cell, in a folder below that of the comparison, is there."""
     card = cell.scenario.policy.card
     trained_in = None if card is None else card.training.arena
     return RunEntry(
         name=cell.name,
-        folder=cell.name,
-        label=label or cell.title,
-        role=role,
-        group=group,
+        folder=folder,
+        label=cell.label or cell.title,
+        role=cell.role,
+        group=cell.group,
         planned=len(cell.scenario.seeds),
         rules=cell.scenario.rules,
         trained_in=None if trained_in is None else Path(trained_in).stem,
@@ -220,12 +220,7 @@ def _fly_by_workers(
 ) -> _Flown:
     with stop_on_signals() as stop, executor_of(cells[0].scenario.scenario) as executor:
         run = run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
-        state: Ended = "complete"
-        if run.error is not None:
-            state = "broken off"
-        elif not run.complete or stop():
-            state = "interrupted"
-    return list(run.cells), state, run.error or ""
+    return list(run.cells), run.ended, run.error or ""
 
 
 def _fly_live(
@@ -246,12 +241,7 @@ def _fly_live(
 
 def outcome_line(run: CellRun) -> str:
     """Return how the flights of a cell ended."""
-    outcomes = [episode.outcome for episode in run.episodes]
-    told = ", ".join(
-        f"{outcomes.count(outcome):,} {words}"
-        for outcome, words in OUTCOME_LABELS.items()
-        if outcome in outcomes
-    )
+    told = count_outcomes([episode.outcome for episode in run.episodes])
     return told if run.new else f"{told} (flown before)"
 
 

@@ -44,15 +44,9 @@ def fly_scenario(
     cell = Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)
     with stop_on_signals() as stop, executor_of(asked) as executor:
         run = run_cell(out, cell, executor, progress=progress, stop=stop)
-        (flown,) = run.cells
-        ended: Ended = "complete"
-        if run.error is not None:
-            ended = "broken off"
-        elif not run.complete or stop():
-            # Also when the last flight had ended by then: what would come after must not begin.
-            ended = "interrupted"
-    tell_end(flown.path, ended, run.error or "", progress)
-    return FlownRun(flown.path, ended, flown.episodes, flown.new, run.error or "")
+    (flown,) = run.cells
+    tell_end(flown.path, run.ended, run.error or "", progress)
+    return FlownRun(flown.path, run.ended, flown.episodes, flown.new, run.error or "")
 
 
 def executor_of(asked: Flights) -> AbstractContextManager[Executor]:

@@ -556,7 +556,7 @@ def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str
 def training_of(folder: Path) -> tuple[list[Any], tuple[str, ...]]:
     scenario = Scenario(level="gym", policy=DEFAULT_POLICY, computer="ras-pi-4", episodes=EPISODES)
     gap = declare_gap(scenario, mitigated=str(folder))
-    cells = [cell for cell in gap.cells if gap.roles[cell.name].role == "training"]
+    cells = [cell for cell in gap.cells if cell.role == "training"]
     return cells, gap.remarks
 
 
