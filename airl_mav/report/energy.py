@@ -188,7 +188,6 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
             color=theme.MARK,
         )
     ax.axhline(0.0, color=theme.MUTED, lw=0.8)
-    ax.set_ylabel("kJ", fontsize=8.5, color=theme.MUTED)
     if many:
         label = "flights, sorted by their energy"
         ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -197,7 +196,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
         label = "flight"
         step = -(-len(ranked) // 20)
         ax.set_xticks(x[::step], [f"{f.record.index}" for f in ranked[::step]])
-    ax.set_xlabel(label, fontsize=8.5, color=theme.MUTED)
+    theme.label_axes(ax, label, "kJ")
     theme.plain_axes(ax)
     ax.grid(False, axis="x")
     figure.legend(

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
 
-US_PER_MS = 1_000.0
 NONE = "–"
 """Shown where there is no value."""
 TOO_FEW_CELL = "too few"

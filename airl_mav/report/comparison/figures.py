@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
@@ -24,7 +24,7 @@ from airl_mav.report.comparison.tables import letters_of, published_change
 from airl_mav.report.flights_above import Panel, path_points
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
-from airl_mav.report.table import NONE, OUTCOME_LABELS, US_PER_MS
+from airl_mav.report.table import NONE, OUTCOME_LABELS
 
 ROW_IN = 0.5
 """Height of a contrast in a figure."""
@@ -143,9 +143,7 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
             medians.append(float(np.median(at_ms)))
             ends += [float(at_ms[0]), float(at_ms[-1])]
         if min(ends) > 0.0 and max(ends) > LONG_TAIL * min(medians):
-            ax.set_xscale("log")
-            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            ax.xaxis.set_minor_formatter(NullFormatter())
+            theme.logarithmic(ax, "x")
         else:
             ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 104.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -62,47 +62,27 @@ HEADLINED = (WITHOUT, WITH, WITH_TRAINED)
 """Gaps whose figures head an arena."""
 
 
-@dataclass(frozen=True)
-class _GapKind:
-    """Which two roles make a gap."""
-
-    key: str
-    target: Role
-    reference: Role
-    title: str
-    short: str
-
+_UNDELAYED = "mitigation, reference undelayed"
+_TRAINED = "mitigation, reference delay-trained (the paper's way)"
+_NO_MITIGATION, _MITIGATED = "no mitigation", "mitigated"
 
 GAP_KINDS = (
-    _GapKind(
-        WITHOUT, "target", "reference", "without mitigation, reference undelayed", "no mitigation"
+    ContrastEntry("target", "reference", WITHOUT, f"without {_UNDELAYED}", _NO_MITIGATION),
+    ContrastEntry("mitigated", "reference", WITH, f"with {_UNDELAYED}", _MITIGATED),
+    ContrastEntry("target", "training", WITHOUT_TRAINED, f"without {_TRAINED}", _NO_MITIGATION),
+    ContrastEntry("mitigated", "training", WITH_TRAINED, f"with {_TRAINED}", _MITIGATED),
+    ContrastEntry(
+        "mitigated", "target", HELP, "mitigation against none, both on the target", "mitigation"
     ),
-    _GapKind(WITH, "mitigated", "reference", "with mitigation, reference undelayed", "mitigated"),
-    _GapKind(
-        WITHOUT_TRAINED,
-        "target",
-        "training",
-        "without mitigation, reference delay-trained (the paper's way)",
-        "no mitigation",
-    ),
-    _GapKind(
-        WITH_TRAINED,
-        "mitigated",
-        "training",
-        "with mitigation, reference delay-trained (the paper's way)",
-        "mitigated",
-    ),
-    _GapKind(
-        HELP, "mitigated", "target", "mitigation against none, both on the target", "mitigation"
-    ),
-    _GapKind(
-        COST,
+    ContrastEntry(
         "mitigated-reference",
         "reference",
+        COST,
         "mitigated policy where nothing is late, reference undelayed",
         "mitigated, undelayed",
     ),
 )
+"""Which two roles make a gap; the runs that have them take their places."""
 
 
 def build_gap(
@@ -110,16 +90,11 @@ def build_gap(
 ) -> Comparison:
     """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
 
-    Args:
-        facts: What was asked for: `policy`, `computer`, `reference`, `latency`, ...
-        entries: The runs, each with its `role`; their group is the arena.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    See `show.build_comparison`; facts are `policy`, `computer`, `reference`, `latency`, ..., each
+    entry has its `role`, and its group is the arena.
     """
     contrasts = [
-        ContrastEntry(target.name, reference.name, kind.key, kind.title, kind.short)
+        replace(kind, target=target.name, reference=reference.name)
         for group in dict.fromkeys(entry.group for entry in entries)
         for kind in GAP_KINDS
         for target in entries

@@ -43,15 +43,9 @@ WIDEST = 3
 def build_ladder(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a ladder.
+    """Work out a ladder of levels, the reference first; see `show.build_comparison`.
 
-    Args:
-        facts: What all levels share: `policy`, `arena`, ...
-        entries: The levels, the reference first.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    The facts are what all levels share: `policy`, `arena`, ...
     """
     title = f"{facts.get('policy')} in {facts.get('arena')}"
     comparison = compare(runs, kind="ladder", title=title, facts=facts, entries=entries)

@@ -24,15 +24,10 @@ from airl_mav.report.table import NONE, Column, TableView
 def build_matrix(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a table of policies x arenas.
+    """Work out a table of policies x arenas; see `show.build_comparison`.
 
-    Args:
-        facts: What all cells share: level, seed, episodes, vehicle, computer.
-        entries: One for each cell: its `label` is the policy, its `group` the arena.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    The facts are what all cells share: level, seed, episodes, vehicle, computer. The `label` of an
+    entry is the policy, its `group` the arena.
     """
     title = "Policies by arenas"
     return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)

@@ -15,17 +15,15 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_leg
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
-    PolicyCamera,
     bearing,
     pose_at,
     view_obstacle,
     view_wall,
 )
+from airl_mav.report.forensics.evidence import Evidence
 
 LOOK_BACK = 5
 """Decisions before the collision whose frames are looked at."""
@@ -89,14 +87,9 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(
-    record: EpisodeRecord,
-    path: Trajectory,
-    stamps: Mapping[str, NDArray[Any]],
-    arena: Arena | None,
-    camera: PolicyCamera | None,
-) -> Collision | None:
+def examine_collision(flight: Evidence) -> Collision | None:
     """Take a collision apart; None for a flight that hit nothing, or that has no recording."""
+    record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
         return None
     hit_us = record.ended_us
@@ -119,12 +112,11 @@ def examine_collision(
                 measure_leg(path, frame_us, motor_us).distance_m,
             )
             answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
-        if arena is not None and camera is not None:
+        if arena is not None and flight.camera is not None:
             if number is not None:
+                began_us, camera = record.started_us, flight.camera
                 views = [
-                    view_obstacle(
-                        path, int(frame), hit_us, arena, record.started_us, number, camera
-                    )
+                    view_obstacle(path, int(frame), hit_us, arena, began_us, number, camera)
                     for frame in frames
                 ]
                 view = views[-1]
