@@ -90,14 +90,7 @@ OPTIONS = GapOptions
 
 
 def run(options: GapOptions, console: Console | None = None) -> int:
-    """Measure the gap.
-
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Measure the gap; exit status and errors as of `fly_and_show`."""
     experiment = declare_gap(
         scenario_of(options),
         mitigated=options.mitigated,

@@ -59,14 +59,7 @@ OPTIONS = LadderOptions
 
 
 def run(options: LadderOptions, console: Console | None = None) -> int:
-    """Fly the levels and show what differs.
-
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Fly the levels and show what differs; exit status and errors as of `fly_and_show`."""
     arena = options.arena or training_arena(find_policy(options.policy))
     experiment = declare_ladder(
         scenario_of(options, arena=arena), options.levels, sitl_episodes=options.sitl_episodes

@@ -29,6 +29,8 @@ NOT_THE_POLICYS_OWN = (
     "hold_s",
     "altitude_m",
     "max_speed_m_s",
+    "time_limit_s",
+    "watchdog",
 )
 """Fields whose results are not written onto a policy's card when they are given."""
 
@@ -103,7 +105,7 @@ def check_plain(cells: Sequence[Cell]) -> None:
     """Raise UsageError for results that are not the policies' own: none goes onto a card."""
     for cell in cells:
         asked, usual = cell.scenario.scenario, Scenario()
-        for field in (*NOT_THE_POLICYS_OWN, "time_limit_s", "watchdog"):
+        for field in NOT_THE_POLICYS_OWN:
             if (value := getattr(asked, field)) != getattr(usual, field):
                 raise FieldError(field, value, "without on-card: these are not the policy's own")
         if cell.scenario.policy.folder is None:

@@ -31,12 +31,16 @@ RANKS = 160
 HIGH = 2.0
 """Flights with more than this times the 95th percentile would press all others flat: cut off."""
 
+AIRFRAME = {"hover_j": "hovering", "motion_j": "speed", "manoeuvre_j": "manoeuvres"}
+"""The parts of the airframe's energy, in the order of the tables."""
+
 PARTS = (
-    ("hover_j", "hovering", theme.SERIES),
-    ("manoeuvre_j", "manoeuvres", theme.MARK),
-    ("motion_j", "speed", theme.SERIES_SOFT),
+    ("hover_j", AIRFRAME["hover_j"], theme.SERIES),
+    ("manoeuvre_j", AIRFRAME["manoeuvre_j"], theme.MARK),
+    ("motion_j", AIRFRAME["motion_j"], theme.SERIES_SOFT),
     ("computer_j", "computer", COMPUTER_COLOUR),
 )
+"""What is drawn, from the bottom to the top."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +97,7 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
     ]
     if splits and len(splits) == len(flights):
         split = add_up(splits)
-        lines += [
-            ("– hovering", split.hover_j),
-            ("– speed", split.motion_j),
-            ("– manoeuvres", split.manoeuvre_j),
-        ]
+        lines += [(f"– {title}", getattr(split, name)) for name, title in AIRFRAME.items()]
         notes.append(
             "The airframe's parts follow the terms of its power model (Krishnan et al. 2021, eq. "
             "1). Hovering: staying up, with the payload. Speed: what moving adds; below 0 where it "
@@ -123,9 +123,7 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
         Column("outcome", number=False),
         Column("time", "s"),
         Column("airframe", "kJ"),
-        Column("hovering", "kJ"),
-        Column("speed", "kJ"),
-        Column("manoeuvres", "kJ"),
+        *(Column(title, "kJ") for title in AIRFRAME.values()),
         Column("computer", "J"),
         Column("mean power", "W"),
     )
@@ -138,8 +136,7 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
 def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     """Return one flight's cells."""
     p = flight.parts
-    names = ("hover_j", "motion_j", "manoeuvre_j")
-    parts = [NONE] * 3 if p is None else [f"{getattr(p, name) / 1e3:.2f}" for name in names]
+    parts = [NONE if p is None else f"{getattr(p, name) / 1e3:.2f}" for name in AIRFRAME]
     q = flight.record.quality
     time_s = 0.0 if q is None else q.flight_time_s
     whole = flight.airframe_j + flight.computer_j

@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import pair_by_seed
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -28,6 +25,7 @@ from airl_mav.report.comparison.model import (
     ContrastEntry,
     RunEntry,
 )
+from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.tables import (
     THE_PAPER,
     common_rules,
@@ -42,16 +40,10 @@ from airl_mav.report.flights_above import flight_pictures
 from airl_mav.report.measures import ALL_MEASURES, FLIGHT_TIME, interval_of
 from airl_mav.report.table import NONE, Column, TableView, ms
 
-Role = Literal["reference", "target", "mitigated", "training", "mitigated-reference"]
-"""Of `training` there may be several runs: one for each source of latency."""
-
 OVERLAID = 100
 """Flights of a run that are drawn over each other: the first seeds."""
 
-WORST = 6
-"""Seeds that are looked at one by one."""
-
-WORST_ROLES: tuple[Role, ...] = ("reference", "target", "mitigated")
+WORST_ROLES = ("reference", "target", "mitigated")
 """What is drawn of the worst seeds."""
 
 WITHOUT, WITH = "without-mitigation", "with-mitigation"
@@ -82,7 +74,8 @@ GAP_KINDS = (
         "mitigated, undelayed",
     ),
 )
-"""Which two roles make a gap; the runs that have them take their places."""
+"""Which two roles make a gap; the runs that have them take their places. Of `training` there may be
+several runs: one for each source of latency."""
 
 
 def build_gap(
@@ -164,25 +157,6 @@ def _as_late(t2_us: float | None, published_ms: float) -> bool:
     if t2_us is None:
         return False
     return abs(t2_us / US_PER_MS - published_ms) <= max(0.2 * published_ms, 20.0)
-
-
-def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
-    """Return seeds that lost most: half of them failed, half took longest against the reference.
-
-    The reference reached the goal with all of them. Of those that failed the first seeds are taken.
-    """
-    failed: list[int] = []
-    slower: dict[int, float] = {}
-    for first, second in pair_by_seed(reference, target):
-        if first.outcome is not Outcome.SUCCESS or first.quality is None:
-            continue
-        if second.outcome is not Outcome.SUCCESS:
-            failed.append(first.seed)
-        elif second.quality is not None:
-            slower[first.seed] = second.quality.flight_time_s / first.quality.flight_time_s
-    longest = sorted(slower, key=lambda seed: (-slower[seed], seed))
-    chosen = sorted(failed)[: max(WORST // 2, WORST - len(longest))]
-    return [*chosen, *longest[: WORST - len(chosen)]]
 
 
 # --- the verdict
