@@ -7,12 +7,7 @@ from pathlib import Path
 
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult, add_result

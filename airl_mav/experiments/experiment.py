@@ -15,15 +15,11 @@ from typing import Any
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_flights
-from airl_mav.experiments.fly import executor_of, raise_unless_complete, shown
+from airl_mav.experiments.fly import raise_unless_complete, shown
 from airl_mav.experiments.live import Ended, fly_live, tell_end
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
-from airl_mav.experiments.store import (
-    CampaignStore,
-    Declaration,
-    DeclaredCell,
-    open_campaign,
-)
+from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
@@ -218,7 +214,9 @@ def _fly_by_workers(
     progress: Progress,
     tell: Callable[[CellRun], None],
 ) -> _Flown:
-    with stop_on_signals() as stop, executor_of(cells[0].scenario.scenario) as executor:
+    asked = cells[0].scenario.scenario
+    in_process = asked.level == "gym"
+    with stop_on_signals() as stop, open_executor(asked, in_process=in_process) as executor:
         run = run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
     return list(run.cells), run.ended, run.error or ""
 

@@ -6,12 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
 from airl_mav.scenario.model import LevelName, Scenario
 
 LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.flight.statistics import (
-    MEANS,
-    Aggregate,
-    Estimate,
-    aggregate,
-    median_of,
-    successful,
-)
+from airl_mav.flight.statistics import MEANS, Aggregate, Estimate, aggregate, median_of, successful
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,

@@ -8,14 +8,7 @@ from pathlib import Path
 
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.model import Comparison
-from airl_mav.report.document import (
-    Document,
-    Facts,
-    Headline,
-    Section,
-    provenance_facts,
-    run_link,
-)
+from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts, run_link
 
 
 def comparison_document(

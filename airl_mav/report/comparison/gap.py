@@ -13,11 +13,7 @@ from airl_mav.profiles.published import PublishedRun, load_published, published_
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
-from airl_mav.report.comparison.figures import (
-    contrast_pictures,
-    flight_panels,
-    seed_pictures,
-)
+from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_pictures
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,

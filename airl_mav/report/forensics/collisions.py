@@ -40,8 +40,6 @@ class Collision:
 
     what: str
     """As the plant calls it: `static-box-3`, `wall`, `floor`."""
-    obstacle: int | None
-    """Number of the obstacle; None for a wall or the floor, or where the arena is not known."""
     speed_m_s: float
     """At the collision."""
     off_heading_rad: float
@@ -125,7 +123,6 @@ def examine_collision(flight: Evidence) -> Collision | None:
                 view = view_wall(path, frame_us, hit_us, arena)
     return Collision(
         what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
-        obstacle=number,
         speed_m_s=float(np.linalg.norm(velocity)),
         off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
         before_s=before_s,
