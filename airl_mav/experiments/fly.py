@@ -20,9 +20,7 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
-def fly_scenario(
-    scenario: ResolvedScenario, out: Path | None, progress: Progress, *, name: str | None = None
-) -> FlownRun:
+def fly_scenario(scenario: ResolvedScenario, out: Path | None, progress: Progress) -> FlownRun:
     """Fly what is left of a scenario at any level, several flights at a time where that can be.
 
     Ctrl-C and SIGTERM end it with what has ended kept.
@@ -31,13 +29,12 @@ def fly_scenario(
         scenario: What is flown.
         out: Run folder; one that holds episodes of the same run gets the others. None: a new one.
         progress: Who looks on.
-        name: Name of a new run; None: after level and policy.
 
     Raises:
         UsageError: The input cannot be used; what was flown before is kept.
     """
     asked = scenario.scenario
-    name = name or run_name(scenario)
+    name = run_name(scenario)
     if asked.level == "sitl":
         return fly_live(scenario, out, progress, name=name)
     cell = Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)

@@ -27,8 +27,9 @@ class Measure:
         "energy_j",
         "computer_energy_j",
         "total_energy_j",
+        "mean_speed_m_s",
     ]
-    """Its field in a `PairedComparison`, and in an `Aggregate`."""
+    """Its field in an `Aggregate`; but for the speed, also in a `PairedComparison`."""
     title: str
     unit: str
     scale: float
@@ -62,6 +63,7 @@ FLIGHT_TIME = Measure("flight_time_s", "flight time", "s", 1.0, 2)
 DISTANCE = Measure("distance_m", "distance", "m", 1.0, 2)
 ENERGY = Measure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
 COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
+MEAN_SPEED = Measure("mean_speed_m_s", "mean speed", "m/s", 1.0, 2)
 TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
 
 MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)

@@ -145,15 +145,13 @@ def rich_table(view: TableView, *, wrap: bool = False) -> Table:
     return table
 
 
-def print_facts(
-    rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim", indent: str = ""
-) -> None:
+def print_facts(rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim") -> None:
     """Print terms with their texts."""
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style=style, no_wrap=True)
     facts.add_column(overflow="fold")
     for term, text in rows:
-        facts.add_row(f"{indent}{term}", Text(text))
+        facts.add_row(term, Text(text))
     console.print()
     console.print(facts)
 

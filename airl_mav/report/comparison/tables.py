@@ -272,12 +272,10 @@ def contrasts_table(
     )
 
 
-def contrast_headlines(
-    contrast: Contrast, measures: Sequence[Measure] = MEASURES, digits: int = 2
-) -> tuple[Headline, ...]:
+def contrast_headlines(contrast: Contrast, digits: int = 2) -> tuple[Headline, ...]:
     """Return the differences of a contrast as headlines."""
     headlines = []
-    for measure in measures:
+    for measure in MEASURES:
         d = measure.change(contrast.paired).difference
         told = published_change(contrast, measure)
         more = [] if told is None else [f"{THE_PAPER} {told:+.1f}"]
