@@ -150,10 +150,7 @@ def run_and_compare(
 ) -> ExperimentResult:
     """Fly an experiment to its end and compare its runs: what the functions of the API share.
 
-    Raises:
-        UsageError: It cannot be flown, or the folder holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    Raises what `evaluate` does.
     """
     with shown(progress) as shows:
         flown = run_experiment(experiment, None if out is None else Path(out), shows)

@@ -23,15 +23,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 def fly_scenario(scenario: ResolvedScenario, out: Path | None, progress: Progress) -> FlownRun:
     """Fly what is left of a scenario at any level, several flights at a time where that can be.
 
-    Ctrl-C and SIGTERM end it with what has ended kept.
-
-    Args:
-        scenario: What is flown.
-        out: Run folder; one that holds episodes of the same run gets the others. None: a new one.
-        progress: Who looks on.
-
-    Raises:
-        UsageError: The input cannot be used; what was flown before is kept.
+    Ctrl-C and SIGTERM end it with what has ended kept; all else as of `live.fly_live`.
     """
     asked = scenario.scenario
     name = run_name(scenario)

@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from airl_mav.flight.energy import EnergySplit, add_up, split_energy
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import Power
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -48,8 +49,7 @@ class FlightEnergy:
     """One flight's energy, from the start of navigation."""
 
     record: EpisodeRecord
-    airframe_j: float
-    computer_j: float
+    quality: Quality
     parts: EnergySplit | None
     """None where the vehicle's power model or the recording is missing."""
 
@@ -72,8 +72,7 @@ def flight_energies(run: LoadedRun, power: Power | None) -> list[FlightEnergy]:
             if path is None or power is None or len(path) < 2
             else split_energy(path, e.navigation_us, e.ended_us, power, watts)
         )
-        q = e.quality
-        flights.append(FlightEnergy(e, q.energy_j, q.computer_energy_j, parts))
+        flights.append(FlightEnergy(e, e.quality, parts))
     return flights
 
 
@@ -85,9 +84,9 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
         Column("share", "%"),
         Column("mean power", "W"),
     )
-    time_s = sum(f.record.quality.flight_time_s for f in flights if f.record.quality is not None)
-    airframe = sum(f.airframe_j for f in flights)
-    computer = sum(f.computer_j for f in flights)
+    time_s = sum(f.quality.flight_time_s for f in flights)
+    airframe = sum(f.quality.energy_j for f in flights)
+    computer = sum(f.quality.computer_energy_j for f in flights)
     whole = airframe + computer
     splits = [f.parts for f in flights if f.parts is not None]
     lines = [("airframe", airframe)]
@@ -137,17 +136,15 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     """Return one flight's cells."""
     p = flight.parts
     parts = [NONE if p is None else f"{getattr(p, name) / 1e3:.2f}" for name in AIRFRAME]
-    q = flight.record.quality
-    time_s = 0.0 if q is None else q.flight_time_s
-    whole = flight.airframe_j + flight.computer_j
+    q = flight.quality
     return (
         f"{flight.record.index}",
         OUTCOME_LABELS[flight.record.outcome],
-        f"{time_s:.2f}",
-        f"{flight.airframe_j / 1e3:.2f}",
+        f"{q.flight_time_s:.2f}",
+        f"{q.energy_j / 1e3:.2f}",
         *parts,
-        f"{flight.computer_j:,.0f}",
-        f"{whole / time_s:,.1f}" if time_s else NONE,
+        f"{q.computer_energy_j:,.0f}",
+        f"{q.total_energy_j / q.flight_time_s:,.1f}" if q.flight_time_s else NONE,
     )
 
 
@@ -159,7 +156,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     ranked = list(flights)
     kept = np.arange(len(ranked))
     if many:
-        ranked.sort(key=lambda f: f.airframe_j + f.computer_j)
+        ranked.sort(key=lambda f: f.quality.total_energy_j)
         kept = np.unique(np.linspace(0, len(ranked) - 1, RANKS).round().astype(int))
         ranked = [ranked[k] for k in kept]
     whole = all(f.parts is not None for f in flights)
@@ -177,7 +174,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     top = HIGH * float(np.percentile(above, 95.0))
     if above.max() > top > 0.0:
         ax.set_ylim(top=top)
-        over = sum(f.airframe_j + f.computer_j > 1e3 * top for f in flights)
+        over = sum(f.quality.total_energy_j > 1e3 * top for f in flights)
         ax.set_title(
             f"{over} above, up to {above.max():,.0f} kJ",
             loc="right",
@@ -208,7 +205,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
 def _joules(flight: FlightEnergy, name: str) -> float:
     """Return one part of a flight's energy [J]; no name: the airframe's."""
     if name == "computer_j":
-        return flight.computer_j
+        return flight.quality.computer_energy_j
     if not name or flight.parts is None:
-        return flight.airframe_j
+        return flight.quality.energy_j
     return float(getattr(flight.parts, name))

@@ -14,11 +14,11 @@ from airl_mav.arena.draw import draw_arena
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate
-from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
+from airl_mav.latency.stages import ALL_STAGES, Samples
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.arenas import arena_of
-from airl_mav.report.comparison.build import tests_of
+from airl_mav.report.comparison.build import samples_of, tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import letters_of, published_change
 from airl_mav.report.flights_above import Panel, path_points
@@ -123,7 +123,7 @@ def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
 
 def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
     """Draw the cumulated distributions of all runs, one picture a stage that has samples."""
-    pooled = {name: _samples(run) for name, run in runs.items()}
+    pooled = {name: samples_of(run) for name, run in runs.items()}
     pictures = []
     for stage in (stage for stage in ALL_STAGES if stage.key in CDF_STAGES):
         having = [run for run in comparison.runs if pooled[run.name][stage.key].size]
@@ -156,12 +156,6 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
         name = f"{comparison.kind}-{stage.key.replace('_', '-')}"
         pictures.append(theme.render(figure, name, alt))
     return pictures
-
-
-def _samples(run: LoadedRun) -> dict[str, Samples]:
-    """Return the durations of all stages [µs], without those of aborted flights."""
-    tests = tests_of(run)
-    return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
 
 
 def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -163,7 +163,7 @@ def _verdict(comparison: Comparison, arena: str) -> str:
     gaps = {c.entry.key: c for c in reversed(comparison.contrasts_of(arena))}
     if (gap := gaps.get(WITHOUT)) is None:
         return ""
-    target, reference = comparison.run(gap.entry.target), comparison.run(gap.entry.reference)
+    target, reference = comparison.pair(gap)
     place = "" if len(comparison.groups) == 1 else f" in {Path(arena).stem}"
     sentence = (
         f"On {_computer(target)}{place} {target.setup.policy.name} flies {_longer(gap)} than on "
