@@ -14,7 +14,7 @@ from typing import Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_flights
+from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cells, shared_flights
 from airl_mav.experiments.fly import raise_unless_complete, shown
 from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.open_executor import open_executor
@@ -191,8 +191,9 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
             experiment.cells, key=lambda cell: cell.scenario.scenario.level
         ):
             fly = _fly_live if level == "sitl" else _fly_by_workers
-            flown, state, problem = fly(store, tuple(group), progress, tell)
-            runs += flown
+            flown = fly(store, tuple(group), progress, tell)
+            runs += flown.cells
+            state, problem = flown.ended, flown.error or ""
             if state != "complete":
                 break
     tell_end(root, state, problem, progress)
@@ -201,21 +202,16 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
     )
 
 
-_Flown = tuple[list[CellRun], Ended, str]
-"""Runs as far as they have come, how it ended, and why."""
-
-
 def _fly_by_workers(
     store: CampaignStore,
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
-) -> _Flown:
+) -> CampaignRun:
     asked = cells[0].scenario.scenario
     in_process = asked.level == "gym"
     with stop_on_signals() as stop, open_executor(asked, in_process=in_process) as executor:
-        run = run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
-    return list(run.cells), run.ended, run.error or ""
+        return run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
 
 
 def _fly_live(
@@ -223,15 +219,15 @@ def _fly_live(
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
-) -> _Flown:
+) -> CampaignRun:
     runs: list[CellRun] = []
     for cell in cells:
         flown = fly_live(cell.scenario, store.cell_path(cell.name), progress, name=cell.name)
         runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":
-            return runs, flown.ended, flown.problem
+            return CampaignRun(tuple(runs), False, flown.ended, flown.problem)
         tell(runs[-1])
-    return runs, "complete", ""
+    return CampaignRun(tuple(runs), True, "complete", None)
 
 
 def outcome_line(run: CellRun) -> str:
