@@ -31,10 +31,9 @@ class GapOptions(Flights, Lateness, Decisions, Aircraft):
     """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
 
     The policy on a workstation and on the onboard computer; a policy that was trained as late as
-    that
-    computer decides, there, in the conditions of its training, and on the workstation. Always the
-    same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against both
-    references, beside those of the paper. The same --out goes on with what was interrupted.
+    that computer decides, there, in the conditions of its training, and on the workstation. Always
+    the same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against
+    both references, beside those of the paper. The same --out goes on with what was interrupted.
 
     Examples:
         airl gap

@@ -21,8 +21,8 @@ class LadderOptions(Flights, Lateness, Decisions, Aircraft):
     """Fly the same policy and seeds at several levels of fidelity, and say what differs.
 
     Success, flight time, distance and energy side by side, with the differences from the first
-    level on
-    the same seeds and their 95 % intervals. The same --out goes on with what was interrupted.
+    level on the same seeds and their 95 % intervals. The same --out goes on with what was
+    interrupted.
 
     Examples:
         airl ladder static-obstacles

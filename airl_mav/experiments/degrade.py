@@ -56,8 +56,8 @@ def declare_degradation(
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
     names = list(policies) or [scenario.policy]
     cells = []
-    for path in names:
-        policy = find_policy(path).name
+    found = [find_policy(name).name for name in names]
+    for path, policy in zip(names, found, strict=True):
         for latency in latencies:
             given = None if latency == NATIVE else latency
             label = latency if given is None or not Path(given).is_file() else Path(given).stem
@@ -72,7 +72,6 @@ def declare_degradation(
                     group=policy,
                 )
             )
-    found = [find_policy(name).name for name in names]
     facts = {field: getattr(scenario, field) for field in FACTS}
     return Experiment(
         kind="degradation",
