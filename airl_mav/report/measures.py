@@ -53,9 +53,9 @@ class Measure:
             return NONE
         return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}"
 
-    def with_interval(self, estimate: Estimate) -> str:
-        """Return an estimate in the shown unit with its 95 % interval in brackets."""
-        return with_interval(estimate.scaled(self.scale), self.digits)
+    def with_interval(self, quality: Aggregate) -> str:
+        """Return the measure of a run in the shown unit, its 95 % interval in brackets."""
+        return with_interval(self.of(quality).scaled(self.scale), self.digits)
 
 
 SUCCESS_RATE = Measure("success_rate", "success rate", "%", 100.0, 1, "points")

@@ -115,7 +115,7 @@ def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
         (
             run.label,
             ms(run.stages["t2"].mean, 0),
-            *(measure.with_interval(measure.of(run.quality)) for measure in MEASURES),
+            *(measure.with_interval(run.quality) for measure in MEASURES),
         )
         for run in comparison.group(policy)
     )

@@ -240,7 +240,7 @@ def columns_table(comparison: Comparison, arena: str) -> TableView:
         rows.append(
             (
                 f"{measure.title} [{measure.unit}]",
-                *(measure.with_interval(measure.of(run.quality)) for run in runs),
+                *(measure.with_interval(run.quality) for run in runs),
                 *(NONE if figure is None else f"{figure:.4g}" for figure in told),
             )
         )

@@ -53,7 +53,7 @@ def _cell(run: ComparedRun | None, measure: Measure) -> str:
     """Return a figure with its interval; a star where the policy was trained."""
     if run is None:
         return NONE
-    text = measure.with_interval(measure.of(run.quality))
+    text = measure.with_interval(run.quality)
     return f"{text} *" if text != NONE and trained_here(run) else text
 
 

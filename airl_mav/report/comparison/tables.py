@@ -92,7 +92,7 @@ def runs_table(
         (
             run.mark,
             f"{run.quality.success_rate.n:,}",
-            *(measure.with_interval(measure.of(run.quality)) for measure in measures),
+            *(measure.with_interval(run.quality) for measure in measures),
         )
         for run in runs
     )
