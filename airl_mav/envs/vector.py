@@ -19,7 +19,7 @@ from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import DecisionOutcome, rewards
 from airl_mav.envs.saved_state import (
     State,
-    join_states,
+    Stateful,
     pack,
     pack_generators,
     saved_array,
@@ -40,7 +40,7 @@ UNBOUNDED = 1e6
 """Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
 
 
-class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
+class NavigationVectorEnv(Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
     """N flights that reset in the step in which they end (Gymnasium's SAME_STEP).
 
     `info` is what Gymnasium's SyncVectorEnv makes of n `NavigationEnv`: `seed`, `zone`,
@@ -160,8 +160,11 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
     def _open_zone(self) -> int | None:
         return open_zone(self._zone, self.curriculum)
 
+    def _held(self) -> Mapping[str, Any]:
+        return {"flights": self.navigation}
+
     def get_state(self) -> State:
-        """Return the whole state as arrays for a checkpoint."""
+        """Return the whole state, as copies."""
         curriculum = None if self.curriculum is None else self.curriculum.state()
         own = {
             "spec": pack(self.environment.model_dump(mode="json")),
@@ -170,7 +173,7 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
             "curriculum": pack(curriculum),
             "generator": pack_generators([self._np_random]),
         }
-        return join_states({"env": own, "flights": self.navigation.get_state()})
+        return super().get_state() | {f"env/{key}": array for key, array in own.items()}
 
     def set_state(self, state: State) -> None:
         """Restore a saved state: the next step is as it would have been.
@@ -180,7 +183,7 @@ class NavigationVectorEnv(VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
         """
         own = state_of_part(state, "env")
         self._check_same(unpack(saved_array(own, "spec")))
-        self.navigation.set_state(state_of_part(state, "flights"))
+        super().set_state(state)
         self._zone = unpack(saved_array(own, "zone"))
         (self._np_random,) = unpack_generators(saved_array(own, "generator"))
         curriculum = unpack(saved_array(own, "curriculum"))
