@@ -20,13 +20,14 @@ from stable_baselines3.common.logger import configure
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.provenance import package_versions
+from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
-from airl_mav.envs.vector import FIRST_TRAINING_SEED, LAST_TRAINING_SEED, NavigationVectorEnv
+from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import Encoded
 from airl_mav.training.algorithms import make_model
