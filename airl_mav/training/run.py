@@ -30,6 +30,7 @@ from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import Encoded
+from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
@@ -88,10 +89,11 @@ def train(
         KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
     """
     config = config.model_copy(update={"environment": bounded(config.environment)})
-    folder = TrainingFolder.begin(out, config, command, resume=resume)
-    with folder.locked():
+    progress = progress or TrainingProgress()
+    with locked(out, progress.waiting):
+        folder = TrainingFolder.begin(out, config, command, resume=resume)
         best = fit(config, folder, progress, device)
-    return TrainingResult(folder, best, export_best(folder, config, name))
+        return TrainingResult(folder, best, export_best(folder, config, name))
 
 
 def fit(
