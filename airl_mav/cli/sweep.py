@@ -23,9 +23,10 @@ from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, write_document
 from airl_mav.scenario.model import Workers
 from airl_mav.sweep.config import SweepConfig, load_sweep
-from airl_mav.sweep.document import document_of, print_plan
+from airl_mav.sweep.document import document_of
 from airl_mav.sweep.run import run_sweep
 from airl_mav.sweep.summary import Computer, estimated_ms
+from airl_mav.sweep.tables import print_plan
 
 
 class SweepOptions(Workers):
