@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -116,22 +116,9 @@ class SinglePilots:
         """Return the commands; see `Pilots`."""
         chosen = np.zeros((len(flying), 3))
         for i in np.flatnonzero(flying):
-            action = limited(self._policies[int(i)].act(_one(seen, int(i))), self._max_speed_m_s)
+            action = limited(self._policies[int(i)].act(seen.rows(int(i))), self._max_speed_m_s)
             chosen[i] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
         return chosen
-
-
-def _one(seen: Observation, i: int) -> Observation:
-    """Return what vehicle i of n sees."""
-    return replace(
-        seen,
-        depth_mm=seen.depth_mm[i],
-        goal=seen.goal[i],
-        velocity=seen.velocity[i],
-        roll=float(np.asarray(seen.roll)[i]),
-        pitch=float(np.asarray(seen.pitch)[i]),
-        yaw=float(np.asarray(seen.yaw)[i]),
-    )
 
 
 class _EncodedPilots:
