@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -221,3 +221,9 @@ def fly_seeds(
 def success_rate(flown: Sequence[EpisodeResult]) -> float:
     """Return the share of the episodes that reached the goal."""
     return sum(each.verdict == Verdict.SUCCESS for each in flown) / len(flown)
+
+
+def mean_of_successes(flown: Iterable[EpisodeResult], quality: str) -> float | None:
+    """Return the mean of a field over the episodes that reached the goal; None without one."""
+    good = [getattr(each, quality) for each in flown if each.verdict == Verdict.SUCCESS]
+    return float(np.mean(good)) if good else None

@@ -8,10 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.decisions import (
     Decisions,
     action_space,
@@ -22,7 +19,7 @@ from airl_mav.envs.decisions import (
 )
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
-from airl_mav.envs.rendering import EpisodeRenderer, Snapshot, Window
+from airl_mav.envs.rendering import EpisodeRenderer, Window
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.layouts import DEPTH, Encoded
 
@@ -87,8 +84,6 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         episode = draw_seeds(self.np_random, 1)[0] if seed is None else seed
         flights = self._begin([0], [episode])
         self._trail = []
-        if self._renderer is not None:
-            self._renderer.begin(self._arena())
         return self._observe(), self._info(flights)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
@@ -125,29 +120,6 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         return {key: value[0].item() for key, value in self._quality(now).items()}
 
     def _frame(self) -> NDArray[np.uint8]:
-        now, truth = self.navigation.flights(), self.navigation.truth()
         if self._renderer is None:
-            spec = self.environment
-            self._renderer = EpisodeRenderer(
-                spec.episode.goal_radius_m, (spec.image_height_px, spec.image_width_px)
-            )
-            self._renderer.begin(self._arena())
-        return self._renderer.draw(
-            Snapshot(
-                time_us=round(now.time_s[0] * US_PER_S),
-                position=truth.position[0],
-                yaw=float(quat_yaw(truth.quaternion[0])),
-                speed_m_s=float(now.speed_m_s[0]),
-                goal_distance_m=float(now.goal_distance_m[0]),
-                energy_j=float(now.energy_j[0]),
-                trail=self._trail,
-                depth=self._depth,
-                outcome=Verdict(int(now.verdict[0])).name.lower(),
-            )
-        )
-
-    def _arena(self) -> Arena:
-        arena = self.navigation.arenas[0]
-        if arena is None:
-            raise gym.error.ResetNeeded("render() before reset()")
-        return arena
+            self._renderer = EpisodeRenderer(self.navigation)
+        return self._renderer.draw(self._trail, self._depth)

@@ -16,7 +16,7 @@ from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import Trained, Trial, TrialResult, result_of, size_of, training_of
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import export_best, fit, nominal
-from airl_mav.training.store import TrainingFolder
+from airl_mav.training.store import TrainingFolder, TrainingProgress
 
 
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
@@ -38,7 +38,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
         # Looked at under the lock: whoever had it may have ended the trial.
         if (done := folder.result(trial)) is not None:
             return done
-        best = fit(config, training, None, device)
+        best = fit(config, training, TrainingProgress(), device)
         export_best(training, config, trial.name)
         seeds = folder.config.evaluation
         flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))
