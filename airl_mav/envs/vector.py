@@ -91,9 +91,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             seed: One number seeds the generator that all episodes' seeds are drawn from. A list
                 gives the first episodes' own seeds, as in `NavigationEnv.reset(seed)`; None in it
                 draws one.
-            options: `zone`: curriculum zone that bounds the goals, of the episodes that follow too,
-                until a reset with a seed or options; left out: that of the curriculum, or the
-                whole arena.
+            options: `zone`, as in `NavigationEnv.reset`.
 
         Raises:
             UsageError: A wrong option, or not n seeds.

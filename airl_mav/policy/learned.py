@@ -82,17 +82,11 @@ class LearnedPolicy:
     def act_batch(
         self, encoded: Mapping[str, NDArray[Any]], rng: np.random.Generator | None = None
     ) -> NDArray[Any]:
-        """Return the actions of n vehicles, as `action_sets.commands` takes them.
+        """Return the actions of n vehicles, as `action_sets.commands` takes them; see `decide`.
 
         Args:
             encoded: The arrays of the card's layout, each with n rows.
             rng: Source of random actions in this call; None: the policy's own.
-
-        Returns:
-            (n,) int64 of a discrete set, (n, 2) float32 of the continuous one.
-
-        Raises:
-            ValueError: The network gives no number.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)

@@ -75,18 +75,14 @@ def inspect_network(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tupl
 def export_network(
     module: nn.Module, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
 ) -> PolicyCard:
-    """Write a network as `policy.onnx` with its card, and return the card.
+    """Write a network as `export.export_sb3` does a model, and return its card.
+
+    The network takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; it returns a
+    score for each discrete action (n, k), or the continuous action (n, 2). Scaling the image is its
+    own business.
 
     Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
     without a card, or an old card that refuses the new policy: never a card for the wrong one.
-
-    Args:
-        module: Takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; returns a
-            score for each discrete action (n, k), or the continuous action (n, 2). Scaling the
-            image is its own business.
-        facts: What the card says beyond the network.
-        folder: Where to write; made if need be.
-        with_torch: Also write the network as a torch program.
 
     Raises:
         UsageError: The network does not fit the facts, cannot be exported, or the export differs.

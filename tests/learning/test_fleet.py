@@ -125,7 +125,8 @@ def test_flies_like_the_pybullet_plant(seed: int) -> None:
 
 def test_battery_runs_empty_when_the_plant_s_does() -> None:
     fleet, arenas, pilot = new_fleet(1), batch_of([OPEN]), PlantPilot(60.0, battery=0.02)
-    hover(fleet, 0, 60.0, VEHICLE, battery=0.02)
+    hover(fleet, 0, 60.0, VEHICLE)
+    fleet.battery[0] = 0.02
     setpoint = np.array([4.0, 0.0, 0.0, 0.3])
     command(fleet, 0, setpoint)
     fly(fleet, arenas, 10_000)
@@ -161,7 +162,8 @@ def test_verdicts_are_the_referee_s_to_the_tick() -> None:
         speed = rng.uniform(1.0, 5.0)
         setpoint = np.array([speed * north, speed * east, rng.uniform(-0.2, 0.2), 0.0])
         for each in (fleet, free):
-            hover(each, i, 2.5, VEHICLE, battery=battery)
+            hover(each, i, 2.5, VEHICLE)
+            each.battery[i] = battery
             command(each, i, setpoint)
         referee = Referee(Task(tuple(world.goal), rules.goal_radius, rules.time_limit_us / 1e6))
         referee.start_navigation(0)
@@ -207,7 +209,8 @@ def test_goal_comes_before_a_collision_in_the_same_tick() -> None:
     goal = dataclasses.replace(OPEN, goal=np.array([0.0, 0.0]))
     fleet = new_fleet(2)
     hover(fleet, 0, 0.01, VEHICLE)
-    hover(fleet, 1, 0.01, VEHICLE, battery=1e-12)
+    hover(fleet, 1, 0.01, VEHICLE)
+    fleet.battery[1] = 1e-12
     fly(fleet, batch_of([goal, dataclasses.replace(OPEN, goal=np.array([50.0, 0.0]))]), 1,
         Rules(3.0, TICK_US))  # fmt: skip
     assert list(fleet.verdict) == [Verdict.SUCCESS, Verdict.COLLISION]
