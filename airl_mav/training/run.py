@@ -174,7 +174,6 @@ class _BetweenRollouts(BaseCallback):
     def _save(self) -> None:
         self._saved = self.model.num_timesteps
         save_checkpoint(self._folder.checkpoints, self.model, self._meta())
-        self._progress.checkpointed(self._saved)
 
     # --- SB3's hooks
 

@@ -83,9 +83,6 @@ class TrainingProgress:
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
         """Called after an evaluation; `best`: better than all before it."""
 
-    def checkpointed(self, steps: int) -> None:
-        """Called when a checkpoint is on the disk."""
-
 
 class TrainingFolder:
     """A training run on disk; it can be read and resumed after a kill at any moment."""
