@@ -24,7 +24,7 @@ help:  ## Show the targets
 define install
 	@test -n "$(INTERPRETER)" || { PYTHON='$(PYTHON)' scripts/find-python --explain; exit 1; }
 	@test -x $(BIN)/python || $(INTERPRETER) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile \
 	    --constraint constraints.txt --editable '.[$(1)]'
 	@touch $@
 endef

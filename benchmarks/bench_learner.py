@@ -22,7 +22,6 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.training.algorithms import BATCH, make_model
 from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.networks import count_parameters
 
 SIZES = ((32, 24), (64, 48))
 NETWORKS = {"small": NetworkSpec(), "appendix": NetworkSpec(kind="appendix")}
@@ -63,7 +62,7 @@ def main() -> None:
                 model.learn(2500)
                 last = fastest(model)
                 as_plain(model.policy)
-                size = f"{count_parameters(network, height, width):,}"
+                size = f"{sum(weights.numel() for weights in model.q_net.parameters()):,}"
                 rates = (f"{fastest(model):,.0f}", f"{last:,.0f}")
                 table.add_row(name, f"{width}x{height}", size, precision, *rates)
     Console().print(table)

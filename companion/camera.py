@@ -31,14 +31,9 @@ class FrameSource(Protocol):
         ...
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen.
+        """Wait for a frame that is not the one already seen (its sequence; -1 = none).
 
-        Args:
-            newer_than_sequence: Sequence of the frame already seen; -1 = none.
-            timeout_s: Longest wait [wall s].
-
-        Returns:
-            The newest frame, or None when the time is over.
+        Returns the newest frame, or None when the time is over [wall s].
         """
         ...
 
@@ -53,15 +48,10 @@ class ZmqFrameSource:
     def __init__(
         self, endpoint: str, clock: Clock, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
-        """Connect; the publisher may start later.
+        """Connect to an endpoint such as "tcp://192.168.1.2:5560"; the publisher may start later.
 
-        Args:
-            endpoint: Where the frames are published, as "tcp://192.168.1.2:5560".
-            clock: Simulated time, for the stamps.
-            context: A ZeroMQ context to share; None = one of its own.
-
-        Raises:
-            ValueError: The endpoint is none.
+        The clock, of simulated time, is for the stamps. A ZeroMQ context may be shared; None = one
+        of its own. Raises FieldError for an unusable endpoint.
         """
         self.malformed = 0
         """Messages that were no frames."""
@@ -77,7 +67,8 @@ class ZmqFrameSource:
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
             self.close()
-            raise ValueError(f"{error}; accepted: tcp://HOST:PORT, ipc://PATH") from error
+            accepted = f"{error}; accepted: tcp://HOST:PORT, ipc://PATH"
+            raise FieldError("camera", endpoint, accepted) from None
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame so far, without waiting; None before the first."""
@@ -119,7 +110,4 @@ def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:
     # libzmq would cut the number to 16 bits without a word.
     if endpoint.startswith("tcp:") and not (port.isdecimal() and 1 <= int(port) <= GREATEST_PORT):
         raise FieldError("camera", endpoint, f"tcp://HOST:PORT, port 1..{GREATEST_PORT}")
-    try:
-        return ZmqFrameSource(endpoint, clock)
-    except ValueError as error:
-        raise FieldError("camera", endpoint, f"{error}") from None
+    return ZmqFrameSource(endpoint, clock)

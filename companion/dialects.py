@@ -7,10 +7,7 @@ altitude of a take-off travels with the command.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 from mavsdk.autopilot import Autopilot
 
@@ -29,21 +26,12 @@ class Dialect:
 
     name: str
     streams: tuple[tuple[str, float], ...]
-    """Streams to request: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
+    """Streams to request, in order: X of MAVSDK's telemetry.set_rate_X, and the rate [Hz]."""
     health: tuple[str, ...]
     """Flags of MAVSDK's health that must be set for arming and flight by position."""
     arm_timeout_s: float
     """Longest time from the beginning of a mission, with the flight controller just powered up, to
     its arming [s]."""
-
-    def requests(self, telemetry: Any) -> list[Callable[[], Any]]:
-        """Return the calls of MAVSDK's telemetry that request the streams, in order."""
-        return [partial(getattr(telemetry, f"set_rate_{name}"), hz) for name, hz in self.streams]
-
-    def ready(self, telemetry: Any) -> bool:
-        """Return whether it may be armed and then flown by position, by MAVSDK's telemetry."""
-        health = telemetry.health()
-        return all(getattr(health, flag) for flag in self.health)
 
 
 _POSITION = ("is_local_position_ok", "is_global_position_ok")

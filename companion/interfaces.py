@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from airl_mav.policy.observation import Kinematics
 
@@ -18,18 +17,13 @@ class LinkError(Exception):
     """The flight controller refused, or is gone."""
 
 
-@dataclass(frozen=True)
-class BodyVelocity:
-    """A velocity setpoint in the heading frame, with a yaw rate."""
+class BodyVelocity(NamedTuple):
+    """A velocity setpoint in the heading frame, with a yaw rate, in the order on the wire."""
 
     forward_m_s: float
     right_m_s: float
     down_m_s: float
     yaw_rate_rad_s: float
-
-    def wire(self) -> tuple[float, float, float, float]:
-        """Return the four numbers in the order in which they are sent."""
-        return self.forward_m_s, self.right_m_s, self.down_m_s, self.yaw_rate_rad_s
 
 
 STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)

@@ -7,6 +7,7 @@ this process hangs; `watchdog.py` is there for that.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
 from collections.abc import Callable
@@ -24,12 +25,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import PX4, Dialect, dialect_of
 from companion.interfaces import STOP, BodyVelocity, LinkError
-from companion.mavsdk_connection import (
-    exchange_raw_bytes,
-    first_autopilot,
-    open_connection,
-    set_timeout,
-)
+from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.1
 """Interval at which a condition is checked while waiting for it [s]."""
@@ -57,6 +53,9 @@ STREAM_RETRY_S = 0.2
 RAW_URL = "raw://"
 """Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
 
+RAW_CHUNK = 65_536
+"""Bytes passed at a time; MAVSDK's parser reassembles a divided frame."""
+
 RAW_TIMEOUT_S = 3600.0
 """MAVSDK's time-out of a command on a raw connection [wall s]. The answer is certain, but not its
 wall time: a process that was stopped must not repeat commands when it resumes."""
@@ -72,18 +71,14 @@ class MavsdkLink:
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
     ) -> None:
-        """Open a connection; `connect` waits for the vehicle.
+        """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
         Args:
-            url: MAVSDK connection, `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or
-                `raw://`.
+            url: MAVSDK connection.
             clock: For time-outs.
             abandon: Set from another thread to end any wait.
             heard: Whether the flight controller is received, where wall time cannot tell;
                 None = MAVSDK decides.
-
-        Raises:
-            UsageError: The URL is invalid or its port is taken.
         """
         self.url = url
         self._clock = clock
@@ -97,7 +92,8 @@ class MavsdkLink:
         self._action: Any = None
         self._offboard: Any = None
         self._texts: Any = None
-        self._dialect: Dialect = PX4
+        self.dialect: Dialect = PX4
+        """Dialect of the flight controller; PX4's before `connect`."""
         self._asked = False
         """The streams have been asked for since the last mission."""
 
@@ -122,14 +118,9 @@ class MavsdkLink:
 
         The flight controller may be another one by now, or have been powered up again: nothing that
         was heard before counts, and the streams are asked for anew. Right after `connect` there is
-        nothing to do.
+        nothing to do. `stop`, set from outside, breaks off the wait.
 
-        Args:
-            timeout_s: How long to wait until one is heard [wall s].
-            stop: Set from outside to break off the wait.
-
-        Raises:
-            LinkError: None is heard, or it grants no streams.
+        Raises LinkError when none is heard in time [wall s], or it grants no streams.
         """
         if self._asked:
             self._asked = False
@@ -145,12 +136,12 @@ class MavsdkLink:
         self._ask_for_streams(stop)
 
     def _ask_for_streams(self, stop: threading.Event | None) -> None:
-        self._dialect = dialect_of(self._system.autopilot_type())
+        self.dialect = dialect_of(self._system.autopilot_type())
         stopwatch = WallClock()
-        for ask in self._dialect.requests(self._telemetry):
+        for name, rate_hz in self.dialect.streams:
             while True:
                 try:
-                    ask()
+                    getattr(self._telemetry, f"set_rate_{name}")(rate_hz)
                     break
                 except TelemetryError as error:
                     if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
@@ -173,11 +164,24 @@ class MavsdkLink:
             What to feed MAVSDK with, whole frames, from one thread at a time.
         """
         self.set_timeout(RAW_TIMEOUT_S)
-        return exchange_raw_bytes(self._mavsdk, sent)
+        self._mavsdk.subscribe_raw_bytes_to_be_sent(sent)
+        # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
+        buffer = (ctypes.c_uint8 * RAW_CHUNK)()
+        handle, pass_bytes = self._mavsdk._handle, self._mavsdk._lib.mavsdk_pass_received_raw_bytes
+
+        def feed(data: bytes) -> None:
+            for start in range(0, len(data), RAW_CHUNK):
+                chunk = data[start : start + RAW_CHUNK]
+                ctypes.memmove(buffer, chunk, len(chunk))
+                pass_bytes(handle, buffer, len(chunk))
+
+        return feed
 
     def set_timeout(self, seconds: float) -> None:
         """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
-        set_timeout(self._mavsdk, seconds)
+        call = self._mavsdk._lib.mavsdk_set_timeout_s  # not wrapped by MAVSDK-Python 4.1
+        call.argtypes = [ctypes.c_void_p, ctypes.c_double]
+        call(self._mavsdk._handle, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Exchange STATUSTEXTs with the flight controller; `connect` comes first.
@@ -209,11 +213,6 @@ class MavsdkLink:
         self._texts = self._offboard = self._action = self._telemetry = None
 
     @property
-    def dialect(self) -> Dialect:
-        """Dialect of the flight controller; PX4's before `connect`."""
-        return self._dialect
-
-    @property
     def connected(self) -> bool:
         """Whether heartbeats of the flight controller arrive (MAVSDK allows gaps of 3 s)."""
         if self._system is None:
@@ -223,17 +222,13 @@ class MavsdkLink:
     @property
     def healthy(self) -> bool:
         """Whether the flight controller reports good sensors and that it may be armed."""
-        return self._dialect.ready(self._telemetry)
+        health = self._telemetry.health()
+        return all(getattr(health, flag) for flag in self.dialect.health)
 
     @property
     def armed(self) -> bool:
         """Whether the heartbeat says armed (known up to 1 s late)."""
         return bool(self._telemetry.armed())
-
-    @property
-    def flight_mode(self) -> str:
-        """Flight mode as the heartbeat says it (known up to 1 s late)."""
-        return str(self._telemetry.flight_mode().name)
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity and attitude."""
@@ -293,12 +288,11 @@ class MavsdkLink:
 
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
-        s = setpoint
         self.setpoints_sent += 1
-        yaw_rate_deg_s = math.degrees(s.yaw_rate_rad_s)
+        *velocity, yaw_rate_rad_s = setpoint
         try:
             self._offboard.set_velocity_body(
-                VelocityBodyYawspeed(s.forward_m_s, s.right_m_s, s.down_m_s, yaw_rate_deg_s)
+                VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate_rad_s))
             )
         except OffboardError as error:
             raise LinkError(f"setpoint refused: {_reason(error)}") from None

@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import UsageError
 from airl_mav.latency.samplers import LatencySampler
@@ -106,13 +105,18 @@ def fly_mission(
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
     notes = list(watchdog.notes)
-    if abandon.is_set() or lost:
-        # A lost link may be lost one way only: MAVSDK must not go on repeating the last setpoint
-        # to a vehicle that still hears it.
-        notes += _let_go(link)
-    else:
-        progress("landing")
-        notes += _come_down(link, left_offboard=watchdog.left_offboard)
+    try:
+        if abandon.is_set() or lost:
+            # A lost link may be lost one way only: MAVSDK must not go on repeating the last
+            # setpoint to a vehicle that still hears it.
+            link.leave_offboard()
+        else:
+            progress("landing")
+            if not watchdog.left_offboard:
+                link.set_velocity_body(STOP)
+            link.land(LAND_TIMEOUT_S)
+    except LinkError as error:
+        notes.append(str(error))
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
 
@@ -120,48 +124,16 @@ def fly_mission(
 def check_camera(policy: Policy, frames: FrameSource, stop: threading.Event) -> None:
     """Look at the camera before take-off. Raises UsageError when the policy cannot use it.
 
-    Args:
-        policy: What will decide.
-        frames: The camera.
-        stop: Set from outside to stop waiting for a first frame.
+    Without a frame nothing is known of it, and nothing is refused. `stop`, set from outside, ends
+    the wait for a first frame.
     """
-    if isinstance(policy, CameraBound):
-        lens = first_lens(frames, stop)
-        if lens is not None and (reason := policy.refuses(lens)) is not None:
-            raise UsageError(f"--policy {policy.name}: {reason}")
-
-
-def first_lens(frames: FrameSource, stop: threading.Event) -> Intrinsics | None:
-    """Return the camera's intrinsics, for a look at them before take-off; None without a frame.
-
-    Args:
-        frames: The camera.
-        stop: Set from outside to stop waiting.
-    """
+    if not isinstance(policy, CameraBound):
+        return
     for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):
         received = frames.wait(newer_than_sequence=-1, timeout_s=FRAME_WAIT_S)
         if received is not None:
-            return received.frame.intrinsics
+            if (reason := policy.refuses(received.frame.intrinsics)) is not None:
+                raise UsageError(f"--policy {policy.name}: {reason}")
+            return
         if stop.is_set():
-            break
-    return None
-
-
-def _come_down(link: MavsdkLink, *, left_offboard: bool) -> list[str]:
-    """Stop and land; return what went wrong."""
-    try:
-        if not left_offboard:
-            link.set_velocity_body(STOP)
-        link.land(LAND_TIMEOUT_S)
-    except LinkError as error:
-        return [str(error)]
-    return []
-
-
-def _let_go(link: MavsdkLink) -> list[str]:
-    """Stop commanding; return what went wrong."""
-    try:
-        link.leave_offboard()
-    except LinkError as error:
-        return [str(error)]
-    return []
+            return

@@ -5,19 +5,19 @@ Sequential, as in the paper: while the next decision is computed, the last comma
 
 from __future__ import annotations
 
-import threading
+from dataclasses import dataclass, field
+from threading import Event
 
 import numpy as np
 
-from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import Action, Policy, limited, vertical_speed
+from airl_mav.policy.actions import Policy, limited, vertical_speed
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.scenario.model import PilotSettings
-from companion.camera import FrameSource
+from companion.camera import FrameSource, ReceivedFrame
 from companion.interfaces import BodyVelocity, Link
 from companion.watchdog import Watchdog
 
@@ -28,107 +28,76 @@ WAITING = "waiting for a frame"
 """What the pilot tells the watchdog that it is at."""
 
 
+@dataclass
 class Pilot:
     """Flies a policy to a goal."""
 
-    def __init__(
-        self,
-        link: Link,
-        frames: FrameSource,
-        policy: Policy,
-        watchdog: Watchdog,
-        clock: Clock,
-        settings: PilotSettings,
-        *,
-        latency: LatencySampler | None = None,
-    ) -> None:
-        """Put the loop together.
+    link: Link
+    frames: FrameSource
+    policy: Policy
+    watchdog: Watchdog
+    clock: Clock
+    """Simulated time."""
+    settings: PilotSettings
+    latency: LatencySampler | None = None
+    """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
+    log: DecisionLog = field(default_factory=DecisionLog, init=False)
 
-        Args:
-            link: The flight controller.
-            frames: The camera.
-            policy: What decides.
-            watchdog: Guards the setpoints.
-            clock: Simulated time.
-            settings: Hold time, goal radius, altitude, speed limit.
-            latency: Where to draw t2 from, to fly as a slower computer; None = as fast as it is.
-        """
-        self.log = DecisionLog()
-        self._link = link
-        self._frames = frames
-        self._policy = policy
-        self._watchdog = watchdog
-        self._clock = clock
-        self._settings = settings
-        self._latency = latency
-
-    def fly(self, goal: tuple[float, float], stop: threading.Event) -> str:
+    def fly(self, goal: tuple[float, float], stop: Event) -> str:
         """Decide until the goal is reached, or something ends it; return why, in words.
 
-        Args:
-            goal: North, east [m] from the start.
-            stop: Set from outside to end the flight.
-
-        Raises:
-            LinkError: The flight controller refuses setpoints.
+        The goal lies north, east [m] of the start; `stop`, set from outside, ends the flight.
+        Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
         while not stop.is_set():
-            if not self._link.connected:
+            if not self.link.connected:
                 return "link lost"
-            if self._watchdog.left_offboard:
+            if self.watchdog.left_offboard:
                 return "watchdog"
-            self._watchdog.doing(WAITING)
-            received = self._frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
+            self.watchdog.doing(WAITING)
+            received = self.frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
             if received is None:
                 continue
             sequence = received.frame.sequence
-            state = self._link.kinematics()
+            state = self.link.kinematics()
             away = np.hypot(goal[0] - state.position[0], goal[1] - state.position[1])
-            if away < self._settings.goal_radius_m:
+            if away < self.settings.goal_radius_m:
                 return "goal reached"
-            if not self._decide(received.frame, received.received_us, state, goal, stop):
+            if not self._decide(received, state, goal, stop):
                 return "watchdog"
         return "stopped"
 
     def _decide(
-        self,
-        frame: Frame,
-        decoded_us: int,
-        state: Kinematics,
-        goal: tuple[float, float],
-        stop: threading.Event,
+        self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], stop: Event
     ) -> bool:
         """Run one decision; False when the watchdog has ended the flight."""
-        clock, settings = self._clock, self._settings
-        self._watchdog.doing("inference")
+        clock, settings = self.clock, self.settings
+        self.watchdog.doing("inference")
         started_us = clock.time_us()
-        action = limited(self._policy.act(encode(frame, state, goal)), settings.max_speed_m_s)
-        if self._latency is not None:
+        action = limited(self.policy.act(encode(seen.frame, state, goal)), settings.max_speed_m_s)
+        if self.latency is not None:
             # Not to be interrupted: a computation is not.
-            clock.sleep_until(started_us + self._latency.sample_us())
+            clock.sleep_until(started_us + self.latency.sample_us())
         ready_us = clock.time_us()
-        setpoint = self._setpoint(action, self._link.kinematics())
+        # The vertical speed holds the altitude.
+        down = vertical_speed(settings.altitude_m, float(self.link.kinematics().position[2]))
+        setpoint = BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
         hold_us = int(settings.hold_s * US_PER_S)
         sent_us = clock.time_us()
         if stop.is_set():
             return True
-        if not self._watchdog.command(setpoint, hold_us):
+        if not self.watchdog.command(setpoint, hold_us):
             return False
-        self._watchdog.doing("holding an action")
+        self.watchdog.doing("holding an action")
         clock.sleep_until(sent_us + hold_us, stop)
         self.log.record(
-            frame.capture_time_us,
-            decoded_us,
+            seen.frame.capture_time_us,
+            seen.received_us,
             started_us,
             ready_us,
             sent_us,
             clock.time_us(),
-            setpoint.wire(),
+            setpoint,
         )
         return True
-
-    def _setpoint(self, action: Action, state: Kinematics) -> BodyVelocity:
-        """Add the vertical speed that holds the altitude."""
-        down = vertical_speed(self._settings.altitude_m, float(state.position[2]))
-        return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)

@@ -52,12 +52,9 @@ class TimesyncLink(MavsdkLink):
         super().close()
 
     def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
-        """Send requests, and wait for the answers; `connect` comes first.
+        """Send so many requests, one per interval [s], and wait for the answers.
 
-        Args:
-            count: Number of requests.
-            interval_s: Time from one request to the next [s].
-            stop: Set from outside to end early.
+        `connect` comes first; `stop`, set from outside, ends it early.
         """
         asked_us = self._clock.time_us()
         for _ in range(count):

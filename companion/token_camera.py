@@ -6,6 +6,8 @@ by its turn, which names the newest one that has reached it in simulated time.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from companion.camera import FrameSource, ReceivedFrame
@@ -14,34 +16,35 @@ from companion.token_clock import TokenTurns
 from companion.tokens import NO_FRAME
 
 
+@dataclass
 class TokenFrameSource:
     """Returns the frame that the turn names. Implements `camera.FrameSource`."""
 
-    def __init__(self, frames: FrameSource, turns: TokenTurns, clock: Clock) -> None:
-        """Take the source of the frames, the turns that name them, and the companion's clock."""
-        self._frames = frames
-        self._turns = turns
-        self._clock = clock
-        self._newest: ReceivedFrame | None = None
+    frames: FrameSource
+    turns: TokenTurns
+    """What names them."""
+    clock: Clock
+    """The companion's."""
+    newest: ReceivedFrame | None = field(default=None, init=False)
 
     def latest(self) -> ReceivedFrame | None:
         """Return the frame that the turn names; None before the first.
 
         Raises Abandoned when it does not come.
         """
-        wanted = self._turns.frame
+        wanted = self.turns.frame
         if wanted == NO_FRAME:
             return None
-        if self._newest is None or self._newest.frame.sequence != wanted:
-            self._newest = self._await(wanted)
-        return self._newest
+        if self.newest is None or self.newest.frame.sequence != wanted:
+            self.newest = self._await(wanted)
+        return self.newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
         """Wait for a frame that is not the one already seen; see `camera.FrameSource`.
 
         Here the time-out counts in simulated time.
         """
-        clock, arrived = self._clock, self._turns.frame_arrived
+        clock, arrived = self.clock, self.turns.frame_arrived
         deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
         while True:
             newest = self.latest()
@@ -54,12 +57,12 @@ class TokenFrameSource:
 
     def _await(self, wanted: int) -> ReceivedFrame:
         """Wait for a frame that is on its way through the operating system."""
-        received, patience_s = self._frames.latest(), self._turns.patience_s
+        received, patience_s = self.frames.latest(), self.turns.patience_s
         waited_s = 0
         while received is None or received.frame.sequence != wanted:
             # It is sent again until the turn has been given back.
             seen = NO_FRAME if received is None else received.frame.sequence
-            newer = self._frames.wait(newer_than_sequence=seen, timeout_s=1.0)
+            newer = self.frames.wait(newer_than_sequence=seen, timeout_s=1.0)
             if newer is None:
                 waited_s += 1
                 if waited_s >= patience_s:

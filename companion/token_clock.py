@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
-from airl_mav.core.clock import Clock, SimClock
+from airl_mav.core.clock import SimClock
 from companion.conducted import Abandoned
 from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
 
@@ -44,24 +44,19 @@ class TokenTurns:
                 while this process runs].
         """
         self.patience_s = patience_s
-        """Longest wait for anything."""
         self.frame = NO_FRAME
         """Sequence of the newest frame that has reached the companion by now."""
         self.frame_arrived = threading.Event()
         """Set when there is a newer one; whoever waits for it clears it first."""
         self._stop, self._abandon = stop, abandon
-        self._clock = SimClock()
+        self.clock = SimClock()
+        """Simulated time: it moves with the turns."""
         self._inbox: SimpleQueue[TurnGiven] = SimpleQueue()
         self._link: TextLink | None = None
         self._send: Callable[[str], None] = lambda _: None
         self._number = 0
         self._sent: list[str] = []
         """All texts of this turn, to be sent again should they be lost."""
-
-    @property
-    def clock(self) -> Clock:
-        """Simulated time: it moves with the turns."""
-        return self._clock
 
     @contextmanager
     def taken(self, link: TextLink) -> Iterator[None]:
@@ -162,7 +157,7 @@ class TokenTurns:
             raise Abandoned("the flight controller has ended the flight")
         self._number = given.number
         self._sent.clear()
-        self._clock.sleep_until(given.time_us)
+        self.clock.sleep_until(given.time_us)
         if given.order == "abandon":
             self._abandon.set()
         if given.order:

@@ -52,11 +52,9 @@ class Watchdog:
         self._activity = activity
 
     def command(self, setpoint: BodyVelocity, hold_us: int) -> bool:
-        """Send a decided setpoint; False when offboard has been left and it is too late.
+        """Send a decided setpoint, meant to hold for so long [µs].
 
-        Args:
-            setpoint: What to fly.
-            hold_us: How long the action is meant to hold [µs].
+        False when offboard has been left and it is too late.
         """
         with self._lock:
             if self.left_offboard:

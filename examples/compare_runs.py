@@ -4,9 +4,9 @@ from airl_mav import Scenario, rehearse
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.scenario.model import WindSettings
 
-calm = rehearse(Scenario(level="lockstep", episodes=5), out="runs/calm")
+calm = rehearse(Scenario(level="lockstep", episodes=4), out="runs/calm")
 windy = rehearse(
-    Scenario(level="lockstep", episodes=5, wind=WindSettings(east_m_s=4.0, gust_m_s=1.5)),
+    Scenario(level="lockstep", episodes=4, wind=WindSettings(east_m_s=4.0, gust_m_s=1.5)),
     out="runs/windy",
 )
 

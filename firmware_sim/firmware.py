@@ -102,6 +102,7 @@ class BuiltinFlightStack:
         self.filenos = server.filenos
         self.receive = server.receive
         self.send = server.send
+        self.log_to = server.log_to
         self.counters = server.counters
         self.close = server.close
 
@@ -115,10 +116,6 @@ class BuiltinFlightStack:
         del tick
         if self._autopilot is not None:
             self._server.attach(self._autopilot)
-
-    def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write the onboard link to a tlog from now on; None ends it."""
-        self._server.log_to(tlog)
 
 
 @dataclass(frozen=True)
@@ -143,11 +140,8 @@ class Firmware:
     ) -> None:
         """Put it together; there is no episode yet.
 
-        Args:
-            flight_stack: The flight controller and its MAVLink.
-            camera: Where frames go; None = no camera.
-            pacing: How simulated time passes.
-            recording: Whether episodes are recorded, to be saved; without, they may last for ever.
+        `camera` is where frames go; None = no camera. Without `recording`, episodes cannot be
+        saved, and may last for ever.
         """
         self.flight_stack = flight_stack
         self.clock = pacing.clock

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.interfaces import Autopilot, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 if TYPE_CHECKING:  # Checking the options of external firmware must not load an estimator.
-    from firmware_sim.autopilot.autopilot_state import Message, Setpoint
+    from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+    from firmware_sim.autopilot.autopilot_state import Message
     from firmware_sim.autopilot.commander import Flight
-    from firmware_sim.autopilot.estimator import Estimator
 
 
 class FirmwareLostError(Exception):
@@ -22,27 +22,10 @@ class FirmwareMissingError(UsageError):
     """External firmware cannot be started, or never connected."""
 
 
-class Internals(Protocol):
-    """What the recorder reads of a flight controller that shows its internals."""
+class FlightController(Protocol):
+    """Takes a tick's sensors, returns motor commands, and tells a rehearsal what it must know.
 
-    on_setpoint: Callable[[Setpoint, int], None] | None
-    """Called with every accepted setpoint and its time of receipt [µs], if set."""
-
-    @property
-    def ticks_to_motors(self) -> int:
-        """After how many more ticks the motors reflect what is demanded in the next one."""
-        ...
-
-    @property
-    def estimator(self) -> Estimator:
-        """Its estimator."""
-        ...
-
-
-class FlightController(Autopilot, Protocol):
-    """An autopilot, and what a rehearsal must know of it; a new one for each episode.
-
-    `step` of external firmware may raise `FirmwareLostError`.
+    The built-in autopilot, or a bridge to real firmware; a new one for each episode.
     """
 
     on_message: Callable[[Message], None] | None
@@ -59,8 +42,15 @@ class FlightController(Autopilot, Protocol):
         ...
 
     @property
-    def internals(self) -> Internals | None:
-        """Its internals; None for external firmware, which does not show them."""
+    def internals(self) -> BuiltinAutopilot | None:
+        """What the recorder reads; None for external firmware, which does not show it."""
+        ...
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Advance to the sample's time and return the motor commands to hold until the next.
+
+        Raises FirmwareLostError where it is external firmware.
+        """
         ...
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:

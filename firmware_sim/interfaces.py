@@ -9,14 +9,9 @@ hundred times real time.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from airl_mav.core.frames import Geodetic
-
-Vector = NDArray[np.float64]
+from airl_mav.core.frames import Geodetic, Vector
 
 
 class GpsFix(NamedTuple):
@@ -76,11 +71,3 @@ class Truth(NamedTuple):
     angular_velocity: Vector  # (3,) FRD [rad/s]
     power_w: float
     battery_remaining: float
-
-
-class Autopilot(Protocol):
-    """A flight controller: the built-in one, or a bridge to real firmware."""
-
-    def step(self, sample: SensorSample) -> ActuatorControls:
-        """Advance to the sample's time and return the motor commands to hold until the next."""
-        ...

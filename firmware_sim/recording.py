@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.flight.trajectory import TrajectoryRecorder
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Estimate, Setpoint
-from firmware_sim.flight_controller import Internals
 from firmware_sim.plant.kinematics import POSE
 from firmware_sim.plant.plant import Plant
 
@@ -67,7 +67,7 @@ class FlightRecorder:
     It grows by some 100 kB per simulated second, so a flight that nobody reads has none.
     """
 
-    def __init__(self, internals: Internals | None) -> None:
+    def __init__(self, internals: BuiltinAutopilot | None) -> None:
         """Start empty; `internals` are those of the flight controller, None = nothing."""
         self.setpoints = SetpointLog()
         """Stays empty where nobody can look into the flight controller."""
@@ -85,12 +85,9 @@ class FlightRecorder:
         self._slips: list[tuple[int, int]] = []
 
     def began_tick(self, due_us: int, began_us: int, slipped_us: int) -> None:
-        """Note a tick that is paced by the wall clock.
+        """Note a tick that is paced by the wall clock: when it was due, and when it began [µs].
 
-        Args:
-            due_us: When it was due [µs].
-            began_us: When it began [µs].
-            slipped_us: Simulated time that was given up right before it [µs].
+        Simulated time `slipped_us` [µs] was given up right before it.
         """
         self._lateness_us.append(began_us - due_us)
         if slipped_us:

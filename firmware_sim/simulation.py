@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,7 +15,6 @@ from airl_mav.core.clock import Clock
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.filters import filter_named
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import SensorSample, Truth
@@ -24,9 +22,6 @@ from firmware_sim.plant.camera_server import DepthCamera
 from firmware_sim.plant.kinematics import POSITION, QUATERNION
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder
-
-NEVER_US = sys.maxsize
-"""Later than any simulated time [µs]."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +40,12 @@ class EpisodeSetup:
 def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
     """Boot the built-in autopilot. Raises UsageError for a wrong parameter of the vehicle's."""
     parameters = Parameters(setup.vehicle.autopilot_parameters())
-    return BuiltinAutopilot(parameters, filter_named(setup.aircraft.estimator))
+    if setup.aircraft.estimator == "kernel":
+        return BuiltinAutopilot(parameters)
+    # The library's filter, equal to rounding. Imported late: it brings scipy's statistics along.
+    from firmware_sim.autopilot.filter_filterpy import FilterpyFilter
+
+    return BuiltinAutopilot(parameters, FilterpyFilter)
 
 
 class Simulation:
@@ -83,13 +83,10 @@ class Simulation:
             rate_hz=self.autopilot.rate_hz,
         )
         self.autopilot.use_truth(self.plant.truth)
-        self._arena = setup.arena
         self._camera: DepthCamera | None = None
-        self._capture_us = NEVER_US
+        """None on an endless floor."""
         if setup.arena is not None:
-            self._camera = DepthCamera.from_profile(setup.vehicle.camera, setup.arena)
-            self._camera.reset(setup.arena, start_us)
-            self._capture_us = self._camera.next_us
+            self._camera = DepthCamera(setup.vehicle.camera, setup.arena, start_us)
         self.recorder = FlightRecorder(self.autopilot.internals) if recording else None
         """None = nothing is recorded."""
         self.start_us = start_us
@@ -104,9 +101,8 @@ class Simulation:
         if self.recorder is not None:
             self.recorder.begin()
         self.plant.begin()
-        if self._camera is not None and self._arena is not None:
-            self._camera.reset(self._arena, self.start_us)
-            self._capture_us = self._camera.next_us
+        if self._camera is not None:
+            self._camera.restart(self.start_us)
 
     @property
     def truth(self) -> Truth:
@@ -129,16 +125,10 @@ class Simulation:
 
     def capture_due(self, publish: Callable[[Frame], None]) -> None:
         """Hand a depth frame to `publish` when the camera is due; an endless floor has none."""
-        if self.time_us >= self._capture_us:
-            self._capture(publish)
-
-    def _capture(self, publish: Callable[[Frame], None]) -> None:
-        camera, arena, motion = self._camera, self._arena, self.plant.motion
-        if camera is None or arena is None:
-            return
-        centers = arena.centers_at(self.time_us - self.start_us)
-        publish(camera.capture(self.time_us, motion[POSITION], motion[QUATERNION], centers))
-        self._capture_us = camera.next_us
+        camera = self._camera
+        if camera is not None and self.time_us >= camera.next_us:
+            motion = self.plant.motion
+            publish(camera.capture(self.time_us, motion[POSITION], motion[QUATERNION]))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""

@@ -16,16 +16,10 @@ def fly(
     duration_s: float | None,
     say: Callable[[str], None],
 ) -> None:
-    """Fly until told to stop, or for a duration of simulated time; say how it went.
+    """Fly until told to stop, or for a duration of simulated time [s]; say how it went.
 
-    Args:
-        firmware: With an episode.
-        stop: Set from outside to end it.
-        duration_s: Simulated time after which it ends [s]; None: never by itself.
-        say: Is told how it went, a line at a time.
-
-    Raises:
-        FirmwareLostError: Real firmware is gone.
+    Without a duration it never ends by itself; `say` takes a line at a time. Raises
+    FirmwareLostError when real firmware is gone.
     """
     start_us, stopwatch = firmware.clock.time_us(), WallClock()
     end_us = None if duration_s is None else start_us + int(duration_s * US_PER_S)

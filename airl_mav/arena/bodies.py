@@ -36,13 +36,9 @@ class Bodies:
 def draw_bodies(
     rng: np.random.Generator, n: int, kind: StaticObstacles, altitude_m: float
 ) -> Bodies:
-    """Draw n bodies, the widest first: big ones are harder to place later.
+    """Draw n bodies of a kind, the widest first: big ones are harder to place later.
 
-    Args:
-        rng: Source of the draws.
-        n: How many.
-        kind: Shapes and size ranges.
-        altitude_m: Height above the floor that every sphere crosses [m].
+    Every sphere crosses the height `altitude_m` above the floor [m].
     """
     allowed = np.array([Shape[name.upper()] for name in kind.shapes], np.int8)
     shape = allowed[rng.integers(len(allowed), size=n)]

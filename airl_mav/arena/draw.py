@@ -6,6 +6,7 @@ flew through it at 2.5 or above. Every kind of thing has one labelled artist, fo
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import replace_file
 
 FLOOR_COLOUR = "#f8f7f4"
 GRID_COLOUR = "#e4e1da"
@@ -59,14 +62,8 @@ def draw_arena(
     _draw_floor(arena, ax)
     _draw_zones(arena, ax, zone_radii_m)
     for tour in arena.tours:
-        ax.plot(
-            tour.points[:, 1],
-            tour.points[:, 0],
-            color=MOVING_COLOURS[0],
-            lw=0.7,
-            alpha=0.45,
-            zorder=1,
-        )
+        north, east = tour.points.T
+        ax.plot(east, north, color=MOVING_COLOURS[0], lw=0.7, alpha=0.45, zorder=1)
     _draw_obstacles(arena, ax, time_us)
     for i, tour in enumerate(arena.tours, start=arena.n_static):
         _draw_arrow(ax, arena.centers_at(time_us)[i], tour, time_us)
@@ -113,14 +110,11 @@ def save_png(
 
 
 def write_png(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a figure under a temporary name beside `path`, then rename: never half a picture."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        FigureCanvasAgg(figure)
-        figure.savefig(part, format="png", dpi=dpi)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    """Write a figure: never half a picture."""
+    picture = io.BytesIO()
+    FigureCanvasAgg(figure)
+    figure.savefig(picture, format="png", dpi=dpi)
+    replace_file(path, picture.getvalue())
 
 
 def _draw_floor(arena: Arena, ax: Axes) -> None:
@@ -129,38 +123,16 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
     length, width = b.north_max - b.north_min, b.east_max - b.east_min
     thick = WALL_SHARE * max(length, width)
     colour = tuple(channel / 255.0 for channel in arena.wall_colour)
-    ax.add_patch(
-        Rectangle(
-            (b.east_min - thick, b.north_min - thick),
-            width + 2.0 * thick,
-            length + 2.0 * thick,
-            facecolor=colour,
-            zorder=0.1,
-        )
-    )
-    ax.add_patch(
-        Rectangle((b.east_min, b.north_min), width, length, facecolor=FLOOR_COLOUR, zorder=0.2)
-    )
+    outer = (b.east_min - thick, b.north_min - thick), width + 2.0 * thick, length + 2.0 * thick
+    ax.add_patch(Rectangle(*outer, facecolor=colour, zorder=0.1))
+    ax.add_patch(Rectangle(*_floor(arena), facecolor=FLOOR_COLOUR, zorder=0.2))
     step = _round_step(max(length, width) / 6.0)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MultipleLocator(step))
     first_north, first_east = math.ceil(b.north_min / step), math.ceil(b.east_min / step)
-    ax.hlines(
-        np.arange(first_north * step, b.north_max, step),
-        b.east_min,
-        b.east_max,
-        color=GRID_COLOUR,
-        lw=0.6,
-        zorder=0.3,
-    )
-    ax.vlines(
-        np.arange(first_east * step, b.east_max, step),
-        b.north_min,
-        b.north_max,
-        color=GRID_COLOUR,
-        lw=0.6,
-        zorder=0.3,
-    )
+    grid: dict[str, Any] = {"color": GRID_COLOUR, "lw": 0.6, "zorder": 0.3}
+    ax.hlines(np.arange(first_north * step, b.north_max, step), b.east_min, b.east_max, **grid)
+    ax.vlines(np.arange(first_east * step, b.east_max, step), b.north_min, b.north_max, **grid)
     ax.set_xlim(b.east_min - 1.5 * thick, b.east_max + 1.5 * thick)
     ax.set_ylim(b.north_min - 1.5 * thick, b.north_max + 1.5 * thick)
     ax.set_aspect("equal")
@@ -171,6 +143,12 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
         spine.set_visible(False)
 
 
+def _floor(arena: Arena) -> tuple[tuple[float, float], float, float]:
+    """Return the floor as matplotlib takes a rectangle: corner (east, north), width, height."""
+    b = arena.bounds
+    return (b.east_min, b.north_min), b.east_max - b.east_min, b.north_max - b.north_min
+
+
 def _round_step(target: float) -> float:
     """Return the first of 1, 2, 5, 10, 20, ... that is not below `target`."""
     power = 10.0 ** math.floor(math.log10(target))
@@ -179,13 +157,7 @@ def _round_step(target: float) -> float:
 
 def _draw_zones(arena: Arena, ax: Axes, radii_m: Sequence[float]) -> None:
     """Draw zone limits, cut off at the walls, each with its name as near to due north as fits."""
-    b = arena.bounds
-    floor = Rectangle(
-        (b.east_min, b.north_min),
-        b.east_max - b.east_min,
-        b.north_max - b.north_min,
-        transform=ax.transData,
-    )
+    floor = Rectangle(*_floor(arena), transform=ax.transData)
     for k, radius in enumerate(radii_m):
         ring = Circle(
             (0.0, 0.0), radius, fill=False, edgecolor=ZONE_COLOUR, lw=0.9, ls=(0, (5, 4)), zorder=1
@@ -233,17 +205,8 @@ def _draw_obstacles(arena: Arena, ax: Axes, time_us: int) -> None:
         ax.add_patch(patch)
         if arena.obstacles.shape[i] == Shape.SPHERE:
             radius = 0.62 * arena.obstacles.half_size[i, 0]
-            ax.add_patch(
-                Circle(
-                    (centers[i, 1], centers[i, 0]),
-                    radius,
-                    fill=False,
-                    edgecolor="white",
-                    alpha=0.6,
-                    lw=0.9,
-                    zorder=2.2,
-                )
-            )
+            ring: dict[str, Any] = {"edgecolor": "white", "alpha": 0.6, "lw": 0.9, "zorder": 2.2}
+            ax.add_patch(Circle((centers[i, 1], centers[i, 0]), radius, fill=False, **ring))
 
 
 def _footprint(arena: Arena, i: int, center: NDArray[np.float64]) -> Patch:
@@ -285,22 +248,9 @@ def _draw_start_and_goal(arena: Arena, ax: Axes, goal_radius_m: float | None) ->
     """Draw the start as a wedge that points north, the goal as a star in its disc."""
     north, east = arena.goal
     if goal_radius_m is not None:
-        ax.add_patch(
-            Circle(
-                (east, north),
-                goal_radius_m,
-                facecolor=(*_rgb(GOAL_COLOUR), 0.14),
-                edgecolor=GOAL_COLOUR,
-                lw=1.0,
-                zorder=1.5,
-            )
-        )
+        disc = Circle((east, north), goal_radius_m, edgecolor=GOAL_COLOUR, lw=1.0, zorder=1.5)
+        disc.set_facecolor(to_rgba(GOAL_COLOUR, 0.14))
+        ax.add_patch(disc)
     marker: dict[str, Any] = {"ls": "none", "mec": "white", "mew": 0.8, "zorder": 3}
     ax.plot(0.0, 0.0, marker="^", ms=11, color=START_COLOUR, label="start, heading north", **marker)
     ax.plot(east, north, marker="*", ms=15, color=GOAL_COLOUR, label="goal", **marker)
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    """Return the channels, 0 to 1, of "#rrggbb"."""
-    red, green, blue = (int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5))
-    return red, green, blue

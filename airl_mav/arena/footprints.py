@@ -40,10 +40,7 @@ def join(*parts: Boxes) -> Boxes:
 def bounding_half(shape: NDArray[np.int8], half_size: Floats, yaw: Floats) -> Floats:
     """Return half extents (n, 2) [m] north and east of the footprints of n primitives.
 
-    Args:
-        shape: (n,) Shape.
-        half_size: (n, 3) as in Obstacles [m].
-        yaw: (n,) heading of a box's first axis [rad].
+    Arguments are as the fields of `Obstacles`.
     """
     cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
     along, across = half_size[:, 0], half_size[:, 1]

@@ -8,14 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from airl_mav.arena.bodies import Bodies, draw_bodies
-from airl_mav.arena.footprints import (
-    Boxes,
-    Floats,
-    bounding_boxes,
-    footprint_areas,
-    inner,
-    join,
-)
+from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, inner, join
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
 from airl_mav.arena.passage import passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, draw_place, place_all

@@ -21,14 +21,7 @@ CELLS_MAX = 250_000
 
 
 def passage_exists(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
-    """Return whether a disc of diameter `width_m` can be moved from the origin to `goal`.
-
-    Args:
-        bounds: The walls.
-        obstacles: Static obstacles.
-        goal: (2,) north, east [m].
-        width_m: Width of the vehicle [m].
-    """
+    """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m]."""
     return gaps_suffice(bounds, obstacles, goal, width_m) or raster_passage(
         bounds, obstacles, goal, width_m
     )

@@ -16,8 +16,7 @@ from airl_mav.profiles.arena import ArenaSpec
 def zone_radius_m(spec: ArenaSpec, zone: int | None) -> float:
     """Return how far [m] from the start a goal of a zone may be; None means the largest zone.
 
-    Raises:
-        UsageError: There is no such zone.
+    Raises UsageError when there is no such zone.
     """
     if zone is None:
         return spec.zones_m[-1]

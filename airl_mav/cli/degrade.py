@@ -59,14 +59,7 @@ OPTIONS = DegradeOptions
 
 
 def run(options: DegradeOptions, console: Console | None = None) -> int:
-    """Fly the latencies and show what they cost.
-
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Fly the latencies and show what they cost; exit status and errors as of `fly_and_show`."""
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     experiment = declare_degradation(scenario, options.latencies, options.policies)
     code, _ = fly_and_show(experiment, options.out, console or Console())

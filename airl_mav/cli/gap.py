@@ -31,10 +31,9 @@ class GapOptions(Flights, Lateness, Decisions, Aircraft):
     """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
 
     The policy on a workstation and on the onboard computer; a policy that was trained as late as
-    that
-    computer decides, there, in the conditions of its training, and on the workstation. Always the
-    same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against both
-    references, beside those of the paper. The same --out goes on with what was interrupted.
+    that computer decides, there, in the conditions of its training, and on the workstation. Always
+    the same seeds: gaps of success, flight time, distance and energy with 95 % intervals, against
+    both references, beside those of the paper. The same --out goes on with what was interrupted.
 
     Examples:
         airl gap
@@ -90,14 +89,7 @@ OPTIONS = GapOptions
 
 
 def run(options: GapOptions, console: Console | None = None) -> int:
-    """Measure the gap.
-
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Measure the gap; exit status and errors as of `fly_and_show`."""
     experiment = declare_gap(
         scenario_of(options),
         mitigated=options.mitigated,

@@ -21,8 +21,8 @@ class LadderOptions(Flights, Lateness, Decisions, Aircraft):
     """Fly the same policy and seeds at several levels of fidelity, and say what differs.
 
     Success, flight time, distance and energy side by side, with the differences from the first
-    level on
-    the same seeds and their 95 % intervals. The same --out goes on with what was interrupted.
+    level on the same seeds and their 95 % intervals. The same --out goes on with what was
+    interrupted.
 
     Examples:
         airl ladder static-obstacles
@@ -59,14 +59,7 @@ OPTIONS = LadderOptions
 
 
 def run(options: LadderOptions, console: Console | None = None) -> int:
-    """Fly the levels and show what differs.
-
-    Returns:
-        Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Fly the levels and show what differs; exit status and errors as of `fly_and_show`."""
     arena = options.arena or training_arena(find_policy(options.policy))
     experiment = declare_ladder(
         scenario_of(options, arena=arena), options.levels, sitl_episodes=options.sitl_episodes

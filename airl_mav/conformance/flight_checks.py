@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from airl_mav.conformance.autopilots import Reaction
-from airl_mav.conformance.checklist import CheckDefinition, CheckFailedError, require
+from airl_mav.conformance.checklist import CheckDefinition, require
 from airl_mav.conformance.ground_checks import TEXT_S, require_answer
 from airl_mav.conformance.mavlink_names import LandedState, MavCommand, MavFrame, name_of
 from airl_mav.conformance.steps import STOP_BODY, STOP_NED, Setpoint
@@ -64,8 +64,8 @@ def takeoff(vehicle: Vehicle, altitude_m: float) -> str:
         climbed = vehicle.height_m - start_m > CLIMB_SHARE * altitude_m
         return climbed and abs(vehicle.velocity_m_s[2]) < STANDING_M_S
 
-    if not vehicle.wait_for(arrived, CLIMB_S):
-        raise CheckFailedError(f"{vehicle.height_m - start_m:.1f} m after {CLIMB_S:g} s")
+    climbed = vehicle.wait_for(arrived, CLIMB_S)
+    require(climbed, f"{vehicle.height_m - start_m:.1f} m after {CLIMB_S:g} s")
     took_s = vehicle.telemetry.boot_s - start_s
     in_air = vehicle.wait_for(lambda: vehicle.landed_state == LandedState.IN_AIR, MODE_S)
     right_mode = vehicle.reaches_mode(vehicle.autopilot.after_takeoff_mode)
@@ -81,10 +81,9 @@ def start_offboard(vehicle: Vehicle, setpoint: Setpoint) -> None:
     """Enter offboard by MAVSDK. Raises CheckFailedError when the mode does not come."""
     vehicle.fly(setpoint)
     vehicle.call("offboard.start()", vehicle.offboard.start, must_succeed=True)
-    mode = vehicle.autopilot.offboard_mode
-    if not vehicle.reaches_mode(mode):
-        expected = vehicle.autopilot.mode_name(mode)
-        raise CheckFailedError(f"mode {vehicle.mode_name}, not {expected} within {MODE_S:g} s")
+    expected = vehicle.autopilot.mode_name(vehicle.autopilot.offboard_mode)
+    offboard = vehicle.reaches_mode(vehicle.autopilot.offboard_mode)
+    require(offboard, f"mode {vehicle.mode_name}, not {expected} within {MODE_S:g} s")
 
 
 # --- commands and velocities by MAVSDK
@@ -239,16 +238,14 @@ def _lose_setpoints(vehicle: Vehicle) -> str:
     wait_s = latest_s + LOSS_MARGIN_S
     if expected.text:
         text = vehicle.wait_for(lambda: telemetry.find_text(expected.text, since), wait_s)
-        if not text:
-            raise CheckFailedError(f'no "{expected.text}" in {wait_s:g} s')
+        require(text, f'no "{expected.text}" in {wait_s:g} s')
         reaction_s, how = text.boot_s - last_s, f'"{text.text}"'
     else:
         vehicle.wait(wait_s)
         motion = telemetry.recent(wait_s + 1.0).between(last_s, math.inf)
         north = motion.velocity[:, 0]
         slower = np.flatnonzero(north < BRAKING * cruise)
-        if not slower.size:
-            raise CheckFailedError(f"flies on at {north[-1]:.2f} m/s after {wait_s:g} s")
+        require(slower.size, f"flies on at {north[-1]:.2f} m/s after {wait_s:g} s")
         reaction_s, how = float(motion.position[slower[0], 0]) - last_s, "brakes"
     right_mode = vehicle.reaches_mode(expected.mode)
     finding = f"{how} {reaction_s:.2f} s after the last setpoint, {vehicle.mode_name}"
@@ -268,8 +265,8 @@ def _motion_after_loss(vehicle: Vehicle, cruise: float) -> str:
         return math.hypot(*vehicle.velocity_m_s[:2])
 
     if not vehicle.autopilot.loss.descends:
-        if not vehicle.wait_for(lambda: level_m_s() < STANDING_M_S, STOP_S):
-            raise CheckFailedError(f"still moves at {level_m_s():.2f} m/s")
+        stands = vehicle.wait_for(lambda: level_m_s() < STANDING_M_S, STOP_S)
+        require(stands, f"still moves at {level_m_s():.2f} m/s")
         return "stands"
     vehicle.wait(FLY_S)
     down = float(vehicle.telemetry.recent(1.0).velocity[:, 2].mean())
@@ -299,14 +296,12 @@ def hold(vehicle: Vehicle) -> str:
     vehicle.wait(FLY_S)
     vehicle.call("offboard.stop()", vehicle.offboard.stop, must_succeed=True)
     autopilot = vehicle.autopilot
-    if not vehicle.reaches_mode(*autopilot.hold_modes):
-        expected = " or ".join(map(autopilot.mode_name, autopilot.hold_modes))
-        raise CheckFailedError(f"mode {vehicle.mode_name}, not {expected}")
+    expected = " or ".join(map(autopilot.mode_name, autopilot.hold_modes))
+    holds = vehicle.reaches_mode(*autopilot.hold_modes)
+    require(holds, f"mode {vehicle.mode_name}, not {expected}")
     start_s = vehicle.telemetry.boot_s
-    if not vehicle.wait_for(lambda: vehicle.speed_m_s < STANDING_M_S, STOP_S):
-        raise CheckFailedError(
-            f"{vehicle.mode_name}: {vehicle.speed_m_s:.2f} m/s after {STOP_S:g} s"
-        )
+    stands = vehicle.wait_for(lambda: vehicle.speed_m_s < STANDING_M_S, STOP_S)
+    require(stands, f"{vehicle.mode_name}: {vehicle.speed_m_s:.2f} m/s after {STOP_S:g} s")
     stopped_s = vehicle.telemetry.boot_s - start_s
     vehicle.wait(FLY_S)
     places = vehicle.telemetry.recent(FLY_S).position[:, 1:4]
@@ -323,8 +318,8 @@ def _land(vehicle: Vehicle) -> str:
     vehicle.call("action.land()", vehicle.action.land, must_succeed=True)
     mode = vehicle.autopilot.land_mode
     right_mode = vehicle.reaches_mode(mode)
-    if not vehicle.wait_for(lambda: vehicle.landed_state == LandedState.ON_GROUND, longest_s):
-        raise CheckFailedError(f"not on the ground after {longest_s:.0f} s")
+    landed = vehicle.wait_for(lambda: vehicle.landed_state == LandedState.ON_GROUND, longest_s)
+    require(landed, f"not on the ground after {longest_s:.0f} s")
     phases = telemetry.landed_states[before:]
     finding = f"{_names(phases)} after {telemetry.boot_s - start_s:.1f} s"
     require(right_mode, f"{finding}; it was never in {vehicle.autopilot.mode_name(mode)}")

@@ -63,16 +63,9 @@ def heartbeat(vehicle: Vehicle) -> str:
 
 
 def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, since: int) -> str:
-    """Return an answer's finding.
+    """Return the finding of a MAV_RESULT; `since` is the number of texts before the question.
 
-    Args:
-        vehicle: Who answered.
-        result: MAV_RESULT received.
-        expected: The expected answer.
-        since: Number of texts before the question.
-
-    Raises:
-        CheckFailedError: It is not the expected one.
+    Raises CheckFailedError if it is not the expected answer.
     """
     name = name_of(MavResult, result)
     require(result == expected.result, f"{name}, not {expected.result.name}")

@@ -47,6 +47,13 @@ CUSTOM_MODE_FLAG = 1  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK: the vehicle may be armed
 
 
+def command_long(number: int, *params: float) -> dict[str, float]:
+    """Return the fields of a COMMAND_LONG; parameters that are left out are 0."""
+    padded = (*params, *[0.0] * 7)[:7]
+    numbered = {f"param{index}": value for index, value in enumerate(padded, 1)}
+    return {"command": int(number), "confirmation": 0, **numbered}
+
+
 def name_of(kind: type[IntEnum], number: int) -> str:
     """Return the name of a number, or the number itself where it has none."""
     try:

@@ -119,14 +119,9 @@ def judge(measured: MeasuredStep | None, reference: Reference) -> str:
 
 
 def load_reference(name: str, autopilot: int) -> Reference:
-    """Return a stored column: `auto`, a shipped name, or a path to a .toml.
+    """Return a stored column: `auto` (by HEARTBEAT.autopilot), a shipped name, a path to a .toml.
 
-    Args:
-        name: Which one.
-        autopilot: HEARTBEAT.autopilot of the vehicle that is heard, for `auto`.
-
-    Raises:
-        UsageError: There is none, or it cannot be used.
+    Raises UsageError if there is none, or it cannot be used.
     """
     if name != AUTO:
         return load_profile("conformance", name, Reference)

@@ -6,17 +6,8 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from functools import partial
 
+from airl_mav.conformance import flight_checks
 from airl_mav.conformance.checklist import CheckFailedError, Checklist, Line, Transcript, require
-from airl_mav.conformance.flight_checks import (
-    FACING_EAST,
-    LANDING_CHECKS,
-    LOSS_CHECKS,
-    OFFBOARD_CHECKS,
-    hold,
-    setpoint_checks,
-    start_offboard,
-    takeoff,
-)
 from airl_mav.conformance.ground_checks import GROUND_CHECKS, heartbeat
 from airl_mav.conformance.reference import AUTO, judge, load_reference, summary
 from airl_mav.conformance.result import ConformanceResult, Settings
@@ -125,28 +116,28 @@ def _check(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) ->
 def _check_in_air(vehicle: Vehicle, checklist: Checklist, result: ConformanceResult) -> None:
     """Make the checks in the air; the vehicle is armed."""
     settings = result.settings
-    checklist.perform("takeoff", lambda: takeoff(vehicle, settings.altitude_m))
+    checklist.perform("takeoff", lambda: flight_checks.takeoff(vehicle, settings.altitude_m))
     if vehicle.height_m < settings.altitude_m / 2.0:
         return
     if not settings.steps_only:
-        checklist.perform_all(OFFBOARD_CHECKS, vehicle)
+        checklist.perform_all(flight_checks.OFFBOARD_CHECKS, vehicle)
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
-        with SetpointStream(vehicle, FACING_EAST) as stream:
-            checklist.perform_all(setpoint_checks(stream), vehicle)
+        with SetpointStream(vehicle, flight_checks.FACING_EAST) as stream:
+            checklist.perform_all(flight_checks.setpoint_checks(stream), vehicle)
     if settings.steps:
         checklist.perform("step responses", lambda: _fly_steps(vehicle, settings, result.steps))
         vehicle.call("offboard.stop()", vehicle.offboard.stop)
     if not settings.steps_only:
-        if not checklist.perform_all(LOSS_CHECKS, vehicle):
+        if not checklist.perform_all(flight_checks.LOSS_CHECKS, vehicle):
             checklist.skip("setpoints resume", "not reached")
-        checklist.perform("hold", lambda: hold(vehicle))
-    checklist.perform_all(LANDING_CHECKS, vehicle)
+        checklist.perform("hold", lambda: flight_checks.hold(vehicle))
+    checklist.perform_all(flight_checks.LANDING_CHECKS, vehicle)
 
 
 def _fly_steps(vehicle: Vehicle, settings: Settings, measured: dict[StepName, MeasuredStep]) -> str:
     """Fly the steps; responses are added as they come. Raises CheckFailedError, LinkError."""
     steps = {leg.step.name: leg.step for legs in MANOEUVRES for leg in legs if leg.step}
-    start_offboard(vehicle, STOP_NED)
+    flight_checks.start_offboard(vehicle, STOP_NED)
     vehicle.wait(FACE_NORTH_S)
     inexact = vehicle.clock.inexact
     for repetition in range(settings.repeat):

@@ -7,7 +7,6 @@ the stored columns were measured. So each time is late by up to one sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -55,11 +54,6 @@ class Setpoint(NamedTuple):
     down: float = 0.0
     yaw_or_yawspeed: float = 0.0
 
-    def mirrored(self) -> Setpoint:
-        """Return the opposite motion; up stays up."""
-        frame, first, second, down, yaw = self
-        return Setpoint(frame, 0.0 - first, 0.0 - second, down, 0.0 - yaw)
-
 
 Quantity = Literal["north", "east", "down", "forward", "heading", "heading rate"]
 
@@ -82,6 +76,18 @@ class Step(NamedTuple):
     def title(self) -> str:
         """For example "north 0 -> 2 m/s"."""
         return f"{self.quantity} {self.before:g} -> {self.after:g} {self.unit}"
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """The new setpoint."""
+        return {
+            "north": Setpoint("ned", self.after),
+            "east": Setpoint("ned", 0.0, self.after),
+            "down": Setpoint("ned", 0.0, 0.0, self.after),
+            "heading": Setpoint("ned", 0.0, 0.0, 0.0, self.after),
+            "forward": Setpoint("body", self.after),
+            "heading rate": Setpoint("body", 0.0, 0.0, 0.0, self.after),
+        }[self.quantity]
 
     def mirrored(self) -> Step:
         """Return the opposite step; up stays up."""
@@ -166,15 +172,6 @@ def step_response(
     )
 
 
-def median_response(responses: Sequence[StepResponse]) -> StepResponse:
-    """Return the median of several flights of one step, figure by figure.
-
-    Not their mean: now and then noise of the estimate alone makes a movement, long before the step
-    does. NaN where one did not get there.
-    """
-    return StepResponse(*np.median(np.array(responses), axis=0).tolist())
-
-
 class MeasuredStep(NamedTuple):
     """A step and its responses, one per repetition."""
 
@@ -183,8 +180,12 @@ class MeasuredStep(NamedTuple):
 
     @property
     def median(self) -> StepResponse:
-        """Median over the repetitions."""
-        return median_response(self.flights)
+        """Median over the repetitions, figure by figure; NaN where one did not get there.
+
+        Not their mean: now and then noise of the estimate alone makes a movement, long before the
+        step does.
+        """
+        return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
 
 STOP_NED = Setpoint("ned")
@@ -194,15 +195,8 @@ STOP_BODY = Setpoint("body")
 
 def _leg(seconds: float, name: StepName, quantity: Quantity, before: float, after: float) -> Leg:
     """Return the leg of a step."""
-    setpoint = {
-        "north": Setpoint("ned", after),
-        "east": Setpoint("ned", 0.0, after),
-        "down": Setpoint("ned", 0.0, 0.0, after),
-        "heading": Setpoint("ned", 0.0, 0.0, 0.0, after),
-        "forward": Setpoint("body", after),
-        "heading rate": Setpoint("body", 0.0, 0.0, 0.0, after),
-    }[quantity]
-    return Leg(setpoint, seconds, Step(name, quantity, before, after))
+    step = Step(name, quantity, before, after)
+    return Leg(step.setpoint, seconds, step)
 
 
 # Long enough to settle by PX4's and ArduPilot's measured settling times, with a second to spare.
@@ -240,45 +234,33 @@ def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
         if not any(leg.step is not None and leg.step.name in names for leg in manoeuvre):
             continue
         for setpoint, seconds, step in manoeuvre:
-            measured = step if step is not None and step.name in names else None
-            leg = Leg(setpoint, seconds, measured)
-            if mirrored:
-                leg = Leg(setpoint.mirrored(), seconds, measured and measured.mirrored())
-            legs.append(leg)
+            # The legs between steps are stops: there is nothing to mirror.
+            flown = step.mirrored() if step is not None and mirrored else step
+            measured = flown if flown is not None and flown.name in names else None
+            legs.append(Leg(setpoint if flown is None else flown.setpoint, seconds, measured))
     return legs
 
 
 def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
-    """Return the response to a step.
+    """Return the response to a step, from the motion of `BEFORE_S` before it to its leg's end.
 
-    Args:
-        step: Which one.
-        motion: From `BEFORE_S` before it to the end of its leg.
-        sent_s: When the setpoint reached the vehicle, by its clock [s].
-
-    Raises:
-        ValueError: Telemetry is missing before or after the step.
+    `sent_s` is when the setpoint reached the vehicle, by its clock [s]. Raises ValueError if
+    telemetry is missing before or after the step.
     """
-    times_s, values = _samples(step.quantity, motion, sent_s)
-    change = VELOCITY_CHANGE if step.unit == "m/s" else ANGLE_CHANGE
-    return step_response(times_s - sent_s, values, step.before, step.after, change)
-
-
-def _samples(
-    quantity: Quantity, motion: Motion, sent_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return times [s] and values [the quantity's unit]."""
     position, heading = motion
-    if quantity == "heading":
+    velocity, times_s = motion.velocity, position[:, 0]
+    if step.quantity == "heading":
         # Around the start: a turn may cross south.
-        return heading[:, 0], np.degrees(np.unwrap(heading[:, 1]))
-    if quantity == "heading rate":
-        return heading[:, 0], np.degrees(heading[:, 2])
-    velocity = motion.velocity
-    if quantity == "forward":
+        times_s, values = heading[:, 0], np.degrees(np.unwrap(heading[:, 1]))
+    elif step.quantity == "heading rate":
+        times_s, values = heading[:, 0], np.degrees(heading[:, 2])
+    elif step.quantity == "forward":
         before = heading[heading[:, 0] <= sent_s]
         if not len(before):
             raise ValueError("no heading from before the step")
         yaw = float(wrap_pi(before[-1, 1]))
-        return position[:, 0], velocity[:, 0] * math.cos(yaw) + velocity[:, 1] * math.sin(yaw)
-    return position[:, 0], velocity[:, ("north", "east", "down").index(quantity)]
+        values = velocity[:, 0] * math.cos(yaw) + velocity[:, 1] * math.sin(yaw)
+    else:
+        values = velocity[:, ("north", "east", "down").index(step.quantity)]
+    change = VELOCITY_CHANGE if step.unit == "m/s" else ANGLE_CHANGE
+    return step_response(times_s - sent_s, values, step.before, step.after, change)

@@ -27,6 +27,7 @@ from airl_mav.conformance.mavlink_names import (
     CUSTOM_MODE_FLAG,
     MavCommand,
     MavFrame,
+    command_long,
     name_of,
 )
 from airl_mav.conformance.steps import Setpoint
@@ -89,12 +90,10 @@ class Vehicle:
             raise FieldError("connect", self.url, problem=heard)
         self._target = system.get_system_id()
         self._direct = MavlinkDirect(system)
-        for names, receive in (
-            (telemetry.MESSAGES, self.telemetry.receive),
-            (vehicle_clock.MESSAGES, self.clock.receive),
-        ):
-            for name in names:
-                self._direct.subscribe_message(name, receive)
+        for name in telemetry.MESSAGES:
+            self._direct.subscribe_message(name, self.telemetry.receive)
+        for name in vehicle_clock.MESSAGES:
+            self._direct.subscribe_message(name, self.clock.receive)
         self.action, self.offboard = Action(system), Offboard(system)
 
     def expect_autopilot(self, number: int) -> None:
@@ -140,10 +139,7 @@ class Vehicle:
         values = " ".join(f"{value:g}" for value in params)
         what = f"{name_of(MavCommand, number)} {values}".strip()
         self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
-        padded = (*params, *[0.0] * 7)[:7]
-        numbered = {f"param{index}": value for index, value in enumerate(padded, 1)}
-        command = {"command": int(number), "confirmation": 0, **numbered}
-        message = self._message("COMMAND_LONG", command)
+        message = self._message("COMMAND_LONG", command_long(number, *params))
         for left in reversed(range(COMMAND_ATTEMPTS)):
             try:
                 answer = self._direct.send_command(message)

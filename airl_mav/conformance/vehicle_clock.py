@@ -13,7 +13,7 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Any, NamedTuple
 
-from airl_mav.conformance.mavlink_names import MavCommand
+from airl_mav.conformance.mavlink_names import MavCommand, command_long
 from airl_mav.conformance.telemetry import AUTOPILOT_COMPONENT, Telemetry
 from airl_mav.core.clock import NS_PER_US, WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
@@ -83,7 +83,7 @@ class VehicleClock:
     def choose_method(self) -> Method:
         """Find the first method that the vehicle answers, and use it from now on."""
         for self.method in Method:
-            if self.method is Method.TELEMETRY or self._ask() is not None:
+            if self._ask() is not None:
                 break
         return self.method
 
@@ -91,7 +91,7 @@ class VehicleClock:
         """Return the first of a few exchanges that is short enough, else the shortest."""
         best: Exchange | None = None
         for _ in range(ATTEMPTS):
-            found = None if self.method is Method.TELEMETRY else self._ask()
+            found = self._ask()
             if found is None:
                 break
             if self.wall.time_us() - found.middle_us <= SHORT_US:
@@ -120,6 +120,8 @@ class VehicleClock:
 
     def _ask(self) -> Exchange | None:
         """Exchange once; None when there is no answer, or one by another clock."""
+        if self.method is Method.TELEMETRY:
+            return None
         newest_s = self._telemetry.boot_s
         self._answer = None
         # Set before an answer can come.
@@ -130,9 +132,8 @@ class VehicleClock:
             self._send("TIMESYNC", {"tc1": 0, "ts1": self._question})
         else:
             self._telemetry.unlogged_acks[MavCommand.REQUEST_MESSAGE] += 1
-            params = {"param1": SYSTEM_TIME_ID} | {f"param{n}": 0.0 for n in range(2, 8)}
-            command = {"command": MavCommand.REQUEST_MESSAGE.value, "confirmation": 0}
-            self._send("COMMAND_LONG", {**command, **params})
+            question = command_long(MavCommand.REQUEST_MESSAGE, SYSTEM_TIME_ID)
+            self._send("COMMAND_LONG", question)
         if not self._answered.wait(ANSWER_S) or self._answer is None:
             return None
         boot_s, received_us = self._answer

@@ -15,15 +15,6 @@ from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize,
 
 
 @kernel
-def attitude_setpoint(thrust: Vec, yaw: float) -> Quat:
-    """Return the attitude whose body -z lies along the thrust vector NED, with a heading [rad].
-
-    PX4's ControlMath::bodyzToAttitude.
-    """
-    return attitude_towards(thrust, math.cos(yaw), math.sin(yaw))
-
-
-@kernel
 def heading_of(q: Quat) -> tuple[float, float]:
     """Return cosine and sine of the heading of q."""
     north = 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3])
@@ -36,8 +27,11 @@ def heading_of(q: Quat) -> tuple[float, float]:
 
 
 @kernel
-def attitude_towards(thrust: Vec, cy: float, sy: float) -> Quat:
-    """Return `attitude_setpoint` for a heading given by its cosine and sine."""
+def attitude_setpoint(thrust: Vec, cy: float, sy: float) -> Quat:
+    """Return the attitude whose body -z lies along the thrust vector NED.
+
+    PX4's ControlMath::bodyzToAttitude; the heading is given by its cosine and sine.
+    """
     norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if norm < 1e-9:
         half = 0.5 * math.atan2(sy, cy)
@@ -87,13 +81,9 @@ def _shortest(a: Vec, b: Vec) -> Quat:
 
 @kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
-    """Return the body rates FRD [rad/s] that turn attitude q into q_sp.
+    """Return the body rates FRD [rad/s] that turn attitude q (body -> NED) into q_sp.
 
-    Args:
-        q: Attitude body -> NED.
-        q_sp: Attitude wanted.
-        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
-        gains: Attitude P gains, yaw weight, rate limits.
+    `yaw_rate_ff` is a heading rate about the world's down axis [rad/s].
     """
     down = (0.0, 0.0, 1.0)
     reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)

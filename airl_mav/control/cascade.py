@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.attitude import attitude_towards, heading_of, rate_setpoint
+from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
 from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
 from airl_mav.control.mixer import Motors, mix
@@ -84,13 +84,7 @@ def new_memory(n: int | None = None) -> Memory:
 
 
 def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
-    """Set the vertical integral to what it settles at in a hover.
-
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        command: Collective command 0..1 that the vehicle hovers at.
-        gains: Holds the hover thrust that the controller counts on.
-    """
+    """Set the vertical integral to what it settles at in a hover at a collective `command` 0..1."""
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     memory[_VEL_INT + 2] = (gains.hover_thrust - command) * GRAVITY_M_S2 / gains.hover_thrust
 
@@ -127,21 +121,6 @@ def filters(gains: Gains, dt: float) -> Filters:
 
 
 @kernel
-def cascade(
-    position: Vec,
-    velocity: Vec,
-    q: Quat,
-    omega: Vec,
-    demand: Demand,
-    memory: Memory,
-    gains: Gains,
-    dt: float,
-) -> Output:
-    """Run one tick of the cascade; updates `memory` in place. Arguments as of `cascade_tick`."""
-    return cascade_tick(position, velocity, q, omega, demand, memory, gains, filters(gains, dt), dt)
-
-
-@kernel
 def cascade_tick(
     position: Vec,
     velocity: Vec,
@@ -153,7 +132,7 @@ def cascade_tick(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Run one tick of the cascade with filters computed before; updates `memory` in place.
+    """Run one tick of the cascade; updates `memory` in place.
 
     Args:
         position: NED [m].
@@ -180,20 +159,14 @@ def cascade_tick(
     wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
     rates_sp, collective = wanted, thrust_sp
     if not first:
-        rates_sp = (memory[_RATES_SP], memory[_RATES_SP + 1], memory[_RATES_SP + 2])
+        rates_sp = _three(memory, _RATES_SP)
         collective = memory[_THRUST_ON]
     memory[_THRUST_ON] = thrust_sp
     for i in range(3):
         memory[_RATES_SP + i] = wanted[i]
     motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
-    v = _VELOCITY_SP
-    return Output(
-        motors,
-        collective,
-        _attitude_sp(memory)[0],
-        wanted,
-        (memory[v], memory[v + 1], memory[v + 2]),
-    )
+    newest_sp = _attitude_sp(memory)[0]
+    return Output(motors, collective, newest_sp, wanted, _three(memory, _VELOCITY_SP))
 
 
 @kernel
@@ -213,6 +186,11 @@ def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
         memory[_VEL_LP + i] = velocity[i]
         memory[_GYRO + i] = omega[i]
     settle_gyro_filter(memory, weights.gyro)
+
+
+@kernel
+def _three(memory: Memory, start: int) -> Vec:
+    return memory[start], memory[start + 1], memory[start + 2]
 
 
 @kernel
@@ -244,9 +222,9 @@ def _position_loop(
     velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
     thrust, integral = velocity_control(
         velocity,
-        (memory[_VEL_DOT], memory[_VEL_DOT + 1], memory[_VEL_DOT + 2]),
+        _three(memory, _VEL_DOT),
         velocity_sp,
-        (memory[_VEL_INT], memory[_VEL_INT + 1], memory[_VEL_INT + 2]),
+        _three(memory, _VEL_INT),
         gains,
         period,
     )
@@ -254,7 +232,7 @@ def _position_loop(
         cos_yaw, sin_yaw = heading_of(q)
     else:
         cos_yaw, sin_yaw = math.cos(demand.yaw), math.sin(demand.yaw)
-    q_sp = attitude_towards(thrust, cos_yaw, sin_yaw)
+    q_sp = attitude_setpoint(thrust, cos_yaw, sin_yaw)
     for i in range(3):
         memory[_VEL_INT + i] = integral[i]
         memory[_VELOCITY_SP + i] = velocity_sp[i]
@@ -283,11 +261,11 @@ def _rate_loop(
         slope = (rate - before) / dt
         memory[_DGYRO + i] += weights.angular_acceleration * (slope - memory[_DGYRO + i])
     torque, integral = rate_control(
-        (memory[_GYRO], memory[_GYRO + 1], memory[_GYRO + 2]),
-        (memory[_DGYRO], memory[_DGYRO + 1], memory[_DGYRO + 2]),
+        _three(memory, _GYRO),
+        _three(memory, _DGYRO),
         rates_sp,
-        (memory[_RATE_INT], memory[_RATE_INT + 1], memory[_RATE_INT + 2]),
-        (memory[_SAT], memory[_SAT + 1], memory[_SAT + 2]),
+        _three(memory, _RATE_INT),
+        _three(memory, _SAT),
         gains,
         dt,
     )

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from airl_mav.control.cascade import (
     Demand,
     Memory,
-    cascade,
+    cascade_tick,
+    filters,
     new_memory,
     reset_integrals,
     settle_gyro_filter,
@@ -59,14 +60,16 @@ def _fly(
     output: Row,
 ) -> Motors:
     """Run one tick of the cascade; updates `memory` and `output`, returns the motor commands."""
-    out = cascade(
+    known = unpack(gains)
+    out = cascade_tick(
         (state[0], state[1], state[2]),
         (state[3], state[4], state[5]),
         (state[6], state[7], state[8], state[9]),
         (state[10], state[11], state[12]),
         Demand(position, velocity, yaw, yaw_rate),
         memory,
-        unpack(gains),
+        known,
+        filters(known, dt),
         dt,
     )
     for i in range(4):
@@ -82,12 +85,7 @@ class Controller:
     """Gains, memory and newest output of one vehicle's cascade."""
 
     def __init__(self, gains: Gains, dt: float) -> None:
-        """Start at rest.
-
-        Args:
-            gains: Gains and limits.
-            dt: Time between two calls of `fly` [s].
-        """
+        """Start at rest; `dt` is the time between two calls of `fly` [s]."""
         self._gains = pack(gains)
         self._gyro_cutoff_hz = gains.gyro_cutoff_hz
         self._dt = dt
@@ -108,10 +106,8 @@ class Controller:
     def fly(self, state: Row, demand: Demand) -> Motors:
         """Run one tick; return the motor commands 0..1.
 
-        Args:
-            state: Begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
-                rates FRD [rad/s]: 13 floats.
-            demand: What to fly.
+        `state` begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
+        rates FRD [rad/s]: 13 floats.
         """
         position, velocity, yaw, yaw_rate = demand
         motors: Motors = _fly(

@@ -68,10 +68,7 @@ def _in_range(m: Motors) -> bool:
 def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
     """Return motor commands 0..1 and the torque that could not be delivered, per axis.
 
-    Args:
-        thrust: Collective 0..1.
-        torque: Normalised roll, pitch, yaw torque, -1..1.
-        gains: Hold how much of roll and pitch the motors get.
+    `thrust` is the collective 0..1, `torque` the normalised roll, pitch and yaw torque, -1..1.
     """
     r, p = gains.mix_roll, gains.mix_pitch
     rolling = (r * ROLL[0], r * ROLL[1], r * ROLL[2], r * ROLL[3])

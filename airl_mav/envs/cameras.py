@@ -5,7 +5,8 @@ One compiled call renders the images of all vehicles.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,7 @@ from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.draws import Stream, stream
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.randomise import noisy_depth
-from airl_mav.envs.saved_state import (
-    State,
-    pack_generators,
-    restore_array,
-    saved_array,
-    unpack_generators,
-)
+from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.spec import Randomisation
 from airl_mav.profiles.vehicle import Camera
 
@@ -48,7 +43,7 @@ def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
     return Lens(intrinsics.focal, intrinsics.cx, intrinsics.cy, range_m)
 
 
-class Cameras:
+class Cameras(Stateful):
     """Frames come at the camera's rate; their phase to the decisions is drawn from the seed."""
 
     def __init__(
@@ -89,19 +84,8 @@ class Cameras:
                 if rng is not None:
                     self.image[i] = noisy_depth(self.image[i], self._randomisation, rng)
 
-    def get_state(self) -> State:
-        """Return the frames, their phases, and where the generators of the noise stand."""
-        return {
-            "image": self.image.copy(),
-            "first_us": self._first_us.copy(),
-            "generators": pack_generators(self._rngs),
-        }
-
-    def set_state(self, state: State) -> None:
-        """Go on from a saved state. Raises UsageError when it does not fit."""
-        restore_array(self.image, state, "image")
-        restore_array(self._first_us, state, "first_us")
-        self._rngs = unpack_generators(saved_array(state, "generators"))
+    def _held(self) -> Mapping[str, Any]:
+        return {"image": self.image, "first_us": self._first_us, "generators": self._rngs}
 
 
 @kernel

@@ -6,13 +6,14 @@ block of decisions at a time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.envs.saved_state import State, restore_array
+from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 
@@ -39,7 +40,7 @@ def stream(seed: int, name: Stream) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(name,)))
 
 
-class DelayDraws:
+class DelayDraws(Stateful):
     """t2 of every decision of n episodes [µs]."""
 
     def __init__(
@@ -87,16 +88,14 @@ class DelayDraws:
             self._block[i] = [sampler.sample_us() for _ in range(BLOCK)]
             self._blocks[i] += 1
 
-    def get_state(self) -> State:
-        """Return the state from which the draws can be repeated."""
-        return {"seeds": self._seeds.copy(), "blocks": self._blocks.copy()}
+    def _held(self) -> Mapping[str, Any]:
+        return {"seeds": self._seeds, "blocks": self._blocks}
 
     def set_state(self, state: State) -> None:
         """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
-        seeds, blocks = self._seeds.copy(), self._blocks.copy()
-        restore_array(seeds, state, "seeds")
-        restore_array(blocks, state, "blocks")
-        for i in np.flatnonzero(seeds != NOT_BEGUN):
-            self.begin(int(i), int(seeds[i]))
-            for _ in range(int(blocks[i])):
-                self._draw_block(int(i))
+        super().set_state(state)
+        for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
+            blocks = int(self._blocks[i])
+            self.begin(i, int(self._seeds[i]))
+            for _ in range(blocks):
+                self._draw_block(i)

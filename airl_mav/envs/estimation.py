@@ -10,22 +10,15 @@ Every episode draws its random numbers from its own seed.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.envs.draws import BLOCK, Stream, stream
-from airl_mav.envs.saved_state import (
-    State,
-    join_states,
-    pack_generators,
-    restore_array,
-    saved_array,
-    state_of_part,
-    unpack_generators,
-)
+from airl_mav.envs.saved_state import Stateful
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import Estimation
 
@@ -62,11 +55,6 @@ class EstimationError:
             sd[list(errors)] = getattr(table, name)
             time_s[list(errors)] = getattr(table, time_name)
         return cls(sd, time_s)
-
-
-def first_errors(model: EstimationError, normals: Array) -> Array:
-    """Return the errors (..., 9) at an episode's start from standard normal numbers (..., 9)."""
-    return model.sd * normals
 
 
 def step_errors(model: EstimationError, errors: Array, normals: Array, dt: float | Array) -> Array:
@@ -108,57 +96,34 @@ def _multiply(a: Array, b: Array) -> Array:
     return np.concatenate([scalar, w * u + s * v + np.cross(v, u)], axis=-1)
 
 
-class NormalDraws:
-    """Standard normal numbers of n episodes, `N_ERRORS` per decision."""
-
-    def __init__(self, n: int) -> None:
-        self._rngs: list[np.random.Generator | None] = [None] * n
-        self._block = np.zeros((n, BLOCK, N_ERRORS))
-
-    def begin(self, i: int, seed: int) -> NDArray[np.float64]:
-        """Start the episode of slot i; return the numbers (N_ERRORS,) of its start."""
-        rng = stream(seed, Stream.ESTIMATION)
-        self._rngs[i], self._block[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
-        first: NDArray[np.float64] = self._block[i, 0]
-        return first
-
-    def take(self, decisions: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return numbers (n, N_ERRORS) after each slot's 1st, 2nd, ... decision, one by one."""
-        for i in np.flatnonzero(decisions % BLOCK == 0):
-            rng = self._rngs[i]
-            if rng is not None:
-                self._block[i] = rng.standard_normal((BLOCK, N_ERRORS))
-        return self._block[np.arange(len(decisions)), decisions % BLOCK]
-
-    def get_state(self) -> State:
-        """Return the drawn block and the states of the generators."""
-        return {"block": self._block.copy(), "generators": pack_generators(self._rngs)}
-
-    def set_state(self, state: State) -> None:
-        """Restore a saved state. Raises UsageError if it does not fit."""
-        restore_array(self._block, state, "block")
-        self._rngs = unpack_generators(saved_array(state, "generators"))
-
-
-class Telemetry:
+class Telemetry(Stateful):
     """Telemetry of n episodes: the truth with errors that change once a decision."""
 
     def __init__(self, n: int, table: Estimation | None) -> None:
         """Make n slots with the errors of a vehicle profile; None: no errors."""
         self._model = None if table is None else EstimationError.from_profile(table)
         self._errors = np.zeros((n, N_ERRORS))
-        self._normals = NormalDraws(n)
+        self._rngs: list[np.random.Generator | None] = [None] * n
+        self._normals = np.zeros((n, BLOCK, N_ERRORS))
+        """Standard normal numbers, `N_ERRORS` per decision, the first for the episode's start."""
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
         if self._model is not None:
-            self._errors[i] = first_errors(self._model, self._normals.begin(i, seed))
+            rng = stream(seed, Stream.ESTIMATION)
+            self._rngs[i], self._normals[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
+            self._errors[i] = self._model.sd * self._normals[i, 0]
 
     def step(self, decisions: NDArray[np.int64], flown_s: NDArray[np.float64]) -> None:
         """Step the errors after each slot's n-th decision (n,), which took `flown_s` (n,) [s]."""
-        if self._model is not None:
-            normals = self._normals.take(decisions)
-            self._errors = step_errors(self._model, self._errors, normals, flown_s)
+        if self._model is None:
+            return
+        for i in np.flatnonzero(decisions % BLOCK == 0):
+            rng = self._rngs[i]
+            if rng is not None:
+                self._normals[i] = rng.standard_normal((BLOCK, N_ERRORS))
+        normals = self._normals[np.arange(len(decisions)), decisions % BLOCK]
+        self._errors = step_errors(self._model, self._errors, normals, flown_s)
 
     def report(self, truth: Kinematics) -> Kinematics:
         """Return the state of all n as telemetry reports it."""
@@ -168,12 +133,8 @@ class Telemetry:
             *perturbed(truth.position, truth.velocity, truth.quaternion, self._errors)
         )
 
-    def get_state(self) -> State:
-        """Return the present errors and the drawn numbers."""
-        errors = {"errors": self._errors.copy()}
-        return join_states({"now": errors, "normals": self._normals.get_state()})
-
-    def set_state(self, state: State) -> None:
-        """Restore a saved state. Raises UsageError if it does not fit."""
-        restore_array(self._errors, state_of_part(state, "now"), "errors")
-        self._normals.set_state(state_of_part(state, "normals"))
+    def _held(self) -> Mapping[str, Any]:
+        return {
+            "now": {"errors": self._errors},
+            "normals": {"block": self._normals, "generators": self._rngs},
+        }

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -116,22 +116,9 @@ class SinglePilots:
         """Return the commands; see `Pilots`."""
         chosen = np.zeros((len(flying), 3))
         for i in np.flatnonzero(flying):
-            action = limited(self._policies[int(i)].act(_one(seen, int(i))), self._max_speed_m_s)
+            action = limited(self._policies[int(i)].act(seen.rows(int(i))), self._max_speed_m_s)
             chosen[i] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
         return chosen
-
-
-def _one(seen: Observation, i: int) -> Observation:
-    """Return what vehicle i of n sees."""
-    return replace(
-        seen,
-        depth_mm=seen.depth_mm[i],
-        goal=seen.goal[i],
-        velocity=seen.velocity[i],
-        roll=float(np.asarray(seen.roll)[i]),
-        pitch=float(np.asarray(seen.pitch)[i]),
-        yaw=float(np.asarray(seen.yaw)[i]),
-    )
 
 
 class _EncodedPilots:
@@ -234,3 +221,9 @@ def fly_seeds(
 def success_rate(flown: Sequence[EpisodeResult]) -> float:
     """Return the share of the episodes that reached the goal."""
     return sum(each.verdict == Verdict.SUCCESS for each in flown) / len(flown)
+
+
+def mean_of_successes(flown: Iterable[EpisodeResult], quality: str) -> float | None:
+    """Return the mean of a field over the episodes that reached the goal; None without one."""
+    good = [getattr(each, quality) for each in flown if each.verdict == Verdict.SUCCESS]
+    return float(np.mean(good)) if good else None

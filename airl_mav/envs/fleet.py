@@ -133,14 +133,11 @@ def new_fleet(n: int) -> Fleet:
 
 
 def hover(
-    fleet: Fleet,
-    i: int,
-    altitude_m: float,
-    vehicle: Vehicle,
-    airframe: Airframe | None = None,
-    battery: float = 1.0,
+    fleet: Fleet, i: int, altitude_m: float, vehicle: Vehicle, airframe: Airframe | None = None
 ) -> None:
     """Put vehicle i into a hover above the origin, heading north, all counters at zero.
+
+    Its battery is full.
 
     Args:
         fleet: Where vehicle i is.
@@ -148,7 +145,6 @@ def hover(
         altitude_m: Height above the floor [m].
         vehicle: What all vehicles share.
         airframe: This vehicle's own; None = the nominal one.
-        battery: State of charge at the start, 1 full to 0 empty.
     """
     for array in fleet:
         array[i] = 0
@@ -159,6 +155,6 @@ def hover(
     share = a.mass * GRAVITY_M_S2 / (4.0 * a.thrust_max)
     fleet.rotor[i] = math.sqrt(share)
     trim_for_hover(fleet.memory[i], command_for(share, a.thrust_curve), vehicle.gains)
-    fleet.battery[i] = battery
+    fleet.battery[i] = 1.0
     fleet.touched[i] = NOTHING
     fleet.verdict[i] = Verdict.FLYING

@@ -8,7 +8,7 @@ as well. Everything is in ticks of simulated time, so nothing depends on the mac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.randomise import draw_airframe
-from airl_mav.envs.saved_state import State, join_states, restore_array, saved_array, state_of_part
+from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
 from airl_mav.latency.injection import Injection
@@ -63,7 +63,7 @@ class Flights:
     """Index of the obstacle that is touched, or `contact.FLOOR`, `WALL`, `NOTHING`."""
 
 
-class Navigation:
+class Navigation(Stateful):
     """N vehicles, each flying to its goal. No slot resets by itself."""
 
     def __init__(
@@ -127,6 +127,7 @@ class Navigation:
         self.arenas: list[Arena | None] = [None] * n
         self.seeds = np.zeros(n, np.int64)
         self.zones = np.full(n, -1, np.int64)
+        self._begun = np.zeros(n, np.bool_)
         self._fleet = new_fleet(n)
         self._batch = batch_of([])
         self._decision = np.zeros(n, np.int64)
@@ -159,7 +160,8 @@ class Navigation:
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         arena = self._arena(seed, zone)
-        self.arenas[i], self.seeds[i], self.zones[i] = arena, seed, -1 if zone is None else zone
+        self.arenas[i], self._begun[i] = arena, True
+        self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
         try:
             put_arena(self._batch, i, arena)
         except (ValueError, IndexError):
@@ -243,20 +245,20 @@ class Navigation:
         if self._trace is not None:
             self._trace.decided(self._fleet, t2_us, self._transport_us, self._link_us)
 
-    def get_state(self) -> State:
-        """Return the whole state, as copies."""
-        own = {key: array.copy() for key, array in self._arrays().items()}
-        own["begun"] = np.array([arena is not None for arena in self.arenas])
-        fleet = {key: array.copy() for key, array in self._fleet._asdict().items()}
-        return join_states(
-            {
-                "navigation": own,
-                "fleet": fleet,
-                "delays": self._delays.get_state(),
-                "telemetry": self._telemetry.get_state(),
-                "cameras": self._cameras.get_state(),
-            }
-        )
+    def _held(self) -> Mapping[str, Any]:
+        return {
+            "navigation": {
+                "seeds": self.seeds,
+                "zones": self.zones,
+                "begun": self._begun,
+                "decision": self._decision,
+                "extra_us": self._extra_us,
+            },
+            "fleet": self._fleet._asdict(),
+            "delays": self._delays,
+            "telemetry": self._telemetry,
+            "cameras": self._cameras,
+        }
 
     def set_state(self, state: State) -> None:
         """Restore a saved state; arenas are generated again from their seeds.
@@ -264,32 +266,14 @@ class Navigation:
         Raises:
             UsageError: It is not one of this environment.
         """
-        own, fleet = state_of_part(state, "navigation"), state_of_part(state, "fleet")
-        for key, array in self._arrays().items():
-            restore_array(array, own, key)
-        for key, array in self._fleet._asdict().items():
-            restore_array(array, fleet, key)
-        self._delays.set_state(state_of_part(state, "delays"))
-        self._telemetry.set_state(state_of_part(state, "telemetry"))
-        self._cameras.set_state(state_of_part(state, "cameras"))
+        super().set_state(state)
         self.arenas = [
             self._arena(int(seed), None if zone < 0 else int(zone)) if begun else None
-            for seed, zone, begun in zip(
-                self.seeds, self.zones, saved_array(own, "begun"), strict=True
-            )
+            for seed, zone, begun in zip(self.seeds, self.zones, self._begun, strict=True)
         ]
         spare = next((arena for arena in self.arenas if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.arenas]
         self._batch = batch_of([arena for arena in room if arena is not None])
-
-    def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays that change in flight, besides the fleet's."""
-        return {
-            "seeds": self.seeds,
-            "zones": self.zones,
-            "decision": self._decision,
-            "extra_us": self._extra_us,
-        }
 
     def _arena(self, seed: int, zone: int | None) -> Arena:
         return generate(

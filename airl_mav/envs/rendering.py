@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
@@ -20,6 +21,9 @@ from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_yaw
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Navigation
 
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100
@@ -30,52 +34,33 @@ TRAIL_COLOUR = "#c0392b"
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """What an image shows besides the arena."""
-
-    time_us: int
-    """Since the start of the episode [µs]."""
-    position: NDArray[np.float64]
-    """(3,) NED [m]."""
-    yaw: float
-    """[rad]"""
-    speed_m_s: float
-    goal_distance_m: float
-    energy_j: float
-    trail: Sequence[NDArray[np.float64]]
-    """Path so far: north, east [m]."""
-    depth: NDArray[np.uint8]
-    """(h, w) as the network sees it."""
-    outcome: str
-    """How the episode ended, "flying" before that."""
-
-
 class EpisodeRenderer:
-    """Draws one environment; images are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+    """Draws the first flight of a navigation; images are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
 
-    def __init__(self, goal_radius_m: float, image_px: tuple[int, int]) -> None:
-        """Take the radius of the goal's disc [m], and rows and columns of the depth image."""
-        self._goal_radius_m = goal_radius_m
-        self._image_px = image_px
+    def __init__(self, navigation: Navigation) -> None:
+        """Take what flies."""
+        self._navigation = navigation
         self._figure = Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI)
         self._canvas = FigureCanvasAgg(self._figure)
         self._background: Any = None
+        self._arena: Arena | None = None
         self._outlines: list[NDArray[np.float64]] = []
 
-    def begin(self, arena: Arena) -> None:
-        """Start an episode: draw what will not change."""
+    def _begin(self, arena: Arena) -> None:
+        """Draw what will not change in an episode."""
+        spec = self._navigation.spec
         self._arena = arena
         self._figure.clear()
         self._map = self._figure.add_axes((0.06, 0.1, 0.5, 0.84))
-        draw_arena(_standing(arena), self._map, goal_radius_m=self._goal_radius_m)
+        draw_arena(_standing(arena), self._map, goal_radius_m=spec.episode.goal_radius_m)
         self._map.set_title(f"{arena.name}, seed {arena.seed}", fontsize=11, color=TEXT_COLOUR)
         self._eye = self._figure.add_axes((0.62, 0.4, 0.35, 0.54))
         self._eye.set_anchor("N")
         self._eye.set(xticks=[], yticks=[])
         self._eye.spines[:].set_color(GRID_COLOUR)
         self._eye.set_title("depth that the network sees", fontsize=11, color=TEXT_COLOUR)
-        self._outlines = [_outline(arena.obstacles, i) for i in _movers(arena)]
+        movers = range(arena.n_static, len(arena.obstacles))
+        self._outlines = [_outline(arena.obstacles, i) for i in movers]
         face, edge = MOVING_COLOURS
         moving: dict[str, Any] = {"animated": True, "facecolor": face, "edgecolor": edge}
         self._moving: Any = self._map.add_collection(PolyCollection([], zorder=2.1, **moving))
@@ -86,7 +71,7 @@ class EpisodeRenderer:
             [0.0], [0.0], color=START_COLOUR, ec="white", lw=0.8, zorder=3.5, animated=True
         )
         self._image = self._eye.imshow(
-            np.zeros(self._image_px, np.uint8),
+            np.zeros((spec.image_height_px, spec.image_width_px), np.uint8),
             cmap="gray",
             vmin=0,
             vmax=255,
@@ -104,34 +89,50 @@ class EpisodeRenderer:
         )
         self._background = None
 
-    def draw(self, now: Snapshot) -> NDArray[np.uint8]:
-        """Return the image of a moment of the present episode."""
+    def draw(
+        self, trail: Sequence[NDArray[np.float64]], depth: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Return the image of the present moment.
+
+        Args:
+            trail: Path so far: north, east [m].
+            depth: (h, w) as the network sees it.
+
+        Raises:
+            ResetNeeded: No episode has begun.
+        """
+        arena = self._navigation.arenas[0]
+        if arena is None:
+            raise ResetNeeded("render() before reset()")
+        if arena is not self._arena:
+            self._begin(arena)
         if self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._canvas.restore_region(self._background)
-        self._update(now)
+        self._update(arena, np.array(trail), depth)
         for artist in (self._moving, self._trail, self._vehicle):
             self._map.draw_artist(artist)
         self._eye.draw_artist(self._image)
         self._figure.draw_artist(self._text)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _update(self, now: Snapshot) -> None:
-        centers = self._arena.centers_at(now.time_us)[self._arena.n_static :, 1::-1]
+    def _update(self, arena: Arena, trail: NDArray[np.float64], depth: NDArray[np.uint8]) -> None:
+        now, truth = self._navigation.flights(), self._navigation.truth()
+        position = truth.position[0]
+        centers = arena.centers_at(round(now.time_s[0] * US_PER_S))[arena.n_static :, 1::-1]
         self._moving.set_verts(
             [outline + at for outline, at in zip(self._outlines, centers, strict=True)]
         )
-        trail = np.array(now.trail)
         self._trail.set_data(trail[:, 1], trail[:, 0])
-        self._vehicle.set_xy(_arrow(now.yaw) + now.position[1::-1])
-        self._image.set_data(now.depth)
+        self._vehicle.set_xy(_arrow(float(quat_yaw(truth.quaternion[0]))) + position[1::-1])
+        self._image.set_data(depth)
         self._text.set_text(
-            f"time   {now.time_us / US_PER_S:7.2f} s     {now.outcome}\n"
-            f"goal   {now.goal_distance_m:7.2f} m\n"
-            f"speed  {now.speed_m_s:7.2f} m/s\n"
-            f"height {-now.position[2]:7.2f} m\n"
-            f"energy {now.energy_j / 1000.0:7.2f} kJ"
+            f"time   {now.time_s[0]:7.2f} s     {Verdict(int(now.verdict[0])).name.lower()}\n"
+            f"goal   {now.goal_distance_m[0]:7.2f} m\n"
+            f"speed  {now.speed_m_s[0]:7.2f} m/s\n"
+            f"height {-position[2]:7.2f} m\n"
+            f"energy {now.energy_j[0] / 1000.0:7.2f} kJ"
         )
 
 
@@ -173,10 +174,6 @@ def _no_display(why: str) -> UsageError:
     return UsageError(
         f"render_mode = 'human': no display for a window ({why}); accepted here: 'rgb_array'"
     )
-
-
-def _movers(arena: Arena) -> range:
-    return range(arena.n_static, len(arena.obstacles))
 
 
 def _standing(arena: Arena) -> Arena:

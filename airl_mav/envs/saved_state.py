@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -15,25 +16,62 @@ State = dict[str, NDArray[Any]]
 """Arrays by name; "fleet/position" is `position` of the part `fleet`."""
 
 
-def join_states(parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> State:
-    """Return the states of several parts as one."""
-    return {f"{part}/{key}": value for part, state in parts.items() for key, value in state.items()}
+class Stateful(ABC):
+    """Something whose state a checkpoint keeps."""
+
+    @abstractmethod
+    def _held(self) -> Mapping[str, Any]:
+        """Return by name all that changes: arrays, lists of generators, tables of them, parts."""
+
+    def get_state(self) -> State:
+        """Return the whole state, as copies."""
+        return _taken(self._held())
+
+    def set_state(self, state: State) -> None:
+        """Restore a saved state: the next step is as it would have been.
+
+        Raises:
+            UsageError: It is of another environment.
+        """
+        _put_back(self._held(), state)
 
 
-def state_of_part(state: Mapping[str, NDArray[Any]], part: str) -> State:
+def _taken(held: Mapping[str, Any]) -> State:
+    state: State = {}
+    for name, part in held.items():
+        if isinstance(part, np.ndarray):
+            state[name] = part.copy()
+        elif isinstance(part, list):
+            state[name] = pack_generators(part)
+        else:
+            inner = part.get_state() if isinstance(part, Stateful) else _taken(part)
+            state |= {f"{name}/{key}": array for key, array in inner.items()}
+    return state
+
+
+def _put_back(held: Mapping[str, Any], state: State) -> None:
+    for name, part in held.items():
+        if isinstance(part, np.ndarray):
+            _restore_array(part, state, name)
+        elif isinstance(part, list):
+            part[:] = unpack_generators(saved_array(state, name))
+        elif isinstance(part, Stateful):
+            part.set_state(state_of_part(state, name))
+        else:
+            _put_back(part, state_of_part(state, name))
+
+
+def state_of_part(state: State, part: str) -> State:
     """Return the state of one part. Raises UsageError when there is none."""
-    found = {key[len(part) + 1 :]: value for key, value in state.items() if _is_of(key, part)}
+    prefix = f"{part}/"
+    found = {key[len(prefix) :]: value for key, value in state.items() if key.startswith(prefix)}
     if not found:
         raise UsageError(f"state: nothing of {part!r} in it: not of this environment")
     return found
 
 
-def restore_array(target: NDArray[Any], state: Mapping[str, NDArray[Any]], key: str) -> None:
-    """Write a saved array over one in place.
-
-    Raises:
-        UsageError: It is missing, or of another shape or type.
-    """
+def _restore_array(target: NDArray[Any], state: State, key: str) -> None:
+    """Write a saved array over one in place. Raises UsageError when it does not fit."""
     value = saved_array(state, key)
     if value.shape != target.shape or value.dtype != target.dtype:
         raise UsageError(
@@ -42,7 +80,7 @@ def restore_array(target: NDArray[Any], state: Mapping[str, NDArray[Any]], key: 
     target[...] = value
 
 
-def saved_array(state: Mapping[str, NDArray[Any]], key: str) -> NDArray[Any]:
+def saved_array(state: State, key: str) -> NDArray[Any]:
     """Return a saved array. Raises UsageError when it is missing."""
     if key not in state:
         raise UsageError(f"state: {key} is missing: not of this environment")
@@ -73,7 +111,3 @@ def _generator(state: Mapping[str, Any]) -> np.random.Generator:
     rng = np.random.default_rng(0)
     rng.bit_generator.state = state
     return rng
-
-
-def _is_of(key: str, part: str) -> bool:
-    return key.startswith(f"{part}/")

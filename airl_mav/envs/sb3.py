@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
-from airl_mav.envs.saved_state import State, join_states, restore_array, state_of_part
+from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.layouts import Encoded
 
@@ -18,7 +18,7 @@ QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "see
 """Keys of `info` that go into SB3's `episode` info, beside return, length and time."""
 
 
-class NavigationVecEnv(VecEnv):
+class NavigationVecEnv(Stateful, VecEnv):
     """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
 
     The info of a step is empty but for the episodes that end in it. `episode` is what SB3's Monitor
@@ -72,21 +72,8 @@ class NavigationVecEnv(VecEnv):
         """Return the present observations, to continue after `set_state`."""
         return self.env.navigation.observe()
 
-    def get_state(self) -> State:
-        """Return the whole state as arrays for a checkpoint."""
-        own = {"return": self._return.copy(), "length": self._length.copy()}
-        return join_states({"vector": self.env.get_state(), "adapter": own})
-
-    def set_state(self, state: State) -> None:
-        """Restore a saved state: the next step is as it would have been.
-
-        Raises:
-            UsageError: It is of another environment.
-        """
-        self.env.set_state(state_of_part(state, "vector"))
-        own = state_of_part(state, "adapter")
-        restore_array(self._return, own, "return")
-        restore_array(self._length, own, "length")
+    def _held(self) -> Mapping[str, Any]:
+        return {"vector": self.env, "adapter": {"return": self._return, "length": self._length}}
 
     def close(self) -> None:
         """Nothing to release."""

@@ -8,33 +8,23 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_yaw
-from airl_mav.envs.delay import bounded
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.rendering import EpisodeRenderer, Snapshot, Window
-from airl_mav.envs.rewards import rewards
-from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.vector import (
+from airl_mav.envs.decisions import (
+    Decisions,
     action_space,
-    curriculum_of,
-    decision_outcome,
     draw_seeds,
-    endings,
     observation_space,
-    open_zone,
     outcome,
-    quality,
     zone_option,
 )
-from airl_mav.policy.action_sets import commands
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Flights
+from airl_mav.envs.rendering import EpisodeRenderer, Window
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.layouts import DEPTH, Encoded
 
 
-class NavigationEnv(gym.Env[Encoded, Any]):
+class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     """One vehicle that flies to its goal; a step is a decision and its hold.
 
     Observation: a Dict of `depth`, `velocity` and `goal` (`airl_mav.policy.layouts`). `info`
@@ -61,17 +51,13 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             raise UsageError(f"render_mode = {render_mode!r}: accepted: None, {', '.join(modes)}")
-        self.environment = bounded(spec_of(spec, knobs))
-        self.navigation = Navigation(self.environment, 1)
+        super().__init__(spec, knobs, 1)
         self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
         self.action_space = action_space(self.environment.action_spec)
-        self.curriculum = curriculum_of(self.navigation)
         self.render_mode = render_mode
         # A picture a decision: shown so often, a video of them runs in the time of the flight.
         fps = 1.0 / self.environment.episode.hold_s
         self.metadata = self.metadata | {"render_fps": fps}
-        self._zone: int | None = None
-        self._before: Flights | None = None
         self._depth = np.zeros((0, 0), np.uint8)
         self._trail: list[NDArray[np.float64]] = []
         self._renderer: EpisodeRenderer | None = None
@@ -96,30 +82,18 @@ class NavigationEnv(gym.Env[Encoded, Any]):
             self._zone = zone_option(options)
         super().reset(seed=seed)
         episode = draw_seeds(self.np_random, 1)[0] if seed is None else seed
-        self.navigation.begin([0], [episode], open_zone(self._zone, self.curriculum))
-        self._before = self.navigation.flights()
+        flights = self._begin([0], [episode])
         self._trail = []
-        if self._renderer is not None:
-            self._renderer.begin(self._arena())
-        return self._observe(), self._info(self._before)
+        return self._observe(), self._info(flights)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
         """Fly one decision; see Gymnasium's Env.step."""
-        if self._before is None:
-            raise gym.error.ResetNeeded("step() before reset()")
-        if self._before.verdict[0] != Verdict.FLYING:
+        if self._before is not None and self._before.verdict[0] != Verdict.FLYING:
             raise gym.error.ResetNeeded("step() after the end of the episode")
-        spec, navigation = self.environment, self.navigation
-        navigation.fly(commands(spec.action_spec, np.asarray(action)[None]))
-        now = navigation.flights()
-        reward = rewards(spec.reward, decision_outcome(self._before, now, spec))
-        terminated, truncated = endings(now)
-        self._before = now
+        now, reward, terminated, truncated = self._decide(np.asarray(action)[None])
         info = self._info(now)
         if terminated[0] or truncated[0]:
             info |= outcome(now, 0)
-            if self.curriculum is not None:
-                self.curriculum.record(info["zone"], success=info["success"])
         return self._observe(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -143,32 +117,9 @@ class NavigationEnv(gym.Env[Encoded, Any]):
         return seen
 
     def _info(self, now: Flights) -> dict[str, Any]:
-        return {key: value[0].item() for key, value in quality(self.navigation, now).items()}
+        return {key: value[0].item() for key, value in self._quality(now).items()}
 
     def _frame(self) -> NDArray[np.uint8]:
-        now, truth = self.navigation.flights(), self.navigation.truth()
         if self._renderer is None:
-            spec = self.environment
-            self._renderer = EpisodeRenderer(
-                spec.episode.goal_radius_m, (spec.image_height_px, spec.image_width_px)
-            )
-            self._renderer.begin(self._arena())
-        return self._renderer.draw(
-            Snapshot(
-                time_us=round(now.time_s[0] * US_PER_S),
-                position=truth.position[0],
-                yaw=float(quat_yaw(truth.quaternion[0])),
-                speed_m_s=float(now.speed_m_s[0]),
-                goal_distance_m=float(now.goal_distance_m[0]),
-                energy_j=float(now.energy_j[0]),
-                trail=self._trail,
-                depth=self._depth,
-                outcome=Verdict(int(now.verdict[0])).name.lower(),
-            )
-        )
-
-    def _arena(self) -> Arena:
-        arena = self.navigation.arenas[0]
-        if arena is None:
-            raise gym.error.ResetNeeded("render() before reset()")
-        return arena
+            self._renderer = EpisodeRenderer(self.navigation)
+        return self._renderer.draw(self._trail, self._depth)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
-from airl_mav.envs.rewards import RewardName
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import LayoutName
 from airl_mav.profiles.arena import Each
+
+RewardName = Literal["shaped", "paper-scaled", "paper"]
+"""See `envs.rewards`."""
 
 
 class EpisodeRules(ProfileModel):

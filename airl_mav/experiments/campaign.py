@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
-from airl_mav.experiments.fliers import Flier, FlyEpisodes
+from airl_mav.experiments.fliers import Flier, FlyEpisodes, LockstepFlier
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.experiments.lockstep_flier import LockstepFlier
+from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -41,6 +41,10 @@ class Cell:
     title: str
     """One line for people."""
     scenario: ResolvedScenario
+    label: str = ""
+    """What it is called in the comparison; empty: the title. The next two as in its `RunEntry`."""
+    role: str = ""
+    group: str = ""
 
     def __post_init__(self) -> None:
         """Raise UsageError if the level's own environment cannot fly the scenario."""
@@ -79,6 +83,8 @@ class CampaignRun:
     """Those that were begun, now or before, in the order of the campaign."""
     complete: bool
     """Whether all episodes of all cells have been flown."""
+    ended: Ended
+    """Also interrupted where the last flight had ended by then: what comes after must not begin."""
     error: str | None
     """Why it was broken off: a job failed, or lost its worker too often."""
 
@@ -140,7 +146,7 @@ def run_cells(
         for cell in cells
         if (held := flown.get(first_of[cell.name].name)) is not None
     ]
-    return CampaignRun(tuple(shown), run.complete, run.error)
+    return replace(run, cells=tuple(shown))
 
 
 def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
@@ -244,7 +250,7 @@ def _run(
     executor: Executor,
     progress: Progress,
     stop: Stop,
-    ended: Callable[[CellRun], None] = lambda _: None,
+    tell: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
     """Fly what is left of cells with different flights, each into its folder."""
     opened: dict[str, _OpenCell] = {}
@@ -258,7 +264,7 @@ def _run(
 
         def close(cell: _OpenCell) -> None:
             cell.stack.close()
-            ended(cell.run())
+            tell(cell.run())
 
         def jobs() -> Iterator[_Job]:
             for cell in cells:
@@ -298,4 +304,9 @@ def _run(
             error = str(problem)
     runs = [opened[cell.name].run() for cell in cells if cell.name in opened]
     complete = len(runs) == len(cells) and all(run.complete for run in runs)
-    return CampaignRun(tuple(runs), complete, error)
+    ended: Ended = "complete"
+    if error is not None:
+        ended = "broken off"
+    elif not complete or stop():
+        ended = "interrupted"
+    return CampaignRun(tuple(runs), complete, ended, error)

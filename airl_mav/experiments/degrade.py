@@ -9,7 +9,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.experiments.experiment import (
     Experiment,
     ExperimentResult,
-    entry_of,
+    file_name,
     make_cell,
     run_and_compare,
 )
@@ -42,10 +42,7 @@ def degrade(
         out: Folder; the same one goes on. None makes `runs/<UTC time>-degradation-...`.
         progress: Whether to draw bars on standard error.
 
-    Raises:
-        UsageError: Something cannot be flown, or `out` holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    Raises what `evaluate` does.
     """
     declared = declare_degradation(scenario, latencies, policies)
     return run_and_compare(declared, out, progress=progress)
@@ -58,24 +55,27 @@ def declare_degradation(
     if len(latencies) < 2 or len(set(latencies)) < len(latencies):
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
     names = list(policies) or [scenario.policy]
-    cells, roles = [], {}
-    for path in names:
-        policy = find_policy(path).name
+    cells = []
+    found = [find_policy(name).name for name in names]
+    for path, policy in zip(names, found, strict=True):
         for latency in latencies:
             given = None if latency == NATIVE else latency
             label = latency if given is None or not Path(given).is_file() else Path(given).stem
-            cell = make_cell(
-                "".join(c if c.isalnum() or c in "._-" else "-" for c in f"{policy}-{label}"),
-                f"{policy} at {label}",
-                scenario.model_copy(update={"policy": path, "latency": given, "workload": None}),
+            flown = {"policy": path, "latency": given, "workload": None}
+            cells.append(
+                make_cell(
+                    file_name(f"{policy}-{label}"),
+                    f"{policy} at {label}",
+                    scenario.model_copy(update=flown),
+                    label=label,
+                    role=label,
+                    group=policy,
+                )
             )
-            cells.append(cell)
-            roles[cell.name] = entry_of(cell, label=label, role=label, group=policy)
     facts = {field: getattr(scenario, field) for field in FACTS}
     return Experiment(
         kind="degradation",
-        name=f"{'-'.join(find_policy(name).name for name in names)}",
-        facts={"policies": [find_policy(name).name for name in names], **facts},
+        name="-".join(found),
+        facts={"policies": found, **facts},
         cells=tuple(cells),
-        roles=roles,
     )

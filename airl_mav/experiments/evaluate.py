@@ -7,13 +7,7 @@ from pathlib import Path
 
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    entry_of,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult, add_result
@@ -30,6 +24,8 @@ NOT_THE_POLICYS_OWN = (
     "hold_s",
     "altitude_m",
     "max_speed_m_s",
+    "time_limit_s",
+    "watchdog",
 )
 """Fields whose results are not written onto a policy's card when they are given."""
 
@@ -63,18 +59,7 @@ def matrix(scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = 
     """Declare a table of policies x arenas. Raises UsageError as `evaluate`."""
     cells = evaluation_cells(scenario, policies, arenas)
     facts = {field: getattr(scenario, field) for field in SHARED}
-    return Experiment(
-        kind="matrix",
-        name=f"{len(policies)}-policies",
-        facts=facts,
-        cells=cells,
-        roles={
-            cell.name: entry_of(
-                cell, label=cell.scenario.policy.name, group=cell.scenario.arena_name
-            )
-            for cell in cells
-        },
-    )
+    return Experiment("matrix", f"{len(policies)}-policies", facts, cells)
 
 
 def evaluation_cells(
@@ -98,6 +83,8 @@ def evaluation_cells(
             f"{policy.name}-{Path(arena).stem}",
             f"{policy.name} in {Path(arena).stem}",
             scenario.model_copy(update={"policy": path, "arena": arena}),
+            label=policy.name,
+            group=Path(arena).stem,
         )
         for path, policy in zip(policies, found, strict=True)
         for arena in arenas
@@ -113,7 +100,7 @@ def check_plain(cells: Sequence[Cell]) -> None:
     """Raise UsageError for results that are not the policies' own: none goes onto a card."""
     for cell in cells:
         asked, usual = cell.scenario.scenario, Scenario()
-        for field in (*NOT_THE_POLICYS_OWN, "time_limit_s", "watchdog"):
+        for field in NOT_THE_POLICYS_OWN:
             if (value := getattr(asked, field)) != getattr(usual, field):
                 raise FieldError(field, value, "without on-card: these are not the policy's own")
         if cell.scenario.policy.folder is None:

@@ -6,29 +6,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.campaign import Cell, CellRun, run_cells, shared_flights
-from airl_mav.experiments.fly import executor_of, raise_unless_complete, shown
+from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cells, shared_flights
+from airl_mav.experiments.fly import raise_unless_complete, shown
 from airl_mav.experiments.live import Ended, fly_live, tell_end
+from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
-from airl_mav.experiments.store import (
-    CampaignStore,
-    Declaration,
-    DeclaredCell,
-    open_campaign,
-)
+from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
 from airl_mav.report.comparison.show import build_comparison, write_comparison
-from airl_mav.report.table import OUTCOME_LABELS
+from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
 
@@ -43,15 +39,13 @@ class Experiment:
     facts: dict[str, Any]
     """What heads the comparison."""
     cells: tuple[Cell, ...]
-    roles: Mapping[str, RunEntry] = field(default_factory=dict)
-    """What the run of a cell is in the comparison, by the cell's name; its folder is filled in."""
     remarks: tuple[str, ...] = ()
     """What a person should know before it flies."""
 
     def root(self, out: Path | None) -> Path:
         """Return the folder: as asked, or a new one under `runs`."""
-        plain = "".join(c if c.isalnum() or c in "._-" else "-" for c in self.name)
-        return out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{plain}"
+        name = f"{utc_now():%Y%m%dT%H%M%SZ}-{self.kind}-{file_name(self.name)}"
+        return out or Path("runs") / name
 
     @property
     def declaration(self) -> Declaration:
@@ -65,8 +59,8 @@ class Experiment:
                     title=cell.title,
                     settings=cell.scenario.config,
                     folder=None if shared[cell.name] is cell else shared[cell.name].name,
-                    role=self.roles[cell.name].role,
-                    group=self.roles[cell.name].group,
+                    role=cell.role,
+                    group=cell.group,
                 )
                 for cell in self.cells
             },
@@ -99,16 +93,11 @@ class ExperimentRun:
         Raises:
             UsageError: No cell has flights, or the folder cannot be written.
         """
+        here, experiment = self.path.absolute(), self.experiment
         entries = [
-            replace(
-                self.experiment.roles[flown.cell.name],
-                folder=flown.path.relative_to(self.path.absolute()).as_posix()
-                if flown.path.is_absolute()
-                else flown.path.relative_to(self.path).as_posix(),
-            )
+            entry_of(flown.cell, flown.path.absolute().relative_to(here).as_posix())
             for flown in self.cells
         ]
-        experiment = self.experiment
         comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
         return comparison, loaded, write_comparison(comparison, loaded, self.path)
 
@@ -127,22 +116,29 @@ class ExperimentResult:
     """The report."""
 
 
-def make_cell(name: str, title: str, scenario: Scenario) -> Cell:
+def file_name(text: str) -> str:
+    """Return a text as the name of a folder."""
+    return "".join(c if c.isalnum() or c in "._-" else "-" for c in text)
+
+
+def make_cell(
+    name: str, title: str, scenario: Scenario, *, label: str = "", role: str = "", group: str = ""
+) -> Cell:
     """Resolve a scenario as a cell. Raises UsageError if it cannot be flown."""
     # A copy without the loaded network: many large ones would fill the memory.
-    return Cell(name, title, replace(resolve(scenario)))
+    return Cell(name, title, replace(resolve(scenario)), label, role, group)
 
 
-def entry_of(cell: Cell, *, label: str = "", role: str = "", group: str = "") -> RunEntry:
-    """Return what the run of a cell is in a comparison."""
+def entry_of(cell: Cell, folder: str) -> RunEntry:
+    """Return what the run of a cell, in a folder below that of the comparison, is there."""
     card = cell.scenario.policy.card
     trained_in = None if card is None else card.training.arena
     return RunEntry(
         name=cell.name,
-        folder=cell.name,
-        label=label or cell.title,
-        role=role,
-        group=group,
+        folder=folder,
+        label=cell.label or cell.title,
+        role=cell.role,
+        group=cell.group,
         planned=len(cell.scenario.seeds),
         rules=cell.scenario.rules,
         trained_in=None if trained_in is None else Path(trained_in).stem,
@@ -154,10 +150,7 @@ def run_and_compare(
 ) -> ExperimentResult:
     """Fly an experiment to its end and compare its runs: what the functions of the API share.
 
-    Raises:
-        UsageError: It cannot be flown, or the folder holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    Raises what `evaluate` does.
     """
     with shown(progress) as shows:
         flown = run_experiment(experiment, None if out is None else Path(out), shows)
@@ -198,8 +191,9 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
             experiment.cells, key=lambda cell: cell.scenario.scenario.level
         ):
             fly = _fly_live if level == "sitl" else _fly_by_workers
-            flown, state, problem = fly(store, tuple(group), progress, tell)
-            runs += flown
+            flown = fly(store, tuple(group), progress, tell)
+            runs += flown.cells
+            state, problem = flown.ended, flown.error or ""
             if state != "complete":
                 break
     tell_end(root, state, problem, progress)
@@ -208,24 +202,16 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
     )
 
 
-_Flown = tuple[list[CellRun], Ended, str]
-"""Runs as far as they have come, how it ended, and why."""
-
-
 def _fly_by_workers(
     store: CampaignStore,
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
-) -> _Flown:
-    with stop_on_signals() as stop, executor_of(cells[0].scenario.scenario) as executor:
-        run = run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
-        state: Ended = "complete"
-        if run.error is not None:
-            state = "broken off"
-        elif not run.complete or stop():
-            state = "interrupted"
-    return list(run.cells), state, run.error or ""
+) -> CampaignRun:
+    asked = cells[0].scenario.scenario
+    in_process = asked.level == "gym"
+    with stop_on_signals() as stop, open_executor(asked, in_process=in_process) as executor:
+        return run_cells(store, cells, executor, progress=progress, stop=stop, ended=tell)
 
 
 def _fly_live(
@@ -233,25 +219,20 @@ def _fly_live(
     cells: Sequence[Cell],
     progress: Progress,
     tell: Callable[[CellRun], None],
-) -> _Flown:
+) -> CampaignRun:
     runs: list[CellRun] = []
     for cell in cells:
         flown = fly_live(cell.scenario, store.cell_path(cell.name), progress, name=cell.name)
         runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":
-            return runs, flown.ended, flown.problem
+            return CampaignRun(tuple(runs), False, flown.ended, flown.problem)
         tell(runs[-1])
-    return runs, "complete", ""
+    return CampaignRun(tuple(runs), True, "complete", None)
 
 
 def outcome_line(run: CellRun) -> str:
     """Return how the flights of a cell ended."""
-    outcomes = [episode.outcome for episode in run.episodes]
-    told = ", ".join(
-        f"{outcomes.count(outcome):,} {words}"
-        for outcome, words in OUTCOME_LABELS.items()
-        if outcome in outcomes
-    )
+    told = count_outcomes([episode.outcome for episode in run.episodes])
     return told if run.new else f"{told} (flown before)"
 
 

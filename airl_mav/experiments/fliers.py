@@ -1,13 +1,16 @@
-"""How the episodes of a scenario are flown in a worker: what each level implements."""
+"""How the episodes of a scenario are flown in a worker: what each level implements; lockstep."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from airl_mav.experiments.executors import Stop
+from airl_mav.lockstep.flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.resolved import PlannedEpisode
+from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+from firmware_sim.warm_up import warm_up
 
 FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
 
@@ -32,3 +35,27 @@ class Flier(Protocol):
             stop: Whether to leave flights unfinished; to be asked while several fly at a time.
         """
         ...
+
+
+@dataclass(frozen=True)
+class LockstepFlier:
+    """Level lockstep: one flight at a time in each worker. Implements `Flier`."""
+
+    scenario: ResolvedScenario
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:  # noqa: ARG002
+        """Return how many episodes make a job; see `Flier`."""
+        return 1
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
+        """Load everything; see `Flier`."""
+        scenario = self.scenario
+        warm_up(scenario.vehicle)
+
+        def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+            for episode in episodes:
+                tlog = folder.tlog_path(episode.index) if scenario.scenario.tlogs else None
+                policy = scenario.fresh_policy(episode.seed)
+                yield fly(scenario, policy, episode.index, episode.seed, tlog=tlog)
+
+        return fly_all

@@ -3,62 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
 
 from airl_mav.core.progress import Progress, RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
-from airl_mav.experiments.executors import Executor, ExecutorSettings
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.signals import stop_on_signals
-from airl_mav.scenario.model import Flights, Scenario, Workers
+from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
-def fly_scenario(
-    scenario: ResolvedScenario, out: Path | None, progress: Progress, *, name: str | None = None
-) -> FlownRun:
+def fly_scenario(scenario: ResolvedScenario, out: Path | None, progress: Progress) -> FlownRun:
     """Fly what is left of a scenario at any level, several flights at a time where that can be.
 
-    Ctrl-C and SIGTERM end it with what has ended kept.
-
-    Args:
-        scenario: What is flown.
-        out: Run folder; one that holds episodes of the same run gets the others. None: a new one.
-        progress: Who looks on.
-        name: Name of a new run; None: after level and policy.
-
-    Raises:
-        UsageError: The input cannot be used; what was flown before is kept.
+    Ctrl-C and SIGTERM end it with what has ended kept; all else as of `live.fly_live`.
     """
     asked = scenario.scenario
-    name = name or run_name(scenario)
+    name = run_name(scenario)
     if asked.level == "sitl":
         return fly_live(scenario, out, progress, name=name)
     cell = Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)
-    with stop_on_signals() as stop, executor_of(asked) as executor:
+    with (
+        stop_on_signals() as stop,
+        open_executor(asked, in_process=asked.level == "gym") as executor,
+    ):
         run = run_cell(out, cell, executor, progress=progress, stop=stop)
-        (flown,) = run.cells
-        ended: Ended = "complete"
-        if run.error is not None:
-            ended = "broken off"
-        elif not run.complete or stop():
-            # Also when the last flight had ended by then: what would come after must not begin.
-            ended = "interrupted"
-    tell_end(flown.path, ended, run.error or "", progress)
-    return FlownRun(flown.path, ended, flown.episodes, flown.new, run.error or "")
-
-
-def executor_of(asked: Flights) -> AbstractContextManager[Executor]:
-    """Give the executor that was asked for. Raises UsageError if Ray cannot be reached."""
-    shared = {name: getattr(asked, name) for name in Workers.model_fields}
-    return open_executor(ExecutorSettings(**shared), in_process=asked.level == "gym")
+    (flown,) = run.cells
+    tell_end(flown.path, run.ended, run.error or "", progress)
+    return FlownRun(flown.path, run.ended, flown.episodes, flown.new, run.error or "")
 
 
 def run_name(scenario: ResolvedScenario) -> str:

@@ -10,19 +10,10 @@ from typing import Any
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.envs.spec import Delay
-from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    entry_of,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.report.comparison.gap import Role
-from airl_mav.report.comparison.model import RunEntry
 from airl_mav.scenario.model import Scenario
 
 DEFAULT_MITIGATED = "static-obstacles-ras-pi-4"
@@ -38,8 +29,7 @@ NOT_MITIGATED = "none"
 
 TRAINING_LATENCY_SEED = 1
 """The latencies of the training's conditions are drawn anew: with the same draws as the target's,
-the
-mitigated policy would be compared with itself."""
+the mitigated policy would be compared with itself."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +66,8 @@ def gap(
     """Measure what a policy loses on an onboard computer, without mitigation and with it.
 
     Always the same seeds: the policy on the reference computer and on the onboard computer; a
-    policy
-    that was trained as late as that computer decides, there, under the conditions of its training,
-    and on the reference.
+    policy that was trained as late as that computer decides, there, under the conditions of its
+    training, and on the reference.
 
     Args:
         scenario: Policy, onboard computer with its workload or latency (none given: the paper's
@@ -91,10 +80,7 @@ def gap(
         out: Folder; the same one goes on. None makes `runs/<UTC time>-gap-...`.
         progress: Whether to draw bars on standard error.
 
-    Raises:
-        UsageError: Something cannot be flown, or `out` holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    Raises what `evaluate` does.
     """
     declared = declare_gap(
         scenario,
@@ -125,14 +111,32 @@ def declare_gap(
     target = _target(scenario)
     undelayed = _reference(reference, reference_workload, target)
     training, remarks = _training(other, target)
-    cells: list[Cell] = []
-    roles: dict[str, RunEntry] = {}
-    for arena in arenas:
-        here = scenario.model_copy(update={"arena": arena})
-        path = None if other is None else mitigated
-        for cell, entry in _cells(here, policy, other, path, target, undelayed, training):
-            cells.append(cell)
-            roles[cell.name] = entry
+    planned = [
+        ("reference", "reference", policy, undelayed),
+        ("target", "target", policy, target),
+    ]
+    if other is not None:
+        planned.append(("mitigated", "mitigated", other, target))
+        for number, place in enumerate(training, start=1):
+            name = "training" if number == 1 else f"training-{number}"
+            planned.append((name, "training", other, place))
+        planned.append(("mitigated-reference", "mitigated-reference", other, undelayed))
+    cells = []
+    for arena, short in zip(arenas, names, strict=True):
+        for name, role, who, place in planned:
+            flown: dict[str, Any] = {"arena": arena, **place.fields}
+            label = f"{who.name} {place.label}"
+            if who is other:
+                flown["policy"] = mitigated
+            if role == "training":
+                flown["latency_seed"] = TRAINING_LATENCY_SEED
+                label = f"{who.name} as trained"
+                label += f" ({place.name})" if len(training) > 1 else ""
+            asked = scenario.model_copy(update=flown)
+            title = f"{label}, {short}"
+            cells.append(
+                make_cell(f"{short}-{name}", title, asked, label=label, role=role, group=arena)
+            )
     facts = {
         "policy": policy.name,
         "mitigated": None if other is None else other.name,
@@ -147,46 +151,7 @@ def declare_gap(
         "seed": scenario.seed,
         "remarks": list(remarks),
     }
-    name = f"{policy.name}-{target.name}"
-    return Experiment("gap", name, facts, tuple(cells), roles, remarks)
-
-
-def _cells(
-    scenario: Scenario,
-    policy: PolicyInfo,
-    mitigated: PolicyInfo | None,
-    mitigated_path: str | None,
-    target: Conditions,
-    reference: Conditions,
-    training: Sequence[Conditions],
-) -> list[tuple[Cell, RunEntry]]:
-    """Return the runs of one arena."""
-    short = Path(scenario.arena).stem
-
-    def planned(
-        role: Role, title: str, place: Conditions, more: Mapping[str, Any], number: int = 1
-    ) -> tuple[Cell, RunEntry]:
-        name = f"{short}-{role}" if number == 1 else f"{short}-{role}-{number}"
-        asked = scenario.model_copy(update={**place.fields, **more})
-        cell = make_cell(name, f"{title}, {short}", asked)
-        return cell, entry_of(cell, label=title, role=role, group=scenario.arena)
-
-    cells = [
-        planned("reference", f"{policy.name} {reference.label}", reference, {}),
-        planned("target", f"{policy.name} {target.label}", target, {}),
-    ]
-    if mitigated is None:
-        return cells
-    flown = {"policy": mitigated_path}
-    cells.append(planned("mitigated", f"{mitigated.name} {target.label}", target, flown))
-    for number, place in enumerate(training, start=1):
-        which = f" ({place.name})" if len(training) > 1 else ""
-        title = f"{mitigated.name} as trained{which}"
-        drawn = {**flown, "latency_seed": TRAINING_LATENCY_SEED}
-        cells.append(planned("training", title, place, drawn, number))
-    title = f"{mitigated.name} {reference.label}"
-    cells.append(planned("mitigated-reference", title, reference, flown))
-    return cells
+    return Experiment("gap", f"{policy.name}-{target.name}", facts, tuple(cells), remarks)
 
 
 def _mitigated(name: str) -> PolicyInfo | None:

@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    entry_of,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
 from airl_mav.scenario.model import LevelName, Scenario
 
 LEVELS: tuple[LevelName, ...] = ("gym", "lockstep", "sitl")
@@ -41,10 +35,7 @@ def ladder(
         out: Folder; the same one goes on. None makes `runs/<UTC time>-ladder-...`.
         progress: Whether to draw bars on standard error.
 
-    Raises:
-        UsageError: Something cannot be flown, or `out` holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+    Raises what `evaluate` does.
     """
     declared = declare_ladder(scenario, levels, sitl_episodes=sitl_episodes)
     return run_and_compare(declared, out, progress=progress)
@@ -75,7 +66,6 @@ def declare_ladder(
         name=f"{policy.name}-{arena}",
         facts=facts,
         cells=cells,
-        roles={cell.name: entry_of(cell) for cell in cells},
     )
 
 

@@ -8,15 +8,15 @@ from contextlib import contextmanager
 from airl_mav.core.provenance import usable_cores
 from airl_mav.experiments.executors import Executor, ExecutorSettings, InProcessExecutor
 from airl_mav.experiments.process_executor import ProcessExecutor
-from airl_mav.scenario.model import GREATEST_WORKERS
+from airl_mav.scenario.model import GREATEST_WORKERS, Workers
 
 
 @contextmanager
-def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> Iterator[Executor]:
+def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Executor]:
     """Give the executor that was asked for.
 
     Args:
-        settings: What was asked for.
+        settings: What was asked for; without settings of its own no job takes a GPU.
         in_process: Whether one worker may be this process; one is then the default, too.
 
     Raises:
@@ -27,7 +27,8 @@ def open_executor(settings: ExecutorSettings, *, in_process: bool = False) -> It
         # Imported here: Ray is an extra.
         from airl_mav.experiments.ray_executor import connected
 
-        with connected(settings, cores) as executor:
+        gpus = settings.ray_gpus if isinstance(settings, ExecutorSettings) else 0.0
+        with connected(settings, cores, gpus) as executor:
             yield executor
         return
     workers = settings.workers or (1 if in_process else cores)

@@ -22,7 +22,6 @@ from airl_mav.core.errors import FieldError
 from airl_mav.experiments.executors import (
     ONE_THREAD,
     POLL_S,
-    ExecutorSettings,
     Failure,
     J,
     R,
@@ -35,6 +34,7 @@ from airl_mav.experiments.executors import (
     never,
     next_attempt,
 )
+from airl_mav.scenario.model import Workers
 
 LOCAL = "local"
 """Address that starts a Ray of its own on this machine."""
@@ -142,12 +142,13 @@ def _check_reachable(address: str) -> None:
 
 
 @contextmanager
-def connected(settings: ExecutorSettings, cores: int) -> Iterator[RayExecutor]:
+def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecutor]:
     """Be connected to a Ray for a while.
 
     Args:
         settings: Its address, and how much of it may be used.
         cores: Usable cores of this machine.
+        gpus: Share of a GPU that Ray keeps for a job.
 
     Raises:
         UsageError: Ray is not installed, or there is none at that address.
@@ -178,6 +179,6 @@ def connected(settings: ExecutorSettings, cores: int) -> Iterator[RayExecutor]:
     try:
         nodes = [node for node in ray.nodes() if node["Alive"]]
         there = sum(int(node["Resources"].get("CPU", 0)) for node in nodes)
-        yield RayExecutor(settings.workers or max(there, 1), settings.ray_gpus)
+        yield RayExecutor(settings.workers or max(there, 1), gpus)
     finally:
         ray.shutdown()

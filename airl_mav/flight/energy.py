@@ -30,11 +30,6 @@ class EnergySplit:
         """Return the vehicle's energy without its computer [J]."""
         return self.hover_j + self.motion_j + self.manoeuvre_j
 
-    @property
-    def total_j(self) -> float:
-        """Return all of it [J]."""
-        return self.airframe_j + self.computer_j
-
 
 def split_energy(
     path: Trajectory, start_us: int, end_us: int, power: Power, computer_watts: float

@@ -7,7 +7,7 @@ far fewer flights than two runs of different seeds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import (
     BOOTSTRAP_SEED,
     CONFIDENCE,
+    MEANS,
     NO_ESTIMATE,
     RESAMPLES,
     Estimate,
@@ -150,22 +151,21 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
         return NO_ESTIMATE
     value = (gained - lost) / n
     z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
-    # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
-    low, high = (_where_score(gained, lost, n, value, limit, -limit * z) for limit in (-1.0, 1.0))
-    return Estimate(value, low, high, n)
 
+    def end(limit: float) -> float:
+        # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
+        if value == limit:
+            return limit
+        low, high = sorted((value, limit))
+        found = optimize.brentq(
+            lambda difference: _score(difference, gained, lost, n) + limit * z,
+            low,
+            high,
+            xtol=1e-12,
+        )
+        return float(found)
 
-def _where_score(
-    gained: int, lost: int, n: int, value: float, limit: float, target: float
-) -> float:
-    """Return the difference between the estimate and a limit at which the score is `target`."""
-    if value == limit:
-        return limit
-    low, high = sorted((value, limit))
-    found = optimize.brentq(
-        lambda difference: _score(difference, gained, lost, n) - target, low, high, xtol=1e-12
-    )
-    return float(found)
+    return Estimate(value, end(-1.0), end(1.0), n)
 
 
 def _score(d: float, gained: int, lost: int, n: int) -> float:
@@ -240,24 +240,17 @@ def compare_pairs(
     pairs = pair_by_seed(reference, other)
     agreement = count_agreement(pairs)
     good = common_successes(pairs)
-
-    def change(metric: Callable[[Quality], float]) -> Change:
-        return compare_means([metric(a) for a, _ in good], [metric(b) for _, b in good])
-
     return PairedComparison(
         agreement=agreement,
         success_rate=_compare_rates(agreement),
-        flight_time_s=change(lambda quality: quality.flight_time_s),
-        distance_m=change(lambda quality: quality.distance_m),
-        energy_j=change(lambda quality: quality.energy_j),
-        computer_energy_j=change(lambda quality: quality.computer_energy_j),
-        total_energy_j=change(total_energy_j),
+        **{
+            name: compare_means(
+                [getattr(first, name) for first, _ in good],
+                [getattr(second, name) for _, second in good],
+            )
+            for name in MEANS
+        },
     )
-
-
-def total_energy_j(quality: Quality) -> float:
-    """Return the energy of vehicle and computer together [J]."""
-    return quality.energy_j + quality.computer_energy_j
 
 
 def _compare_rates(agreement: Agreement) -> Change:

@@ -36,6 +36,11 @@ class Quality:
     max_speed_m_s: float
     takeoff: Leg
 
+    @property
+    def total_energy_j(self) -> float:
+        """Energy of vehicle and computer together [J]."""
+        return self.energy_j + self.computer_energy_j
+
 
 def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
     """Measure the part of a flight between two simulated times [µs]."""

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
 
 CONFIDENCE = 0.95
@@ -35,6 +36,9 @@ class Estimate:
         )
         return Estimate(value, low, high, self.n)
 
+
+MEANS = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_energy_j")
+"""Measures of a flight's quality whose means two runs are compared by."""
 
 NO_ESTIMATE = Estimate(None, None, None, 0)
 """Nothing to work a figure out from."""
@@ -113,19 +117,17 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     outcomes = dict.fromkeys(Outcome, 0)
     for episode in episodes:
         outcomes[episode.outcome] += 1
-    flown = [episode for episode in episodes if episode.outcome is not Outcome.ABORTED]
-    good = [
-        episode.quality
-        for episode in flown
-        if episode.outcome is Outcome.SUCCESS and episode.quality is not None
-    ]
+    good = successful(episodes)
     return Aggregate(
-        success_rate=wilson(outcomes[Outcome.SUCCESS], len(flown)),
-        flight_time_s=bootstrap_mean([quality.flight_time_s for quality in good]),
-        distance_m=bootstrap_mean([quality.distance_m for quality in good]),
-        energy_j=bootstrap_mean([quality.energy_j for quality in good]),
-        computer_energy_j=bootstrap_mean([quality.computer_energy_j for quality in good]),
-        total_energy_j=bootstrap_mean([q.energy_j + q.computer_energy_j for q in good]),
-        mean_speed_m_s=bootstrap_mean([quality.mean_speed_m_s for quality in good]),
+        success_rate=wilson(outcomes[Outcome.SUCCESS], len(episodes) - outcomes[Outcome.ABORTED]),
         outcomes=outcomes,
+        **{
+            name: bootstrap_mean([getattr(quality, name) for quality in good])
+            for name in (*MEANS, "mean_speed_m_s")
+        },
     )
+
+
+def successful(episodes: Sequence[EpisodeRecord]) -> list[Quality]:
+    """Return the quality of the flights that reached the goal."""
+    return [e.quality for e in episodes if e.outcome is Outcome.SUCCESS and e.quality is not None]

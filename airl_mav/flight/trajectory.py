@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 SAMPLE_US = 20_000
 """Time between samples [µs]: 50 Hz."""
@@ -94,8 +94,8 @@ class Trajectory:
 class TrajectoryRecorder:
     """Collects the true state tick by tick and keeps it at 50 Hz.
 
-    Either `add` every tick with all there is; or, where a tick may cost no more than it must,
-    `integrate` every tick, and `keep` when that says so.
+    A tick costs no more than it must: `integrate` every tick, and `keep` when that says so, or at
+    the last moment of an episode.
     """
 
     def __init__(self) -> None:
@@ -107,32 +107,6 @@ class TrajectoryRecorder:
         self._energy_uj = 0.0
         """Since the last sample: power [W] times microseconds."""
         self._power_w = 0.0
-
-    def add(
-        self,
-        time_us: int,
-        position: ArrayLike,
-        velocity: ArrayLike,
-        quaternion: ArrayLike,
-        power_w: float,
-        *,
-        keep: bool = False,
-    ) -> None:
-        """Take the state after one tick.
-
-        Args:
-            time_us: Simulated time [µs], later than the call before.
-            position: (3,) NED [m].
-            velocity: (3,) NED [m/s].
-            quaternion: (4,) [w, x, y, z] body -> world.
-            power_w: Electrical power over the tick that ends now [W].
-            keep: Keep this one even between samples: the last moment of an episode.
-
-        Raises:
-            ValueError: Time does not advance.
-        """
-        if self.integrate(time_us, power_w) or keep:
-            self.keep(np.concatenate([position, velocity, quaternion]).astype(np.float64))
 
     def integrate(self, time_us: int, power_w: float) -> bool:
         """Take the power of the tick that ends now; return whether a sample is due.
@@ -159,8 +133,8 @@ class TrajectoryRecorder:
         """Sample the moment of the newest `integrate`.
 
         Args:
-            state: (10,) position, velocity, quaternion, as in `add`. Kept as it is, not copied:
-                it must not change afterwards.
+            state: (10,) position NED [m], velocity NED [m/s], quaternion [w, x, y, z] body ->
+                world. Kept as it is, not copied: it must not change afterwards.
 
         Raises:
             ValueError: Nothing was integrated yet.

@@ -44,11 +44,7 @@ class LognormalSampler:
         self, mean_us: float, std_us: float, min_us: float, rng: np.random.Generator
     ) -> None:
         """Take the moments [µs]: 0 <= min_us < mean_us, std_us > 0."""
-        # Moments of a log-normal: mean = exp(mu + s²/2), variance = (exp(s²) - 1) mean².
-        over = mean_us - min_us
-        variance = math.log1p((std_us / over) ** 2)
-        self._mu = math.log(over) - 0.5 * variance
-        self._sigma = math.sqrt(variance)
+        self._mu, self._sigma = lognormal_parameters(mean_us - min_us, std_us)
         self._min_us = min_us
         self._rng = rng
 
@@ -94,6 +90,13 @@ class ReplaySampler:
         latency_us = int(self._samples_us[self._next])
         self._next = (self._next + 1) % self._samples_us.size
         return latency_us
+
+
+def lognormal_parameters(mean: float, std: float) -> tuple[float, float]:
+    """Return mean and standard deviation of the logarithm of a log-normal with these moments."""
+    # mean = exp(mu + s²/2), variance = (exp(s²) - 1) mean².
+    variance = math.log1p((std / mean) ** 2)
+    return math.log(mean) - 0.5 * variance, math.sqrt(variance)
 
 
 def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:

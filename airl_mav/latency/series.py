@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.latency.stages import PERIOD, SETPOINT_TO_MOTOR, STAGES, Samples
+from airl_mav.latency.stages import STAGES, Samples, stage_durations
 from airl_mav.latency.stamps import NO_STAMP
 
 FENCE_RANGES = 3.0
@@ -27,28 +27,18 @@ def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
     """Return the duration [µs] of each stage of each decision of an episode, by the stage's key.
 
     Args:
-        stamps: As for `stages.stage_samples`.
+        stamps: As for `stages.stage_durations`.
 
     Returns:
-        Arrays (n,) for n decisions, `NO_STAMP` where one of a stage's stamps is missing; a decision
-        period stands at the decision that ends it. Without the `NO_STAMP`s each is what
-        `stage_samples` gives.
+        Arrays (n,) for n decisions, `NO_STAMP` where one of a stage's stamps is missing. Without
+        the `NO_STAMP`s each is what `stage_samples` gives.
     """
     names = {name for stage in STAGES for name in (stage.start, stage.end)}
     n = max((len(stamps[name]) for name in names & stamps.keys()), default=0)
     series: dict[str, Samples] = {}
-    for stage in (*STAGES, SETPOINT_TO_MOTOR):
-        durations = np.full(n, NO_STAMP, np.int64)
-        if stage.start in stamps and stage.end in stamps:
-            start, end = stamps[stage.start], stamps[stage.end]
-            both = (start != NO_STAMP) & (end != NO_STAMP)
-            durations[both] = (end - start)[both]
-        series[stage.key] = durations
-    period = np.full(n, NO_STAMP, np.int64)
-    sent = stamps.get("sent_us", np.zeros(0, np.int64))
-    there = np.flatnonzero(sent != NO_STAMP)
-    period[there[1:]] = np.diff(sent[there])
-    series[PERIOD.key] = period
+    for key, (there, durations) in stage_durations(stamps).items():
+        series[key] = np.full(n, NO_STAMP, np.int64)
+        series[key][there] = durations
     return series
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.latency.injection import Injection, choose_injection, moments
+from airl_mav.latency.samplers import lognormal_parameters
 from airl_mav.profiles.computer import (
     LONGEST_MS,
     ComputerProfile,
@@ -43,7 +44,6 @@ def select_injection(
     *,
     policy_sha256: str | None = None,
     macs: int | None = None,
-    option: str = "--latency",
 ) -> Injection:
     """Choose the latency that a policy flies with: a source written as text, or a computer.
 
@@ -53,7 +53,6 @@ def select_injection(
         workload: See `choose_injection`.
         policy_sha256: See `choose_injection`.
         macs: See `choose_injection`.
-        option: What the source is called in messages.
 
     Raises:
         UsageError: There is no such source, computer or workload, or both are given.
@@ -61,8 +60,8 @@ def select_injection(
     if source is None:
         return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
     if workload is not None:
-        raise UsageError(f"{option} {source} with --workload {workload}: accepted: one of them")
-    return parse_latency(source, option)
+        raise UsageError(f"--latency {source} with --workload {workload}: accepted: one of them")
+    return parse_latency(source)
 
 
 def parse_latency(text: str, option: str = "--latency") -> Injection:
@@ -101,10 +100,8 @@ def longest_ms(latency: Latency) -> float:
         return max(latency.samples_ms)
     mean_ms, std_ms = latency.mean_ms or 0.0, latency.std_ms or 0.0
     if latency.distribution == "lognormal" and std_ms:
-        over_ms = mean_ms - latency.min_ms
-        variance = math.log1p((std_ms / over_ms) ** 2)
-        scale = math.log(over_ms) - 0.5 * variance
-        return latency.min_ms + math.exp(scale + Z_999 * math.sqrt(variance))
+        mu, sigma = lognormal_parameters(mean_ms - latency.min_ms, std_ms)
+        return latency.min_ms + math.exp(mu + Z_999 * sigma)
     return mean_ms + Z_999 * std_ms
 
 

@@ -54,25 +54,37 @@ SHOWN_STAGES = (*STAGES, PERIOD)
 """The rows of a latency table."""
 
 
-def stage_samples(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
-    """Return the durations [µs] of each stage in one episode, by the stage's key.
+def stage_durations(
+    stamps: Mapping[str, NDArray[Any]],
+) -> dict[str, tuple[NDArray[np.int64], Samples]]:
+    """Return the stages of an episode's decisions, by the stage's key.
 
     Args:
-        stamps: The decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs]. A
-            stage lacks the decisions where one of its two stamps is `NO_STAMP`, and is empty
-            where a whole column is missing.
+        stamps: The decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs].
+
+    Returns:
+        Two arrays (k,): the decisions that have the stage, and its durations [µs]. A stage lacks
+        the decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column
+        is missing. A decision period belongs to the decision that ends it.
     """
-    samples = {}
+    nothing: Samples = np.zeros(0, np.int64)
+    found = {}
     for stage in (*STAGES, SETPOINT_TO_MOTOR):
-        if stage.start not in stamps or stage.end not in stamps:
-            samples[stage.key] = np.zeros(0, np.int64)
+        start, end = (stamps.get(name) for name in (stage.start, stage.end))
+        if start is None or end is None:
+            found[stage.key] = nothing, nothing
             continue
-        start, end = stamps[stage.start], stamps[stage.end]
-        both = (start != NO_STAMP) & (end != NO_STAMP)
-        samples[stage.key] = (end - start)[both].astype(np.int64)
-    sent = stamps.get("sent_us", np.zeros(0, np.int64))
-    samples[PERIOD.key] = np.diff(sent[sent != NO_STAMP]).astype(np.int64)
-    return samples
+        there = np.flatnonzero((start != NO_STAMP) & (end != NO_STAMP))
+        found[stage.key] = there, (end - start)[there].astype(np.int64)
+    sent = stamps.get("sent_us", nothing)
+    there = np.flatnonzero(sent != NO_STAMP)
+    found[PERIOD.key] = there[1:], np.diff(sent[there]).astype(np.int64)
+    return found
+
+
+def stage_samples(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
+    """Return the durations [µs] of each stage in one episode; see `stage_durations`."""
+    return {key: durations for key, (_, durations) in stage_durations(stamps).items()}
 
 
 def pool(episodes: Iterable[Mapping[str, Samples]]) -> dict[str, Samples]:

@@ -95,7 +95,3 @@ class DecisionLog:
         count = self._count
         rows = self._block[: count * ROW.itemsize].view(ROW)
         return {name: rows[name].copy() for name in ROW.names or ()}
-
-    def clear(self) -> None:
-        """Forget all decisions and keep the room."""
-        self._count = 0

@@ -123,7 +123,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
         its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
     """
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
-    image = _look_up(spec, _pooled(seen.depth_mm, spec.camera_rows, spec.width_px))
+    table = _body_table if spec.layout == "body" else _paper_table
+    image = table(spec.range_m)[_pooled(seen.depth_mm, spec.camera_rows, spec.width_px)]
     if spec.layout == "body":
         safe = np.maximum(distance, 1e-6)
         goal = np.stack(
@@ -160,13 +161,6 @@ def _pooled(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np
     for k in range(1, horizontal):
         nearest = np.minimum(nearest, image[:, :, k::horizontal])
     return nearest
-
-
-def _look_up(spec: ObservationSpec, image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Turn the images of `_pooled` into grey values."""
-    table = _body_table(spec.range_m) if spec.layout == "body" else _paper_table(spec.range_m)
-    grey: NDArray[np.uint8] = table[image]
-    return grey
 
 
 def _depths_m(range_m: float) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
 from airl_mav.policy.actions import Action
-from airl_mav.policy.card import (
-    TORCH_FILE,
-    PolicyCard,
-    open_model,
-    read_card,
-    read_torch_program,
-)
+from airl_mav.policy.card import TORCH_FILE, PolicyCard, open_model, read_card, read_torch_program
 from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.runtime import Runtime, RuntimeName, TorchRuntime, outputs_of
@@ -83,23 +76,17 @@ class LearnedPolicy:
             if (reason := self.refuses(observation.intrinsics)) is not None:
                 raise UsageError(f"policy {self.card.name}: {reason}")
             self._fitting = observation.intrinsics
-        encoded = encode_layout(self.card.observation, _as_batch(observation))
+        encoded = encode_layout(self.card.observation, observation.rows(None))
         return command(self.card.actions, self.act_batch(encoded)[0])
 
     def act_batch(
         self, encoded: Mapping[str, NDArray[Any]], rng: np.random.Generator | None = None
     ) -> NDArray[Any]:
-        """Return the actions of n vehicles, as `action_sets.commands` takes them.
+        """Return the actions of n vehicles, as `action_sets.commands` takes them; see `decide`.
 
         Args:
             encoded: The arrays of the card's layout, each with n rows.
             rng: Source of random actions in this call; None: the policy's own.
-
-        Returns:
-            (n,) int64 of a discrete set, (n, 2) float32 of the continuous one.
-
-        Raises:
-            ValueError: The network gives no number.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
@@ -153,14 +140,9 @@ def load_learned(
 ) -> LearnedPolicy:
     """Load a policy from a folder with `policy.onnx` and `card.json`.
 
-    Args:
-        folder: The folder.
-        card: Its card, where it has been read; None: it is read here.
-        runtime: What runs the network; `torch` takes the folder's `policy.pt2`.
-        threads: Threads of one inference.
-        rng: Source of random actions; a card with an epsilon needs one.
-        ablate: Input that is made zero; None: none.
-        trust: Whether a torch program may run code of its maker; see `open_network`.
+    The card is read where none is given. `runtime`, `threads` and `trust` are those of
+    `open_network`, `rng` and `ablate` those of `LearnedPolicy`. An inference is made at once, so
+    that the first decision in the air is no slower than the others.
 
     Raises:
         UsageError: Card and policy do not fit each other, or the runtime is not installed or not
@@ -169,7 +151,10 @@ def load_learned(
     card = card or read_card(folder)
     network = open_network(folder, card, runtime, threads, trust=trust)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
-    _warm_up(policy, network)
+    blank = {k: np.zeros((1, *box.shape), box.dtype) for k, box in boxes(card.observation).items()}
+    found, wanted = network.infer(blank).shape, (1, outputs_of(card.actions))
+    if found != wanted:
+        raise UsageError(f"policy {card.name}: output {found}; accepted: {wanted}")
     return policy
 
 
@@ -181,14 +166,14 @@ def open_network(
     Args:
         folder: The policy's folder.
         card: Its card.
-        runtime: What runs the network.
+        runtime: What runs the network; `torch` takes the folder's `policy.pt2`.
         threads: Threads of one inference.
         trust: Whether the folder's maker may run code on this machine. `torch.export.load` falls
             back to unpickling, which runs whatever the file says. An ONNX model is data, and the
             policies that come with this package are trusted.
 
     Raises:
-        UsageError: As `load_learned`.
+        UsageError: As of `load_learned`.
     """
     if runtime == "onnx":
         return open_model(folder, card, threads)
@@ -203,27 +188,3 @@ def open_network(
         return TorchRuntime(program, card.observation, threads)
     except ValueError as error:
         raise UsageError(f"{folder / TORCH_FILE}: {error}") from None
-
-
-def _warm_up(policy: LearnedPolicy, network: Runtime) -> None:
-    """Infer once, so that the first decision in the air is no slower than the others."""
-    blank = {
-        key: np.zeros((1, *box.shape), box.dtype)
-        for key, box in boxes(policy.card.observation).items()
-    }
-    found, wanted = network.infer(blank).shape, (1, outputs_of(policy.card.actions))
-    if found != wanted:
-        raise UsageError(f"policy {policy.card.name}: output {found}; accepted: {wanted}")
-
-
-def _as_batch(seen: Observation) -> Observation:
-    """Return the observation of one vehicle as one of n = 1."""
-    return replace(
-        seen,
-        depth_mm=seen.depth_mm[None],
-        goal=seen.goal[None],
-        velocity=seen.velocity[None],
-        roll=np.array([seen.roll]),
-        pitch=np.array([seen.pitch]),
-        yaw=np.array([seen.yaw]),
-    )

@@ -7,7 +7,8 @@ one vehicle in the companion and of n at a time in training.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,12 @@ class Observation:
     """(...) [rad]."""
     yaw: float | Vector
     """(...) heading [rad], 0 = north, positive to the east."""
+
+    def rows(self, index: int | None) -> Observation:
+        """Return what vehicle `index` of n sees, or, with None, one vehicle's as that of n = 1."""
+        names = ("depth_mm", "goal", "velocity", "roll", "pitch", "yaw")
+        found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
+        return replace(self, **found)
 
     @property
     def depth_m(self) -> NDArray[np.float32]:

@@ -84,17 +84,10 @@ def load_policy(
     ablate: str | None = None,
     trust: bool = False,
 ) -> Policy:
-    """Return a policy, ready to decide.
+    """Return a policy, ready to decide, by what is known of it, its name or its folder.
 
-    Args:
-        policy: What is known of it; or its name, or the path of its folder.
-        hold_s: How long each of its actions will be held [s].
-        runtime: What runs the network of a learned policy.
-        threads: Threads of one of its inferences.
-        rng: Source of its random actions; a card with an epsilon needs one.
-        ablate: Input of a learned policy that is made zero; None: none.
-        trust: Whether the maker of a policy's folder may run code on this machine: a torch program
-            of another maker than this package is refused without it.
+    `hold_s` is how long each of its actions will be held [s]. The keywords are those of
+    `learned.load_learned`; only a learned policy takes another runtime or an ablation.
 
     Raises:
         UsageError: There is no such policy (lists those that exist), its card does not fit it, or

@@ -77,7 +77,7 @@ class OnnxRuntime:
                 model, options, providers=["CPUExecutionProvider"]
             )
         except Exception as error:  # ONNX Runtime's errors share no other base class.
-            raise ValueError(f"not a model that ONNX Runtime loads: {_line(error)}") from None
+            raise ValueError(f"not a model that ONNX Runtime loads: {first_line(error)}") from None
         _check_signature(self._session, observation, actions)
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
@@ -108,7 +108,7 @@ class TorchRuntime:
         try:
             self._module = torch.export.load(io.BytesIO(program)).module()
         except Exception as error:  # Anything, from a bad archive to an unknown operator.
-            raise ValueError(f"not a program that torch loads: {_line(error)}") from None
+            raise ValueError(f"not a program that torch loads: {first_line(error)}") from None
         self._torch = torch
         self._keys = tuple(boxes(observation))
 
@@ -150,6 +150,6 @@ def _signature(nodes: Mapping[str, tuple[str, tuple[Any, ...]]]) -> str:
     )
 
 
-def _line(error: Exception) -> str:
+def first_line(error: Exception) -> str:
     """Return the first line of an error."""
     return (str(error) or type(error).__name__).splitlines()[0]

@@ -173,14 +173,9 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
 
 
 def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
-    """Return the profile that a file holds, None when there is none.
+    """Return the profile that a .toml file holds, None when there is no such file.
 
-    Args:
-        path: The file, with the suffix .toml.
-        cpu: Processor of this machine.
-
-    Raises:
-        UsageError: The file is no computer profile, or that of another processor.
+    Raises UsageError if it is no computer profile, or that of another processor than `cpu`.
     """
     if not path.exists():
         return None

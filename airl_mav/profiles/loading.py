@@ -53,8 +53,7 @@ def list_profiles(kind: Kind) -> list[str]:
 def describe_profile(kind: Kind, name: str) -> str:
     """Return the line in which a shipped profile describes itself, "" when it has none.
 
-    Raises:
-        UsageError: There is no such profile, or it is no TOML.
+    Raises UsageError when there is no such profile, or it is no TOML.
     """
     return str(_read(kind, _path(kind, name), ()).get("description", ""))
 
@@ -90,7 +89,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
         raise UsageError(f"{above[0]}: base: leads back to {path}")
     if len(above) > MOST_BASES:
         raise UsageError(f"{above[0]}: base: accepted: at most {MOST_BASES} below each other")
-    data = _parse(path)
+    data = read_toml(path)
     base = data.pop("base", None)
     if base is None:
         return data
@@ -99,7 +98,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     return _overlaid(_read(kind, _path(kind, base), (*above, path)), data)
 
 
-def _parse(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
     """Return what a TOML file holds. Raises UsageError."""
     try:
         with path.open("rb") as file:

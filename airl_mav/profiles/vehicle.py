@@ -282,9 +282,8 @@ class VehicleProfile(ProfileModel):
 def load_vehicle(name: str) -> VehicleProfile:
     """Return a vehicle profile by name or path.
 
-    Raises:
-        UsageError: The profile cannot be used, or sets a parameter that the flight controller
-            does not know or accept.
+    Raises UsageError when it cannot be used, or sets a parameter that the flight controller does
+    not know or accept.
     """
     vehicle = load_profile("vehicles", name, VehicleProfile)
     try:

@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator
 
 from airl_mav.flight.energy import EnergySplit, add_up, split_energy
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import Power
 from airl_mav.rehearsal.run_folder import LoadedRun
@@ -31,12 +32,16 @@ RANKS = 160
 HIGH = 2.0
 """Flights with more than this times the 95th percentile would press all others flat: cut off."""
 
+AIRFRAME = {"hover_j": "hovering", "motion_j": "speed", "manoeuvre_j": "manoeuvres"}
+"""The parts of the airframe's energy, in the order of the tables."""
+
 PARTS = (
-    ("hover_j", "hovering", theme.SERIES),
-    ("manoeuvre_j", "manoeuvres", theme.MARK),
-    ("motion_j", "speed", theme.SERIES_SOFT),
+    ("hover_j", AIRFRAME["hover_j"], theme.SERIES),
+    ("manoeuvre_j", AIRFRAME["manoeuvre_j"], theme.MARK),
+    ("motion_j", AIRFRAME["motion_j"], theme.SERIES_SOFT),
     ("computer_j", "computer", COMPUTER_COLOUR),
 )
+"""What is drawn, from the bottom to the top."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +49,7 @@ class FlightEnergy:
     """One flight's energy, from the start of navigation."""
 
     record: EpisodeRecord
-    airframe_j: float
-    computer_j: float
+    quality: Quality
     parts: EnergySplit | None
     """None where the vehicle's power model or the recording is missing."""
 
@@ -68,8 +72,7 @@ def flight_energies(run: LoadedRun, power: Power | None) -> list[FlightEnergy]:
             if path is None or power is None or len(path) < 2
             else split_energy(path, e.navigation_us, e.ended_us, power, watts)
         )
-        q = e.quality
-        flights.append(FlightEnergy(e, q.energy_j, q.computer_energy_j, parts))
+        flights.append(FlightEnergy(e, e.quality, parts))
     return flights
 
 
@@ -81,9 +84,9 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
         Column("share", "%"),
         Column("mean power", "W"),
     )
-    time_s = sum(f.record.quality.flight_time_s for f in flights if f.record.quality is not None)
-    airframe = sum(f.airframe_j for f in flights)
-    computer = sum(f.computer_j for f in flights)
+    time_s = sum(f.quality.flight_time_s for f in flights)
+    airframe = sum(f.quality.energy_j for f in flights)
+    computer = sum(f.quality.computer_energy_j for f in flights)
     whole = airframe + computer
     splits = [f.parts for f in flights if f.parts is not None]
     lines = [("airframe", airframe)]
@@ -93,11 +96,7 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
     ]
     if splits and len(splits) == len(flights):
         split = add_up(splits)
-        lines += [
-            ("– hovering", split.hover_j),
-            ("– speed", split.motion_j),
-            ("– manoeuvres", split.manoeuvre_j),
-        ]
+        lines += [(f"– {title}", getattr(split, name)) for name, title in AIRFRAME.items()]
         notes.append(
             "The airframe's parts follow the terms of its power model (Krishnan et al. 2021, eq. "
             "1). Hovering: staying up, with the payload. Speed: what moving adds; below 0 where it "
@@ -123,9 +122,7 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
         Column("outcome", number=False),
         Column("time", "s"),
         Column("airframe", "kJ"),
-        Column("hovering", "kJ"),
-        Column("speed", "kJ"),
-        Column("manoeuvres", "kJ"),
+        *(Column(title, "kJ") for title in AIRFRAME.values()),
         Column("computer", "J"),
         Column("mean power", "W"),
     )
@@ -138,19 +135,16 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
 def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     """Return one flight's cells."""
     p = flight.parts
-    names = ("hover_j", "motion_j", "manoeuvre_j")
-    parts = [NONE] * 3 if p is None else [f"{getattr(p, name) / 1e3:.2f}" for name in names]
-    q = flight.record.quality
-    time_s = 0.0 if q is None else q.flight_time_s
-    whole = flight.airframe_j + flight.computer_j
+    parts = [NONE if p is None else f"{getattr(p, name) / 1e3:.2f}" for name in AIRFRAME]
+    q = flight.quality
     return (
         f"{flight.record.index}",
         OUTCOME_LABELS[flight.record.outcome],
-        f"{time_s:.2f}",
-        f"{flight.airframe_j / 1e3:.2f}",
+        f"{q.flight_time_s:.2f}",
+        f"{q.energy_j / 1e3:.2f}",
         *parts,
-        f"{flight.computer_j:,.0f}",
-        f"{whole / time_s:,.1f}" if time_s else NONE,
+        f"{q.computer_energy_j:,.0f}",
+        f"{q.total_energy_j / q.flight_time_s:,.1f}" if q.flight_time_s else NONE,
     )
 
 
@@ -162,7 +156,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     ranked = list(flights)
     kept = np.arange(len(ranked))
     if many:
-        ranked.sort(key=lambda f: f.airframe_j + f.computer_j)
+        ranked.sort(key=lambda f: f.quality.total_energy_j)
         kept = np.unique(np.linspace(0, len(ranked) - 1, RANKS).round().astype(int))
         ranked = [ranked[k] for k in kept]
     whole = all(f.parts is not None for f in flights)
@@ -180,7 +174,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     top = HIGH * float(np.percentile(above, 95.0))
     if above.max() > top > 0.0:
         ax.set_ylim(top=top)
-        over = sum(f.airframe_j + f.computer_j > 1e3 * top for f in flights)
+        over = sum(f.quality.total_energy_j > 1e3 * top for f in flights)
         ax.set_title(
             f"{over} above, up to {above.max():,.0f} kJ",
             loc="right",
@@ -188,7 +182,6 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
             color=theme.MARK,
         )
     ax.axhline(0.0, color=theme.MUTED, lw=0.8)
-    ax.set_ylabel("kJ", fontsize=8.5, color=theme.MUTED)
     if many:
         label = "flights, sorted by their energy"
         ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
@@ -197,7 +190,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
         label = "flight"
         step = -(-len(ranked) // 20)
         ax.set_xticks(x[::step], [f"{f.record.index}" for f in ranked[::step]])
-    ax.set_xlabel(label, fontsize=8.5, color=theme.MUTED)
+    theme.label_axes(ax, label, "kJ")
     theme.plain_axes(ax)
     ax.grid(False, axis="x")
     figure.legend(
@@ -212,7 +205,7 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
 def _joules(flight: FlightEnergy, name: str) -> float:
     """Return one part of a flight's energy [J]; no name: the airframe's."""
     if name == "computer_j":
-        return flight.computer_j
+        return flight.quality.computer_energy_j
     if not name or flight.parts is None:
-        return flight.airframe_j
+        return flight.quality.energy_j
     return float(getattr(flight.parts, name))

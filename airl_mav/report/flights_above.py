@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, START_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Bounds
-from airl_mav.core.files import replace_file
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
@@ -83,12 +82,6 @@ def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]
         )
         for number, panel in enumerate(panels, start=1)
     ]
-
-
-def write_overview(run: LoadedRun, arenas: Mapping[int, Arena]) -> None:
-    """Write `trajectories.png` into a run's folder."""
-    picture = overview_picture(run, arenas)
-    replace_file(run.path / f"{picture.name}.png", picture.png)
 
 
 def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Picture:

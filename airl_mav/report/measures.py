@@ -27,8 +27,9 @@ class Measure:
         "energy_j",
         "computer_energy_j",
         "total_energy_j",
+        "mean_speed_m_s",
     ]
-    """Its field in a `PairedComparison`, and in an `Aggregate`."""
+    """Its field in an `Aggregate`; but for the speed, also in a `PairedComparison`."""
     title: str
     unit: str
     scale: float
@@ -52,9 +53,9 @@ class Measure:
             return NONE
         return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}"
 
-    def with_interval(self, estimate: Estimate) -> str:
-        """Return an estimate in the shown unit with its 95 % interval in brackets."""
-        return with_interval(estimate.scaled(self.scale), self.digits)
+    def with_interval(self, quality: Aggregate) -> str:
+        """Return the measure of a run in the shown unit, its 95 % interval in brackets."""
+        return with_interval(self.of(quality).scaled(self.scale), self.digits)
 
 
 SUCCESS_RATE = Measure("success_rate", "success rate", "%", 100.0, 1, "points")
@@ -62,6 +63,7 @@ FLIGHT_TIME = Measure("flight_time_s", "flight time", "s", 1.0, 2)
 DISTANCE = Measure("distance_m", "distance", "m", 1.0, 2)
 ENERGY = Measure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
 COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
+MEAN_SPEED = Measure("mean_speed_m_s", "mean speed", "m/s", 1.0, 2)
 TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
 
 MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)

@@ -14,19 +14,19 @@ from matplotlib.colorbar import Colorbar
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stages import Samples, Stage
 from airl_mav.report import theme
-from airl_mav.report.table import OUTCOME_LABELS, US_PER_MS, ms
+from airl_mav.report.table import OUTCOME_LABELS, ms
 
 LONG_TAIL = 30.0
 """A maximum this many times the median: the axis becomes logarithmic."""
@@ -87,18 +87,14 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Pi
             bottom.plot(
                 at_us / US_PER_MS, level, "o", ms=4, color=theme.MARK, clip_on=False, zorder=3
             )
-    top.set_title(stage.title, loc="left", fontsize=10.5, color=theme.INK, pad=6)
+    theme.label_axes(top, y="decisions", title=stage.title)
     top.set_title("   ".join(marks), loc="right", fontsize=8.5, color=theme.MARK, pad=6)
-    top.set_ylabel("decisions", fontsize=8.5, color=theme.MUTED)
     top.yaxis.set_major_locator(MaxNLocator(3, integer=True))
-    bottom.set_ylabel("share [%]", fontsize=8.5, color=theme.MUTED)
+    theme.label_axes(bottom, f"ms, n = {summary.n:,}", "share [%]")
     bottom.set_yticks([0, 50, 100])
     bottom.set_ylim(0, 104)
-    bottom.set_xlabel(f"ms, n = {summary.n:,}", fontsize=8.5, color=theme.MUTED)
     if long_tail(values):
-        bottom.set_xscale("log")
-        bottom.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        bottom.xaxis.set_minor_formatter(NullFormatter())
+        theme.logarithmic(bottom, "x")
     else:
         bottom.xaxis.set_major_locator(MaxNLocator(5))
     for ax in (top, bottom):
@@ -152,20 +148,8 @@ def map_figure(
     if trajectory is not None and len(trajectory) > 1:
         _draw_path(figure, ax, episode, trajectory, top_speed)
     theme.plain_axes(ax, grid=False)
-    ax.xaxis.label.set(color=theme.MUTED, fontsize=8.5)
-    ax.yaxis.label.set(color=theme.MUTED, fontsize=8.5)
-    handles, labels = ax.get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower left",
-        ncols=3,
-        frameon=False,
-        fontsize=8,
-        labelcolor=theme.INK,
-        handletextpad=0.4,
-        columnspacing=1.2,
-    )
+    theme.label_axes(ax, "east [m]", "north [m]")
+    theme.legend_below(figure, 3, handletextpad=0.4, columnspacing=1.2)
     label = OUTCOME_LABELS[episode.outcome]
     alt = f"Flight {episode.index} from above, coloured by speed: {label}, {episode.reason}"
     return theme.render(figure, f"flight-{episode.index:03d}-map", alt)
@@ -183,8 +167,6 @@ def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
         0.0, 0.0, marker="^", ms=11, color=theme.SERIES, ls="none", label="start, heading north"
     )
     ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel("east [m]")
-    ax.set_ylabel("north [m]")
 
 
 def _draw_path(
@@ -278,7 +260,7 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture
     )
     for ax, label, values in rows:
         ax.plot(t, values, color=theme.SERIES, lw=1.2)
-        ax.set_ylabel(label, fontsize=8.5, color=theme.MUTED)
+        theme.label_axes(ax, y=label)
         ax.set_ylim(bottom=min(0.0, float(values.min())))
         if t[0] < 0.0:
             ax.axvspan(t[0], 0.0, color=theme.RULE, alpha=0.45, lw=0)
@@ -295,8 +277,6 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture
             fontsize=8,
             color=theme.MUTED,
         )
-    rows[-1][0].set_xlabel(
-        "time since the start of navigation [s]", fontsize=8.5, color=theme.MUTED
-    )
+    theme.label_axes(rows[-1][0], "time since the start of navigation [s]")
     alt = f"Speed, altitude and power over time, flight {episode.index}"
     return theme.render(figure, f"flight-{episode.index:03d}-time", alt)

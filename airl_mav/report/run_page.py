@@ -49,7 +49,7 @@ from airl_mav.report.run_tables import (
     real_time_table,
     setup_rows,
 )
-from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json
+from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json, top_speed
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import Picture, montage
 from airl_mav.report.timeline import OUTLIER_NOTE, slowest_table, timeline_figure, timeline_of
@@ -184,11 +184,6 @@ def _shown(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[SceneFlight]:
     ]
 
 
-def _top_speed(shown: Sequence[SceneFlight]) -> float:
-    """Return the upper end of the colour scale of all paths [m/s]."""
-    return max((float(flight.path.speed().max()) for flight in shown), default=0.0) or 1.0
-
-
 def _flights(
     run: LoadedRun,
     arenas: Mapping[int, Arena],
@@ -197,12 +192,12 @@ def _flights(
 ) -> list[PicturedFlight]:
     """Draw the flights that get pictures, the worst first."""
     numbers = {flight.record.index: k for k, flight in enumerate(shown)}
-    top_speed = _top_speed(shown)
+    top = top_speed(shown)
     flights = []
     for episode in pictured(run):
         number = numbers.get(episode.index)
         path = None if number is None else shown[number].path
-        pictures = [map_figure(episode, path, arenas.get(episode.index), top_speed)]
+        pictures = [map_figure(episode, path, arenas.get(episode.index), top)]
         if path is not None:
             pictures.append(time_figure(episode, path))
         flights.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))

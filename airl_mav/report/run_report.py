@@ -7,7 +7,6 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from airl_mav.arena.geometry import Arena
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.forensics.worst import EXAMINED, ranked
@@ -81,8 +80,3 @@ def show_report(path: Path, console: Console) -> LoadedRun:
     run = load(path)
     print_report(run, console, write_report(run) if run.episodes else None)
     return run
-
-
-def pictured_arenas(run: LoadedRun) -> dict[int, Arena]:
-    """Make the arenas of the flights that get pictures, by episode index. Raises UsageError."""
-    return arenas_of(pictured(run), vehicle_of(run.info))

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import Aggregate, Estimate, aggregate, median_of
+from airl_mav.flight.statistics import MEANS, Aggregate, Estimate, aggregate, median_of, successful
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,
@@ -26,9 +23,6 @@ MODELLED_STAGES = tuple(
     if stage.key not in ("send", "control")
 )
 """Level gym sends in no time, and has link and control in one."""
-
-MEASURES = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "mean_speed_m_s")
-"""Fields of a flight's quality that have a mean and a median."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +53,15 @@ def summarize_run(run: LoadedRun) -> RunSummary:
     """Work out the figures of a run."""
     samples = pool(stage_samples(stamps) for stamps in run.latency.values())
     stages = {stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES}
+    good = successful(run.episodes)
     return RunSummary(
         stages=stages,
         samples=samples,
         quality=aggregate(run.episodes),
-        medians=_medians(run.episodes),
+        medians={
+            name: median_of([getattr(quality, name) for quality in good])
+            for name in (*MEANS, "mean_speed_m_s")
+        },
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
     )
-
-
-def _medians(episodes: Sequence[EpisodeRecord]) -> dict[str, Estimate]:
-    """Return the medians of the flights that reached the goal."""
-    good = [e.quality for e in episodes if e.outcome is Outcome.SUCCESS and e.quality is not None]
-    return {name: median_of([getattr(quality, name) for quality in good]) for name in MEASURES}

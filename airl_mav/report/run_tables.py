@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,17 @@ from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
-from airl_mav.report.measures import FEW_FLIGHTS, rate_digits
+from airl_mav.report.measures import (
+    COMPUTER_ENERGY,
+    DISTANCE,
+    ENERGY,
+    FEW_FLIGHTS,
+    FLIGHT_TIME,
+    MEAN_SPEED,
+    SUCCESS_RATE,
+    Measure,
+    rate_digits,
+)
 from airl_mav.report.run_summary import RunSummary
 from airl_mav.report.table import (
     DURATION_COLUMNS,
@@ -149,18 +160,12 @@ def quality_table(summary: RunSummary) -> TableView:
         Column("n"),
     )
     q = summary.quality
-    measures = (
-        ("flight time", "s", "flight_time_s", 1.0, 2),
-        ("distance", "m", "distance_m", 1.0, 2),
-        ("energy, vehicle", "kJ", "energy_j", 1e-3, 2),
-        ("energy, computer", "J", "computer_energy_j", 1.0, 0),
-        ("mean speed", "m/s", "mean_speed_m_s", 1.0, 2),
+    rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
+    computer = replace(COMPUTER_ENERGY, unit="J", scale=1.0, digits=0)
+    rows = tuple(
+        _estimate_row(measure, measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE))
+        for measure in (rate, FLIGHT_TIME, DISTANCE, ENERGY, computer, MEAN_SPEED)
     )
-    digits = rate_digits(q.success_rate)
-    rows = [_estimate_row("success rate", "%", q.success_rate, NO_ESTIMATE, 100.0, digits)]
-    for title, unit, name, scale, places in measures:
-        mean = getattr(q, name)
-        rows.append(_estimate_row(title, unit, mean, summary.medians[name], scale, places))
     notes = [
         "Means and medians over the flights that reached the goal; n is their number (for the "
         "success rate: all flights but aborted ones). Intervals: Wilson for the rate, bootstrap "
@@ -168,23 +173,17 @@ def quality_table(summary: RunSummary) -> TableView:
     ]
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
-    return TableView("quality", "Quality of flight", columns, tuple(rows), tuple(notes))
+    return TableView("quality", "Quality of flight", columns, rows, tuple(notes))
 
 
-def _estimate_row(
-    title: str, unit: str, estimate: Estimate, median: Estimate, scale: float, digits: int
-) -> tuple[str, ...]:
+def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
     """Return an estimate's cells."""
 
-    def show(value: float | None) -> str:
-        return NONE if value is None else f"{scale * value:,.{digits}f}"
-
     def interval(of: Estimate) -> str:
-        return NONE if of.low is None else f"{show(of.low)} … {show(of.high)}"
+        return NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
 
-    value = NONE if estimate.value is None else f"{show(estimate.value)} {unit}"
-    middle = show(median.value), interval(median)
-    return title, value, interval(estimate), *middle, f"{estimate.n}"
+    value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
+    return measure.title, value, interval(mean), middle, interval(median), f"{mean.n}"
 
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:

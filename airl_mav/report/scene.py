@@ -73,8 +73,8 @@ def scene_json(
         everyone: Those that are shown together, in the last view; none with fewer than two.
         fov_deg: Horizontal field of view of the camera [deg]; 0 draws none.
     """
-    top_speed = max((float(flight.path.speed().max()) for flight in flights), default=1.0) or 1.0
-    views = [flight_view(flight, top_speed, fov_deg) for flight in flights]
+    top = top_speed(flights)
+    views = [flight_view(flight, top, fov_deg) for flight in flights]
     if len(everyone) > 1:
         shared = len({(e.arena, e.arena_seed) for e in run.episodes}) == 1
         arena = next((flight.arena for flight in flights), None)
@@ -83,18 +83,23 @@ def scene_json(
     return text.replace("<", "\\u003c")
 
 
+def top_speed(flights: Sequence[SceneFlight]) -> float:
+    """Return the upper end of the colour scale of all paths [m/s]."""
+    return max((float(flight.path.speed().max()) for flight in flights), default=0.0) or 1.0
+
+
 @cache
 def plotly_script() -> str:
     """Return the library that draws the figures, as one script."""
     return (files("plotly") / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
-def flight_view(flight: SceneFlight, top_speed: float, fov_deg: float) -> dict[str, Any]:
+def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, Any]:
     """Return the view of one flight: a figure, and what its time slider moves.
 
     Args:
         flight: What to show.
-        top_speed: Upper end of the colour scale [m/s].
+        top: Upper end of the colour scale [m/s].
         fov_deg: Horizontal field of view of the camera [deg].
     """
     record, arena = flight.record, flight.arena
@@ -106,7 +111,10 @@ def flight_view(flight: SceneFlight, top_speed: float, fov_deg: float) -> dict[s
     if arena is not None and arena.tours:
         centers, count = arena.centers_at(0), arena.n_static
         bodies = [body_mesh(arena.obstacles, i, centers[i]) for i in range(count, len(centers))]
-        traces += [_mesh(bodies, MOVING_COLOURS[0], "moving obstacle"), *_tour_traces(arena)]
+        traces.append(_mesh(bodies, MOVING_COLOURS[0], "moving obstacle"))
+        for tour in arena.tours:
+            on_floor = np.column_stack([tour.points[:, ::-1], np.full(len(tour.points), 0.05)])
+            traces.append(_line(on_floor, MOVING_COLOURS[0], "way of an obstacle", width=2))
         moving = {
             "trace": len(traces) - 1 - len(arena.tours),
             "corners": [len(corners) for corners, _ in bodies],
@@ -129,7 +137,7 @@ def flight_view(flight: SceneFlight, top_speed: float, fov_deg: float) -> dict[s
                 "color": _rounded(speed),
                 "colorscale": scale,
                 "cmin": 0.0,
-                "cmax": top_speed,
+                "cmax": top,
                 "width": 7,
                 "showscale": True,
                 "colorbar": speed_bar,
@@ -272,19 +280,6 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         ]
         traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
     return traces
-
-
-def _tour_traces(arena: Arena) -> list[Trace]:
-    """Return the ways of the moving obstacles on the floor."""
-    return [
-        _line(
-            np.column_stack([tour.points[:, ::-1], np.full(len(tour.points), 0.05)]),
-            MOVING_COLOURS[0],
-            "way of an obstacle",
-            width=2,
-        )
-        for tour in arena.tours
-    ]
 
 
 def _mesh(

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
 
-US_PER_MS = 1_000.0
 NONE = "–"
 """Shown where there is no value."""
 TOO_FEW_CELL = "too few"
@@ -145,15 +145,13 @@ def rich_table(view: TableView, *, wrap: bool = False) -> Table:
     return table
 
 
-def print_facts(
-    rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim", indent: str = ""
-) -> None:
+def print_facts(rows: Iterable[tuple[str, str]], console: Console, *, style: str = "dim") -> None:
     """Print terms with their texts."""
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style=style, no_wrap=True)
     facts.add_column(overflow="fold")
     for term, text in rows:
-        facts.add_row(f"{indent}{term}", Text(text))
+        facts.add_row(term, Text(text))
     console.print()
     console.print(facts)
 

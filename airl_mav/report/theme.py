@@ -11,12 +11,13 @@ import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from PIL import Image
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
@@ -150,13 +151,22 @@ def plain_axes(ax: Axes, *, grid: bool = True) -> None:
         ax.set_axisbelow(True)
 
 
-def label_axes(ax: Axes, x: str, y: str = "", title: str = "") -> None:
-    """Set the labels of an axes, and its title if it has one."""
-    ax.set_xlabel(x, fontsize=8.5, color=MUTED)
+def label_axes(ax: Axes, x: str = "", y: str = "", title: str = "") -> None:
+    """Set the labels of an axes and its title, those that are given."""
+    if x:
+        ax.set_xlabel(x, fontsize=8.5, color=MUTED)
     if y:
         ax.set_ylabel(y, fontsize=8.5, color=MUTED)
     if title:
         ax.set_title(title, loc="left", fontsize=10.5, color=INK, pad=6)
+
+
+def logarithmic(ax: Axes, axis: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, with plain numbers."""
+    ax.set(**{f"{axis}scale": "log"})
+    shown = ax.xaxis if axis == "x" else ax.yaxis
+    shown.set_major_formatter(StrMethodFormatter("{x:g}"))
+    shown.set_minor_formatter(NullFormatter())
 
 
 def legend_below(figure: Figure | SubFigure, columns: int = 3, **options: Any) -> None:

@@ -8,17 +8,17 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
 from airl_mav.latency.stages import STAGES, Samples, Stage
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_figures import long_tail
-from airl_mav.report.table import US_PER_MS, Column, TableView, ms
+from airl_mav.report.table import Column, TableView, ms
 
 TIMELINE_NAME = "latency-timeline"
 
@@ -106,7 +106,7 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Pictur
     )
     if per > 1:
         label += f"; line: median of {per} decisions, shade: least to greatest"
-    rows[-1].set_xlabel(label, fontsize=8.5, color=theme.MUTED)
+    theme.label_axes(rows[-1], label)
     rows[-1].set_xlim(-0.5, len(timeline) - 0.5)
     rows[-1].xaxis.set_major_locator(MaxNLocator(10, integer=True))
     alt = "Duration of each stage of every decision in the order flown, outliers marked: " + (
@@ -174,9 +174,7 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     ax.set_ylabel("ms", fontsize=8, color=theme.MUTED)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if long_tail(np.sort(found) / US_PER_MS):
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
+        theme.logarithmic(ax, "y")
     elif np.ptp(found) == 0:
         value = found[0] / US_PER_MS
         ax.set_ylim(0.0, 2.0 * value if value > 0.0 else 1.0)

@@ -1,31 +1,19 @@
-"""An architecture search: the networks of each arena, what they cost, and what would be done."""
+"""The page of an architecture search: the networks of each arena, and what they cost."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from rich.console import Console
-
-from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
-from airl_mav.report.heatmap import Field, HeatMap, heat_picture
-from airl_mav.report.table import NONE, Column, TableView, print_facts, print_table
-from airl_mav.sweep.config import SweepConfig
-from airl_mav.sweep.store import SWEEP_FILE, SweepFolder, as_data
-from airl_mav.sweep.summary import Computer, NetworkSummary, Sweep, estimated_ms, published_best
-from airl_mav.sweep.trial import Trial, size_of, training_of, trials
-
-ASIDE = 1.03
-"""Factor between the dots of one network in two arenas."""
-MARKERS = ("o", "s", "^", "D", "v")
-LABELLED = 20
-"""So many networks get their name in the trade-off; of more, only the best of each arena."""
+from airl_mav.report.table import NONE
+from airl_mav.report.theme import Picture
+from airl_mav.sweep.pictures import cost_picture, success_picture, trade_picture
+from airl_mav.sweep.store import SWEEP_FILE, as_data
+from airl_mav.sweep.summary import Sweep, published_best
+from airl_mav.sweep.tables import interval, networks_table, percent
+from airl_mav.sweep.trial import training_of, trials
 
 
 def document_of(sweep: Sweep) -> Document:
@@ -66,145 +54,8 @@ def document_of(sweep: Sweep) -> Document:
     )
 
 
-def print_plan(
-    name: str, config: SweepConfig, computer: Computer | None, path: Path, console: Console
-) -> None:
-    """Print what a sweep would do; nothing is written.
-
-    Raises:
-        UsageError: The folder holds results of something else.
-    """
-    folder, wanted = SweepFolder(path, config), trials(config)
-    ended = sum(folder.result(trial) is not None for trial in wanted)
-    steps = config.training.steps
-    most = "at most " if config.training.selection.stop_at is not None else ""
-    facts = [
-        ("sweep", f"{name}: {config.description}"),
-        ("folder", f"{path}"),
-        ("trials", f"{len(wanted)}, of which {ended} have ended"),
-        ("decisions", f"{most}{steps:,} each, {most}{steps * len(wanted):,} in all"),
-        (
-            "evaluation",
-            f"{config.evaluation.episodes:,} flights each, "
-            f"{config.evaluation.episodes * len(wanted):,} in all",
-        ),
-    ]
-    print_facts(facts, console)
-    for grid in config.grids:
-        first = [t for t in wanted if t.arena == grid.arena and t.seed == config.seeds[0]]
-        console.print()
-        print_table(_plan_table(config, grid.name, first, computer), console)
-
-
-def _plan_table(
-    config: SweepConfig, arena: str, networks: list[Trial], computer: Computer | None
-) -> TableView:
-    columns = (
-        Column("network", number=False),
-        Column("trials"),
-        Column("decisions"),
-        Column("parameters"),
-        Column("MACs"),
-        *([Column("t2, estimated", "ms")] if computer is not None else []),
-    )
-    rows = []
-    for trial in networks:
-        size = size_of(config, trial)
-        late = [] if computer is None else [t2_ms(estimated_ms(computer.profile, size.macs))]
-        rows.append(
-            (
-                trial.network,
-                f"{len(config.seeds)}",
-                f"{config.training.steps * len(config.seeds):,}",
-                count(size.parameters),
-                count(size.macs),
-                *late,
-            )
-        )
-    return TableView(f"plan-{arena}", arena, columns, tuple(rows))
-
-
-# --- numbers as text
-
-
-def count(number: float) -> str:
-    """Return a large number in three digits: 40.4 M."""
-    for unit, size in ((" G", 1e9), (" M", 1e6), (" k", 1e3)):
-        if number >= size:
-            return f"{number / size:.3g}{unit}"
-    return f"{number:.0f}"
-
-
-def t2_ms(value: float | None) -> str:
-    """Return a latency [ms] in three digits."""
-    if value is None:
-        return NONE
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def percent(share: float | None) -> str:
-    """Return a share as a number of percent."""
-    return NONE if share is None else f"{100.0 * share:.1f}"
-
-
-def _interval(cell: NetworkSummary) -> str:
-    rate = cell.success_rate
-    return NONE if rate.low is None else f"{percent(rate.low)} … {percent(rate.high)}"
-
-
-# --- what it says
-
-
-def networks_table(sweep: Sweep, arena: str) -> TableView:
-    """Return the networks of an arena, the best first; those without a result last."""
-    timed = sweep.computer is not None
-    columns = (
-        Column("network", number=False),
-        Column("success", "%"),
-        Column("std"),
-        Column("95 % interval"),
-        Column("seeds"),
-        Column("time", "s"),
-        Column("distance", "m", page_only=True),
-        Column("energy", "kJ", page_only=True),
-        Column("best after", page_only=True),
-        Column("parameters", page_only=True),
-        Column("MACs"),
-        *([Column("t2, estimated", "ms")] if timed else []),
-    )
-    cells = sorted(sweep.of(arena), key=lambda c: (-(c.success_rate.value or -1.0), c.macs))
-    notes = [
-        "Network: layers x filters. Success: mean over the training seeds, each of the same "
-        "flights; std: over the seeds. Interval: the wider of Student's t over the seeds and "
-        "Wilson's over all flights. Time, distance, energy: means over the flights that reached "
-        "the goal. Best after: decisions."
-    ]
-    if sweep.computer is not None:
-        notes.append(
-            f"t2 on {sweep.computer.name}: estimated, in proportion to the multiply-accumulates of "
-            "the workload nearest in its profile; nothing was measured."
-        )
-    rows = tuple(_network_row(cell, timed) for cell in cells)
-    title = f"All networks in {arena}"
-    return TableView(f"networks-{arena}", title, columns, rows, tuple(notes))
-
-
-def _network_row(cell: NetworkSummary, timed: bool) -> tuple[str, ...]:
-    n = cell.success_rate.n
-    return (
-        cell.network,
-        percent(cell.success_rate.value),
-        percent(cell.success_std),
-        _interval(cell),
-        f"{n}" if n == cell.planned else f"{n} of {cell.planned}",
-        NONE if cell.flight_time_s is None else f"{cell.flight_time_s:.2f}",
-        NONE if cell.distance_m is None else f"{cell.distance_m:.1f}",
-        NONE if cell.energy_j is None else f"{cell.energy_j / 1e3:.2f}",
-        NONE if cell.decisions is None else f"{cell.decisions:,.0f}",
-        count(cell.parameters),
-        count(cell.macs),
-        *([t2_ms(cell.t2_ms)] if timed else []),
-    )
+def _arena_pictures(sweep: Sweep, arena: str) -> list[Picture]:
+    return [success_picture(sweep, arena), cost_picture(sweep, arena)]
 
 
 def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
@@ -216,7 +67,7 @@ def best_sentences(sweep: Sweep, arena: str) -> tuple[str, ...]:
     seeds = "1 training seed" if n == 1 else f"{n} training seeds"
     lines = [
         f"Best: {best.network} with {percent(best.success_rate.value)} % "
-        f"({_interval(best)} %, {seeds}, {sum(r.episodes for r in best.results):,} flights)."
+        f"({interval(best)} %, {seeds}, {sum(r.episodes for r in best.results):,} flights)."
     ]
     known = [cell for cell in sweep.of(arena) if cell.results]
     if rivals := sweep.rivals(arena):
@@ -272,168 +123,5 @@ def _headline(sweep: Sweep, arena: str) -> Headline:
         theirs = f"; the paper: {published[0]}, {100.0 * published[1]:.0f} %"
     if best is None:
         return Headline(arena, NONE, "", f"no trial has ended{theirs}")
-    detail = f"{percent(best.success_rate.value)} % ({_interval(best)}){theirs}"
+    detail = f"{percent(best.success_rate.value)} % ({interval(best)}){theirs}"
     return Headline(arena, best.network, "", detail)
-
-
-# --- figures
-
-
-def _arena_pictures(sweep: Sweep, arena: str) -> list[theme.Picture]:
-    return [success_picture(sweep, arena), cost_picture(sweep, arena)]
-
-
-def success_picture(sweep: Sweep, arena: str) -> theme.Picture:
-    """Draw the mean success rate of each network of an arena, with its standard deviation."""
-    best = sweep.best(arena)
-    known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
-    rates = [cell.success_rate.value or 0.0 for cell in known]
-    heat = _heat_map(
-        sweep,
-        arena,
-        title=arena,
-        fields={
-            (cell.layers, cell.filters): Field(
-                100.0 * rate,
-                _success_text(cell),
-                marked=best is not None and cell.network == best.network,
-            )
-            for cell, rate in zip(known, rates, strict=True)
-        },
-        unit="success [%]",
-        limits=(min(10.0 * math.floor(10.0 * min(rates, default=0.0)), 90.0), 100.0),
-        note="success, mean ± std over training seeds [%]",
-    )
-    told = ", ".join(f"{cell.network} {percent(cell.success_rate.value)} %" for cell in known)
-    alt = f"Success by layers and filters in {arena}: {told}"
-    return heat_picture(f"sweep-{arena}", alt, heat)
-
-
-def _success_text(cell: NetworkSummary) -> str:
-    text = percent(cell.success_rate.value)
-    if cell.success_std is not None:
-        text += f"\n± {percent(cell.success_std)}"
-    elif len(cell.results) < cell.planned:
-        text += f"\n{len(cell.results)} of {cell.planned}"
-    return text
-
-
-def cost_picture(sweep: Sweep, arena: str) -> theme.Picture:
-    """Draw what each network costs: multiply-accumulates, or the latency estimated from them."""
-    cells = sweep.of(arena)
-    timed = sweep.computer is not None
-    values = [_cost(sweep, cell) for cell in cells]
-    heat = _heat_map(
-        sweep,
-        arena,
-        title="size" if sweep.computer is None else f"t2 on {sweep.computer.name}, estimated",
-        fields={
-            (cell.layers, cell.filters): Field(
-                value,
-                f"{t2_ms(value)} ms\n{count(cell.macs)} MAC"
-                if timed
-                else f"{count(cell.macs)} MAC\n{count(cell.parameters)} par.",
-            )
-            for cell, value in zip(cells, values, strict=True)
-        },
-        unit="t2, estimated [ms]" if timed else "multiply-accumulates",
-        limits=(min(values), max(max(values), 1.01 * min(values))),
-        note="from multiply-accumulates" if timed else "multiply-accumulates, parameters",
-        logarithmic=True,
-    )
-    alt = f"{heat.title} by layers and filters, {arena}"
-    return heat_picture(f"sweep-size-{arena}", alt, heat)
-
-
-def _heat_map(
-    sweep: Sweep,
-    arena: str,
-    *,
-    title: str,
-    fields: dict[tuple[int, int], Field],
-    unit: str,
-    limits: tuple[float, float],
-    note: str,
-    logarithmic: bool = False,
-) -> HeatMap:
-    grid = next(grid for grid in sweep.config.grids if grid.name == arena)
-    return HeatMap(
-        title,
-        grid.layers,
-        "layers",
-        grid.filters,
-        "filters",
-        fields,
-        unit,
-        limits,
-        logarithmic,
-        note,
-    )
-
-
-def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
-    return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
-
-
-def trade_picture(sweep: Sweep) -> theme.Picture:
-    """Draw success against cost: a dot with its interval for each network."""
-    figure = theme.new_figure(7.4, 4.2)
-    ax: Axes = figure.subplots()
-    known = {arena: [c for c in sweep.of(arena) if c.results] for arena in sweep.arenas}
-    many = sum(map(len, known.values())) > LABELLED
-    for number, (arena, cells) in enumerate(known.items()):
-        best = sweep.best(arena)
-        for cell in cells:
-            x = _cost(sweep, cell) * ASIDE ** (number - 0.5 * (len(known) - 1))
-            chosen = best is not None and cell.network == best.network
-            first = arena if cell is cells[0] else None
-            _draw_network(ax, cell, x, number, chosen=chosen, label=first)
-            if chosen or not many:
-                rise = 6 * (len(known) > 1) * (1 - number)
-                ax.annotate(
-                    cell.network,
-                    (x, 100.0 * (cell.success_rate.value or 0.0)),
-                    xytext=(8, rise),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8,
-                    color=theme.INK,
-                    zorder=4,
-                )
-    ax.set_xscale("log")
-    # Every 1, 2 and 5 has its number: a grid spans hardly more than a decade.
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.xaxis.set_major_formatter(
-        FuncFormatter(lambda v, _: f"{v:g}" if sweep.computer is not None else count(v))
-    )
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    cost = "multiply-accumulates of an inference"
-    if sweep.computer is not None:
-        cost = f"t2 on {sweep.computer.name}, estimated from multiply-accumulates [ms]"
-    theme.label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
-    ax.set_ylim(top=101.5)
-    theme.plain_axes(ax)
-    if len(sweep.arenas) > 1:
-        ax.legend(frameon=False, fontsize=8.5, labelcolor=theme.INK, loc="lower right")
-    return theme.render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
-
-
-def _draw_network(
-    ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
-) -> None:
-    """Draw one network of the arena with a number."""
-    rate, colour = cell.success_rate, theme.line_style(number).colour
-    if rate.low is not None and rate.high is not None:
-        ends = [100.0 * rate.low, 100.0 * rate.high]
-        ax.plot([x, x], ends, color=colour, lw=1.4, alpha=0.55)
-    ax.plot(
-        x,
-        100.0 * (rate.value or 0.0),
-        MARKERS[number % len(MARKERS)],
-        ms=8 if chosen else 6,
-        color=colour,
-        mec=theme.MARK if chosen else theme.PAPER,
-        mew=1.8 if chosen else 0.8,
-        label=label,
-        zorder=3,
-    )

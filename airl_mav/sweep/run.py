@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -26,20 +25,17 @@ MOST_BARS = 12
 """Trials under way that get a bar of their own."""
 
 
-@dataclass(frozen=True)
-class _Start:
-    """What a worker is made of."""
+def _worker(
+    folder: SweepFolder,
+    command: str,
+    device: str,
+    stop: Stop,  # noqa: ARG001 (a worker is ended, and loses no checkpoint)
+) -> Callable[[Trial], list[TrialResult]]:
+    """Return what carries out a trial."""
+    # Imported late: the learner takes two seconds to load, and only a worker needs it.
+    from airl_mav.sweep.run_trial import run_trial
 
-    folder: SweepFolder
-    command: str
-    device: str
-
-    def __call__(self, stop: Stop) -> Callable[[Trial], list[TrialResult]]:  # noqa: ARG002
-        """Return what carries out a trial. `stop`: a worker is ended, and loses no checkpoint."""
-        # Imported late: the learner takes two seconds to load, and only a worker needs it.
-        from airl_mav.sweep.run_trial import run_trial
-
-        return lambda trial: [run_trial(self.folder, trial, self.command, self.device)]
+    return lambda trial: [run_trial(folder, trial, command, device)]
 
 
 def run_sweep(
@@ -90,7 +86,7 @@ def run_sweep(
 
         results = executor.run(
             waiting,
-            _Start(folder, command, device),
+            partial(_worker, folder, command, device),
             name=lambda trial: trial.name,
             stop=stopped,
             lost=say,

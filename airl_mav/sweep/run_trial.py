@@ -16,7 +16,7 @@ from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import Trained, Trial, TrialResult, result_of, size_of, training_of
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import export_best, fit, nominal
-from airl_mav.training.store import CONFIG_FILE, TrainingFolder
+from airl_mav.training.store import TrainingFolder, TrainingProgress
 
 
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
@@ -32,16 +32,13 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
         UsageError: It cannot be trained, or another process is at it.
     """
     config, path = training_of(folder.config, trial), folder.trial_path(trial)
-    if (path / CONFIG_FILE).exists():
-        training = TrainingFolder.open(path, config)
-    else:
-        training = TrainingFolder.create(path, config, command)
     # Waits for a worker that is just being ended to let go of the trial.
-    with locked(path, lambda _: None), training.locked():
+    with locked(path, lambda _: None):
+        training = TrainingFolder.begin(path, config, command, resume=True)
         # Looked at under the lock: whoever had it may have ended the trial.
         if (done := folder.result(trial)) is not None:
             return done
-        best = fit(config, training, None, device)
+        best = fit(config, training, TrainingProgress(), device)
         export_best(training, config, trial.name)
         seeds = folder.config.evaluation
         flown = fly_best(training, config, range(seeds.seed, seeds.seed + seeds.episodes))

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-import numpy as np
-
-from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult
+from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
 from airl_mav.policy.template import Size, template_size
@@ -134,20 +132,15 @@ def result_of(
     outcomes = dict.fromkeys(OUTCOMES.values(), 0)
     for flight in flights:
         outcomes[OUTCOMES[flight.verdict]] += 1
-    good = [f for f in flights if OUTCOMES[f.verdict] is Outcome.SUCCESS]
-    means = {
-        name: float(np.mean([getattr(flight, name) for flight in good])) if good else None
-        for name in ("flight_time_s", "distance_m", "energy_j")
-    }
     return TrialResult(
         trial=trial,
         parameters=parameters,
         macs=macs,
         trained=trained,
         episodes=len(flights),
-        successes=len(good),
+        successes=outcomes[Outcome.SUCCESS],
         outcomes=outcomes,
-        flight_time_s=means["flight_time_s"],
-        distance_m=means["distance_m"],
-        energy_j=means["energy_j"],
+        flight_time_s=mean_of_successes(flights, "flight_time_s"),
+        distance_m=mean_of_successes(flights, "distance_m"),
+        energy_j=mean_of_successes(flights, "energy_j"),
     )

@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from airl_mav.core.errors import UsageError
+from airl_mav.policy.runtime import first_line
 from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import policy_arguments, to_channels_last
@@ -104,8 +105,7 @@ def make_model(
     except (AssertionError, TypeError, ValueError) as error:
         if not algorithm.options:
             raise
-        first = (str(error) or type(error).__name__).splitlines()[0]
-        raise UsageError(f"algorithm.options of {algorithm.name!r}: {first}") from None
+        raise UsageError(f"algorithm.options of {algorithm.name!r}: {first_line(error)}") from None
     to_channels_last(model.policy)
     return model
 

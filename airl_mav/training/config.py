@@ -9,7 +9,6 @@ from pydantic import Field, model_validator
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.action_sets import discrete_actions
 from airl_mav.profiles.computer import load_computer
 
 SELECTION_SEED = 500_000
@@ -135,11 +134,6 @@ class TrainingConfig(ProfileModel):
     network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")
     algorithm: AlgorithmSpec = Field(default_factory=AlgorithmSpec, description="algorithm")
     selection: Selection = Field(default_factory=Selection, description="periodic evaluation")
-
-    @property
-    def discrete(self) -> bool:
-        """Whether the actions are numbered."""
-        return discrete_actions(self.environment.action_spec) is not None
 
 
 def configured(

@@ -19,7 +19,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
-from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS
+from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
 from airl_mav.training.onnx_export import TOLERANCE, export_network, random_inputs
 
 CHECKED = 64
@@ -214,8 +214,9 @@ def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
             path, device="cpu", custom_objects={"buffer_size": 1000, "tensorboard_log": None}
         )
     except Exception as error:  # Unpickling raises whatever the pickled objects do.
-        line = (str(error) or type(error).__name__).splitlines()[0]
-        raise UsageError(f"{path}: not a model of {learner.__name__}: {line}") from None
+        raise UsageError(
+            f"{path}: not a model of {learner.__name__}: {first_line(error)}"
+        ) from None
     return model
 
 

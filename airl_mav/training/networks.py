@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 from gymnasium import spaces
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from airl_mav.core.errors import UsageError
@@ -113,17 +113,6 @@ def to_channels_last(policy: nn.Module) -> None:
     for module in policy.modules():
         if isinstance(module, nn.Conv2d):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-def count_parameters(spec: NetworkSpec, height_px: int, width_px: int, outputs: int = 25) -> int:
-    """Return the weights and biases of a network, from the image to its outputs."""
-    with torch.device("meta"):
-        features = flat_size(spec, height_px, width_px) + VECTOR_INPUTS
-        layers = [
-            *_convolution_stack(spec, height_px),
-            *create_mlp(features, outputs, dense_units(spec)),
-        ]
-        return sum(weights.numel() for layer in layers for weights in layer.parameters())
 
 
 def _convolution_stack(spec: NetworkSpec, height_px: int) -> nn.Sequential:

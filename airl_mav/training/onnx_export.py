@@ -6,7 +6,7 @@ import copy
 import io
 import logging
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
-from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime
+from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime, first_line
 
 OPSET = 18
 """ONNX operators: the newest that torch writes without a conversion."""
@@ -39,56 +39,50 @@ class Layer(NamedTuple):
     macs: int
 
 
-def layers(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> list[Layer]:
-    """Run a network once and return its convolutions and dense layers in order.
+def inspect_network(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tuple[list[Layer], int]:
+    """Run a network once and return what took part in the inference.
 
     Args:
         module: The network.
         inputs: Its inputs, with one row each.
+
+    Returns:
+        Its convolutions and dense layers in order, and the weights and biases of all its parts.
     """
-    found: list[Layer] = []
+    layers: list[Layer] = []
+    weights: dict[int, int] = {}
 
-    def note(layer: nn.Module, _: Any, output: torch.Tensor) -> None:
-        if isinstance(layer, nn.Conv2d):
-            kernel = "x".join(str(side) for side in layer.kernel_size)
-            stride = "" if set(layer.stride) == {1} else f"/{layer.stride[0]}"
-            text = f"conv {layer.out_channels} {kernel}{stride}"
-            found.append(Layer(text, output.numel() * layer.weight[0].numel()))
-        elif isinstance(layer, nn.Linear):
-            found.append(Layer(f"dense {layer.out_features}", output.numel() * layer.in_features))
+    def note(part: nn.Module, _: Any, output: torch.Tensor) -> None:
+        weights.update((id(each), each.numel()) for each in part.parameters(recurse=False))
+        if isinstance(part, nn.Conv2d):
+            kernel = "x".join(str(side) for side in part.kernel_size)
+            stride = "" if set(part.stride) == {1} else f"/{part.stride[0]}"
+            text = f"conv {part.out_channels} {kernel}{stride}"
+            layers.append(Layer(text, output.numel() * part.weight[0].numel()))
+        elif isinstance(part, nn.Linear):
+            layers.append(Layer(f"dense {part.out_features}", output.numel() * part.in_features))
 
-    with _hooked(module, note), torch.no_grad():
-        module(*inputs)
-    return found
-
-
-def count_parameters(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> int:
-    """Return the weights and biases of the layers that take part in an inference."""
-    used: dict[int, int] = {}
-
-    def note(layer: nn.Module, _: Any, __: Any) -> None:
-        used.update((id(weights), weights.numel()) for weights in layer.parameters(recurse=False))
-
-    with _hooked(module, note), torch.no_grad():
-        module(*inputs)
-    return sum(used.values())
+    hooks = [part.register_forward_hook(note) for part in module.modules()]
+    try:
+        with torch.no_grad():
+            module(*inputs)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return layers, sum(weights.values())
 
 
 def export_network(
     module: nn.Module, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
 ) -> PolicyCard:
-    """Write a network as `policy.onnx` with its card, and return the card.
+    """Write a network as `export.export_sb3` does a model, and return its card.
+
+    The network takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; it returns a
+    score for each discrete action (n, k), or the continuous action (n, 2). Scaling the image is its
+    own business.
 
     Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
     without a card, or an old card that refuses the new policy: never a card for the wrong one.
-
-    Args:
-        module: Takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; returns a
-            score for each discrete action (n, k), or the continuous action (n, 2). Scaling the
-            image is its own business.
-        facts: What the card says beyond the network.
-        folder: Where to write; made if need be.
-        with_torch: Also write the network as a torch program.
 
     Raises:
         UsageError: The network does not fit the facts, cannot be exported, or the export differs.
@@ -101,7 +95,7 @@ def export_network(
             program = _program(module, example)
             onnx = _onnx(program)
         except Exception as error:  # torch's exporter raises all kinds.
-            raise UsageError(f"torch cannot export the network: {_line(error)}") from error
+            raise UsageError(f"torch cannot export the network: {first_line(error)}") from error
         archive = _archive(program) if with_torch else None
     try:
         _compare(module, OnnxRuntime(onnx, spec, facts.actions), spec, "ONNX Runtime")
@@ -109,15 +103,14 @@ def export_network(
             _compare(module, TorchRuntime(archive, spec), spec, "the torch program")
     except ValueError as error:
         raise UsageError(f"the exported network: {error}") from None
-    one = tuple(tensor[:1] for tensor in example)
-    parts = layers(module, one)
+    layers, parameters = inspect_network(module, tuple(tensor[:1] for tensor in example))
     card = PolicyCard(
         **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
         sha256=digest(onnx),
         torch_sha256=None if archive is None else digest(archive),
-        network=", ".join(part.text for part in parts),
-        parameters=count_parameters(module, one),
-        macs=sum(part.macs for part in parts),
+        network=", ".join(layer.text for layer in layers),
+        parameters=parameters,
+        macs=sum(layer.macs for layer in layers),
     )
     folder.mkdir(parents=True, exist_ok=True)
     replace_file(folder / ONNX_FILE, onnx)
@@ -200,17 +193,6 @@ def _tensors(spec: ObservationSpec, inputs: Encoded) -> tuple[torch.Tensor, ...]
 
 
 @contextmanager
-def _hooked(module: nn.Module, hook: Callable[[nn.Module, Any, Any], None]) -> Iterator[None]:
-    """Call a hook after each part of a network that runs."""
-    handles = [part.register_forward_hook(hook) for part in module.modules()]
-    try:
-        yield
-    finally:
-        for handle in handles:
-            handle.remove()
-
-
-@contextmanager
 def _quiet() -> Iterator[None]:
     """Silence the deprecation warnings of torch's exporter."""
     log = logging.getLogger("torch.onnx")
@@ -222,8 +204,3 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         log.setLevel(level)
-
-
-def _line(error: Exception) -> str:
-    """Return the first line of an error."""
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -13,6 +13,10 @@ class TrainingBar(TrainingProgress):
         self._progress = progress
         self._bar = progress.bar("training", steps, unit="decisions")
 
+    def waiting(self, why: str) -> None:
+        """Print a line."""
+        self._progress.note(why)
+
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
         """Draw the bar."""
         text = "" if success is None else f"success {success:.0%} in training"

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -20,15 +19,17 @@ from stable_baselines3.common.logger import configure
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.provenance import package_versions
+from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.envs.delay import bounded
-from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, success_rate
+from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
-from airl_mav.envs.vector import FIRST_TRAINING_SEED, LAST_TRAINING_SEED, NavigationVectorEnv
+from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.layouts import Encoded
+from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
@@ -87,17 +88,18 @@ def train(
         KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
     """
     config = config.model_copy(update={"environment": bounded(config.environment)})
-    folder = TrainingFolder.begin(out, config, command, resume=resume)
-    with folder.locked():
+    progress = progress or TrainingProgress()
+    with locked(out, progress.waiting):
+        folder = TrainingFolder.begin(out, config, command, resume=resume)
         best = fit(config, folder, progress, device)
-    return TrainingResult(folder, best, export_best(folder, config, name))
+        return TrainingResult(folder, best, export_best(folder, config, name))
 
 
 def fit(
     config: TrainingConfig,
     folder: TrainingFolder,
-    progress: TrainingProgress | None = None,
-    device: str = "cpu",
+    progress: TrainingProgress,
+    device: str,
 ) -> Evaluation:
     """Train to the end in a locked folder, from the newest checkpoint if there is one.
 
@@ -111,7 +113,7 @@ def fit(
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
-    callback = _BetweenRollouts(config, folder, progress or TrainingProgress(), env)
+    callback = _BetweenRollouts(config, folder, progress, env)
     meta = load_latest(folder.checkpoints, model)
     if meta is not None:
         callback.restore(meta)
@@ -172,7 +174,6 @@ class _BetweenRollouts(BaseCallback):
     def _save(self) -> None:
         self._saved = self.model.num_timesteps
         save_checkpoint(self._folder.checkpoints, self.model, self._meta())
-        self._progress.checkpointed(self._saved)
 
     # --- SB3's hooks
 
@@ -259,7 +260,6 @@ def summary(
     zone: int | None,
 ) -> Evaluation:
     """Return an evaluation in figures."""
-    good = [each for each in flown if each.verdict == Verdict.SUCCESS]
     crashed = sum(each.verdict == Verdict.COLLISION for each in flown)
     return Evaluation(
         steps=steps,
@@ -267,8 +267,8 @@ def summary(
         episodes=len(flown),
         success_rate=success_rate(flown),
         collision_rate=crashed / len(flown),
-        flight_time_s=float(np.mean([each.flight_time_s for each in good])) if good else None,
-        distance_m=float(np.mean([each.distance_m for each in good])) if good else None,
+        flight_time_s=mean_of_successes(flown, "flight_time_s"),
+        distance_m=mean_of_successes(flown, "distance_m"),
         training_success=training_success,
         zone=zone,
     )

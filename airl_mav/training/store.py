@@ -10,16 +10,12 @@ policy/             the result: policy.onnx and card.json
 
 from __future__ import annotations
 
-import fcntl
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 
-from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import (
     append_lines,
@@ -31,14 +27,12 @@ from airl_mav.core.files import (
     typed,
     write_json,
 )
-from airl_mav.core.provenance import describe_machine, git_state, package_versions
+from airl_mav.core.provenance import provenance
 from airl_mav.training.config import TrainingConfig
 
 SCHEMA = 1
 CONFIG_FILE = "train.json"
 EVALUATIONS_FILE = "evaluations.jsonl"
-LOCK_FILE = ".lock"
-"""Locked while a process trains; the system unlocks it however the process ends."""
 BEST_FILE = "best.json"
 BEST_MODEL = "model.zip"
 
@@ -74,6 +68,9 @@ _EVALUATION = TypeAdapter(Evaluation)
 class TrainingProgress:
     """Receives the progress of a training run; by itself it ignores it."""
 
+    def waiting(self, why: str) -> None:
+        """Called when another process has the folder; it is waited for."""
+
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
         """Called after each step of all vehicles.
 
@@ -86,60 +83,45 @@ class TrainingProgress:
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
         """Called after an evaluation; `best`: better than all before it."""
 
-    def checkpointed(self, steps: int) -> None:
-        """Called when a checkpoint is on the disk."""
-
 
 class TrainingFolder:
     """A training run on disk; it can be read and resumed after a kill at any moment."""
 
     def __init__(self, path: Path) -> None:
-        """Wrap a folder; use `begin`, `create` or `open`."""
+        """Wrap a folder; `begin` makes or checks the run in it."""
         self.path = path
+        self.checkpoints = path / "checkpoints"
+        self.tensorboard = path / "tensorboard"
+        self.best_model = path / "best" / BEST_MODEL
+        """The best weights so far, as stable-baselines3 saves them."""
+        self.policy = path / "policy"
+        """The exported result."""
 
     @classmethod
     def begin(
         cls, path: Path, config: TrainingConfig, command: str, *, resume: bool
     ) -> TrainingFolder:
-        """Open the folder to resume its run, if it holds one, or create it. Raises UsageError."""
-        if resume and (path / CONFIG_FILE).exists():
-            return cls.open(path, config)
-        return cls.create(path, config, command)
+        """Begin a run in a folder that exists, or open the one that it holds.
 
-    @classmethod
-    def create(cls, path: Path, config: TrainingConfig, command: str) -> TrainingFolder:
-        """Make the folder. Raises UsageError when it already holds a run."""
-        if (path / CONFIG_FILE).exists():
+        Raises:
+            UsageError: It holds a run that is not to be resumed, or has another configuration.
+        """
+        folder = cls(path)
+        if not (path / CONFIG_FILE).exists():
+            plain = config.model_dump(mode="json", exclude_none=True)
+            about = {"schema": SCHEMA, **provenance(command), "config": plain}
+            write_json(path / CONFIG_FILE, about)
+            return folder
+        if not resume:
             raise UsageError(
                 f"{path}: holds a training run already; accepted: another folder, or resume"
             )
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"{path}: {error.strerror}") from None
-        about = {
-            "schema": SCHEMA,
-            "created_utc": utc_now().isoformat(timespec="seconds"),
-            "command": command,
-            "config": config.model_dump(mode="json", exclude_none=True),
-            "versions": package_versions(),
-            "machine": describe_machine(),
-            "git": git_state(),
-        }
-        write_json(path / CONFIG_FILE, about)
-        return cls(path)
-
-    @classmethod
-    def open(cls, path: Path, config: TrainingConfig) -> TrainingFolder:
-        """Open a run. Raises UsageError if there is none, or it has another configuration."""
-        folder = cls(path)
         theirs = TrainingConfig.model_validate(folder.about()["config"])
-        if theirs != config:
-            changed = [
-                name
-                for name in TrainingConfig.model_fields
-                if getattr(theirs, name) != getattr(config, name)
-            ]
+        if changed := [
+            name
+            for name in TrainingConfig.model_fields
+            if getattr(theirs, name) != getattr(config, name)
+        ]:
             raise UsageError(
                 f"{path}: the run to resume has another configuration "
                 f"({', '.join(changed)}); accepted: the same"
@@ -149,36 +131,6 @@ class TrainingFolder:
     def about(self) -> dict[str, Any]:
         """Return what `train.json` holds. Raises UsageError when there is no run."""
         return read_json(self.path / CONFIG_FILE, SCHEMA, "training run")
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """Lock the folder. Raises UsageError if another process trains in it."""
-        with (self.path / LOCK_FILE).open("wb") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise UsageError(f"{self.path}: another process trains here") from None
-            yield
-
-    @property
-    def checkpoints(self) -> Path:
-        """Where checkpoints lie."""
-        return self.path / "checkpoints"
-
-    @property
-    def tensorboard(self) -> Path:
-        """Where TensorBoard looks."""
-        return self.path / "tensorboard"
-
-    @property
-    def best_model(self) -> Path:
-        """The best weights so far, as stable-baselines3 saves them."""
-        return self.path / "best" / BEST_MODEL
-
-    @property
-    def policy(self) -> Path:
-        """The exported result."""
-        return self.path / "policy"
 
     def evaluations(self) -> list[Evaluation]:
         """Return the evaluations so far; a line cut short by a kill is passed over."""

@@ -54,28 +54,27 @@ class BuiltinAutopilot:
     rate_hz = TICK_HZ
 
     def __init__(self, parameters: Parameters, new_filter: NewFilter = KernelFilter) -> None:
-        """Boot: not armable until the estimator has converged.
-
-        Args:
-            parameters: The parameter store.
-            new_filter: Makes the estimator's filter.
-        """
-        self._parameters = parameters
+        """Boot: not armable until the estimator, whose filter `new_filter` makes, has converged."""
+        self.parameters = parameters
+        """The parameter store."""
         value = parameters.value
-        self._estimator = Estimator(value, new_filter)
-        self._state = self._estimator.state
+        self.estimator = Estimator(value, new_filter)
+        """For consistency checks."""
+        self._state = self.estimator.state
         self._guidance = Guidance(value)
         self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
         parameters.on_change(self._read_gains)
-        self._flight = Flight()
-        self._status = _status(self._flight)
+        self.flight = Flight()
+        """The commander's state."""
+        self._status = _status(self.flight)
         self._messages: list[Message] = []
         self._demand: Demand | None = None
         """What is being flown; None = the motors are stopped."""
         self._motors = _STILL
-        self._sample: SensorSample | None = None
+        self.sample: SensorSample | None = None
+        """The newest tick's sensors; None before the first."""
         self._mag = np.zeros(3)
         self._pressure_hpa = math.nan
         self._gps: GpsFix | None = None
@@ -91,38 +90,36 @@ class BuiltinAutopilot:
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Take one tick's sensors and return the motor commands until the next."""
         time_us = sample.time_us
-        self._estimator.step(sample)
-        self._sample, self._snapshot = sample, None
+        self.estimator.step(sample)
+        self.sample, self._snapshot = sample, None
         if sample.mag is not None:
             self._mag = sample.mag
         if sample.pressure_hpa is not None:
             self._pressure_hpa = sample.pressure_hpa
         if sample.gps is not None:
             self._gps = sample.gps
-        if self._home is None and self._estimator.origin is not None:
+        if self._home is None and self.estimator.origin is not None:
             self._set_home()
-        readiness = READINESS[self._flight.phase][self._estimator.healthy]
+        readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
             self._handle(readiness)
         idle = self._demand is None
-        for due in self._failsafe.events(
-            self._flight, time_us, sample.battery.remaining, idle=idle
-        ):
+        for due in self._failsafe.events(self.flight, time_us, sample.battery.remaining, idle=idle):
             if isinstance(due, Message):
                 self._say(due)
             else:
                 self._handle(due)
-        self._demand = self._guidance.demand(self._state, self._flight.phase, time_us)
+        self._demand = self._guidance.demand(self._state, self.flight.phase, time_us)
         if self._demand is not None:
             self._motors = self._controller.fly(self._state, self._demand)
         elif not idle:
             self._motors = _STILL
             self._controller.rest()
         self._detect_ground(time_us)
-        return ActuatorControls(time_us, self._motors, self._flight.phase >= _GROUND)
+        return ActuatorControls(time_us, self._motors, self.flight.phase >= _GROUND)
 
     def _detect_ground(self, time_us: int) -> None:
-        phase = self._flight.phase
+        phase = self.flight.phase
         if phase is _AIR:
             control = self._controller
             if self._land_detector.landed(
@@ -137,13 +134,13 @@ class BuiltinAutopilot:
     # --- commander
 
     def _handle(self, event: Event) -> Result:
-        before = self._flight
+        before = self.flight
         step = transition(before, event)
-        self._flight, self._status = step.flight, _status(step.flight)
+        self.flight, self._status = step.flight, _status(step.flight)
         self._snapshot = None
         if step.text is not None:
             self._say(step.text)
-        if self._sample is None:
+        if self.sample is None:
             return step.result
         if step.flight.mode is not before.mode:
             self._guidance.enter(step.flight.mode, self._state)
@@ -159,40 +156,20 @@ class BuiltinAutopilot:
             self.on_message(message)
 
     def _set_home(self) -> None:
-        origin = self._estimator.origin
+        origin = self.estimator.origin
         if origin is not None:
             self._home = local_to_geodetic(self._state[P:V], origin)
             self._guidance.at_home(self._state)
             self._snapshot = None
 
     def _read_gains(self) -> None:
-        self._controller.set_gains(Gains.from_parameters(self._parameters.value))
+        self._controller.set_gains(Gains.from_parameters(self.parameters.value))
 
     @property
     def _now_us(self) -> int:
-        return self._sample.time_us if self._sample is not None else 0
+        return self.sample.time_us if self.sample is not None else 0
 
     # --- towards MAVLink (port.AutopilotPort)
-
-    @property
-    def parameters(self) -> Parameters:
-        """The parameter store."""
-        return self._parameters
-
-    @property
-    def estimator(self) -> Estimator:
-        """The estimator, for consistency checks."""
-        return self._estimator
-
-    @property
-    def sample(self) -> SensorSample | None:
-        """The newest tick's sensors; None before the first."""
-        return self._sample
-
-    @property
-    def flight(self) -> Flight:
-        """The commander's state."""
-        return self._flight
 
     @property
     def ticks_to_motors(self) -> int:
@@ -217,7 +194,7 @@ class BuiltinAutopilot:
 
     def arm(self, *, force: bool) -> Result:
         """Ask to arm. Force skips the offboard check, never the estimator's health."""
-        blind = self._flight.mode is Mode.OFFBOARD and not self._failsafe.setpoint_fresh(
+        blind = self.flight.mode is Mode.OFFBOARD and not self._failsafe.setpoint_fresh(
             self._now_us
         )
         return self._handle(Event.ARM_BLIND if blind and not force else Event.ARM)
@@ -228,7 +205,7 @@ class BuiltinAutopilot:
 
     def takeoff(self, altitude_m: float | None) -> Result:
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
-        default = self._parameters["MIS_TAKEOFF_ALT"]
+        default = self.parameters["MIS_TAKEOFF_ALT"]
         self._guidance.takeoff_altitude_m = default if altitude_m is None else altitude_m
         if altitude_m is None:
             text = f"Using default takeoff altitude: {default:.1f} m"
@@ -246,7 +223,7 @@ class BuiltinAutopilot:
 
     def set_home_here(self) -> Result:
         """Make the present position home."""
-        if self._estimator.origin is None:
+        if self.estimator.origin is None:
             return Result.TEMPORARILY_REJECTED
         self._set_home()
         return Result.ACCEPTED
@@ -264,22 +241,19 @@ class BuiltinAutopilot:
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""
-        if self._snapshot is None:
-            self._snapshot = self._take_snapshot()
-        return self._snapshot
-
-    def _take_snapshot(self) -> AutopilotState:
-        sample, demand = self._sample, self._demand
+        if self._snapshot is not None:
+            return self._snapshot
+        sample, demand = self.sample, self._demand
         if sample is None:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        estimate = self._estimator.estimate()
+        estimate = self.estimator.estimate()
         attitude, rates, velocity, thrust = self._controller.setpoints()
         if demand is None:
             setpoint = Setpoint(estimate.position, velocity, math.nan, 0.0)
         else:
             position = np.array(demand.position)
             setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
-        return AutopilotState(
+        self._snapshot = AutopilotState(
             time_us=sample.time_us,
             estimate=estimate,
             status=self._status,
@@ -296,8 +270,9 @@ class BuiltinAutopilot:
             battery=sample.battery,
             gps=self._gps,
             home=self._home,
-            origin=self._estimator.origin,
+            origin=self.estimator.origin,
         )
+        return self._snapshot
 
 
 def _status(flight: Flight) -> CommanderStatus:

@@ -43,13 +43,7 @@ class Climb:
         self.speed_m_s, self._time_us = speed_m_s, None
 
     def towards(self, height_m: float, limits: ClimbLimits, time_us: int) -> None:
-        """Move on to a time.
-
-        Args:
-            height_m: Where to.
-            limits: Of this movement.
-            time_us: Simulated time, rising from call to call [µs].
-        """
+        """Move on to a time [µs], which rises from call to call, on the way to a height [m]."""
         elapsed_s = 0.0 if self._time_us is None else (time_us - self._time_us) / US_PER_S
         self._time_us = time_us
         self.height_m += self.speed_m_s * elapsed_s

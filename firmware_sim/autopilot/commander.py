@@ -131,131 +131,64 @@ _TEMP = Result.TEMPORARILY_REJECTED
 _NO_ARM = Row(result=_TEMP, text=_critical("Arming denied: Resolve system health failures first"))
 _NO_OFFBOARD = Row(result=_TEMP, text=_critical("Switching to Offboard is currently not available"))
 _NOT_LANDED = Row(result=_TEMP, text=_critical("Disarming denied: not landed"))
-_B, _S, _G, _A = Phase.BOOT, Phase.STANDBY, Phase.GROUND, Phase.AIR
+_B, _S, _G, _A = Phase
+_ARMED = Row(phase=_G, text=_info("Armed by external command"))
+_LIFTED = Row(phase=_A, text=_info("Takeoff detected"))
+_LANDED = Row(phase=_G, text=_info("Landing detected"))
+_BACK = Row(choice=Choice.INTENDED)
 
 
 def _ask(mode: Mode, text: Message | None = None) -> Row:
     return Row(choice=Choice.ASK, mode=mode, text=text)
 
 
-def _force(mode: Mode) -> Row:
-    return Row(choice=Choice.FORCE, mode=mode, text=_critical("Failsafe activated"))
+def _force(mode: Mode, text: str = "Failsafe activated") -> Row:
+    return Row(choice=Choice.FORCE, mode=mode, text=_critical(text))
 
 
 def _disarm(text: str) -> Row:
     return Row(phase=_S, choice=Choice.RESTORE, text=_info(text))
 
 
-def _everywhere(row: Row) -> dict[Phase, Row]:
-    return dict.fromkeys(Phase, row)
-
-
 _LANDING = _ask(Mode.LAND, _info("Landing at current position"))
 _CUT = Row(phase=_S, choice=Choice.RESTORE, text=_critical("Failsafe activated: disarmed"))
-_LOW_RETURN = Row(
-    choice=Choice.FORCE, mode=Mode.RETURN, text=_critical("Critical battery, returning now")
-)
-_LOW_LAND = Row(
-    choice=Choice.FORCE, mode=Mode.LAND, text=_critical("Critical battery, landing now")
-)
+_LOW_RETURN = _force(Mode.RETURN, "Critical battery, returning now")
+_LOW_LAND = _force(Mode.LAND, "Critical battery, landing now")
+_DISARMED = _disarm("Disarmed by external command")
+_UNUSED = _disarm("Disarmed by auto preflight disarming")
 
-# Complete: a test checks every pair (event, phase).
-TABLE: dict[Event, dict[Phase, Row]] = {
-    Event.READY: {_B: Row(phase=_S), _S: _IGNORE, _G: _IGNORE, _A: _IGNORE},
+TABLE: dict[Event, tuple[Row, Row, Row, Row]] = {
+    Event.READY: (Row(phase=_S), _IGNORE, _IGNORE, _IGNORE),
     # In the air there is no way back to the ground state: the estimate is flown as it is.
-    Event.NOT_READY: {_B: _IGNORE, _S: Row(phase=_B), _G: _IGNORE, _A: _IGNORE},
-    Event.ARM: {
-        _B: _NO_ARM,
-        _S: Row(phase=_G, text=_info("Armed by external command")),
-        _G: _IGNORE,
-        _A: _IGNORE,
-    },
-    Event.ARM_BLIND: {_B: _NO_ARM, _S: _NO_ARM, _G: _IGNORE, _A: _IGNORE},
-    Event.DISARM: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _disarm("Disarmed by external command"),
-        _A: _NOT_LANDED,
-    },
-    Event.KILL: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _disarm("Disarmed by external command"),
-        _A: _disarm("Disarmed by external command"),
-    },
-    Event.HOLD: _everywhere(_ask(Mode.HOLD)),
+    Event.NOT_READY: (_IGNORE, Row(phase=_B), _IGNORE, _IGNORE),
+    Event.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
+    Event.ARM_BLIND: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
+    Event.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
+    Event.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
+    Event.HOLD: (_ask(Mode.HOLD),) * 4,
     # On the ground, disarmed: accepted, the vehicle stays (as PX4 does it).
-    Event.TAKEOFF: _everywhere(_ask(Mode.TAKEOFF)),
-    Event.OFFBOARD: _everywhere(_ask(Mode.OFFBOARD)),
-    Event.OFFBOARD_BLIND: {
-        _B: _ask(Mode.OFFBOARD),
-        _S: _ask(Mode.OFFBOARD),
-        _G: _NO_OFFBOARD,
-        _A: _NO_OFFBOARD,
-    },
-    Event.LAND: {_B: _ask(Mode.LAND), _S: _ask(Mode.LAND), _G: _LANDING, _A: _LANDING},
-    Event.RETURN: _everywhere(_ask(Mode.RETURN)),
-    Event.POSITION: _everywhere(_ask(Mode.POSITION)),
-    Event.LIFTED: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: Row(phase=_A, text=_info("Takeoff detected")),
-        _A: _IGNORE,
-    },
-    Event.LANDED: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _IGNORE,
-        _A: Row(phase=_G, text=_info("Landing detected")),
-    },
-    Event.TAKEOFF_DONE: {_B: _IGNORE, _S: _IGNORE, _G: _IGNORE, _A: _ask(Mode.HOLD)},
-    Event.DISARM_TIMEOUT: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _disarm("Disarmed by auto preflight disarming"),
-        _A: _IGNORE,
-    },
-    Event.LANDED_TIMEOUT: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _disarm("Disarmed by landing"),
-        _A: _IGNORE,
-    },
+    Event.TAKEOFF: (_ask(Mode.TAKEOFF),) * 4,
+    Event.OFFBOARD: (_ask(Mode.OFFBOARD),) * 4,
+    Event.OFFBOARD_BLIND: (_ask(Mode.OFFBOARD), _ask(Mode.OFFBOARD), _NO_OFFBOARD, _NO_OFFBOARD),
+    Event.LAND: (_ask(Mode.LAND), _ask(Mode.LAND), _LANDING, _LANDING),
+    Event.RETURN: (_ask(Mode.RETURN),) * 4,
+    Event.POSITION: (_ask(Mode.POSITION),) * 4,
+    Event.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
+    Event.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
+    Event.TAKEOFF_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
+    Event.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
+    Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm("Disarmed by landing"), _IGNORE),
     # On the ground the loss only drops out of offboard: nothing may take off by failsafe.
-    Event.SETPOINT_LOST_POSITION: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _force(Mode.POSITION),
-        _A: _force(Mode.POSITION),
-    },
-    Event.SETPOINT_LOST_RETURN: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _force(Mode.LAND),
-        _A: _force(Mode.RETURN),
-    },
-    Event.SETPOINT_LOST_LAND: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _force(Mode.LAND),
-        _A: _force(Mode.LAND),
-    },
-    Event.SETPOINT_LOST_HOLD: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: _force(Mode.HOLD),
-        _A: _force(Mode.HOLD),
-    },
-    Event.SETPOINT_LOST_DISARM: {_B: _IGNORE, _S: _IGNORE, _G: _CUT, _A: _CUT},
-    Event.SETPOINT_BACK: {
-        _B: _IGNORE,
-        _S: _IGNORE,
-        _G: Row(choice=Choice.INTENDED),
-        _A: Row(choice=Choice.INTENDED),
-    },
-    Event.BATTERY_RETURN: {_B: _IGNORE, _S: _IGNORE, _G: _IGNORE, _A: _LOW_RETURN},
-    Event.BATTERY_LAND: {_B: _IGNORE, _S: _IGNORE, _G: _IGNORE, _A: _LOW_LAND},
+    Event.SETPOINT_LOST_POSITION: (_IGNORE, _IGNORE, _force(Mode.POSITION), _force(Mode.POSITION)),
+    Event.SETPOINT_LOST_RETURN: (_IGNORE, _IGNORE, _force(Mode.LAND), _force(Mode.RETURN)),
+    Event.SETPOINT_LOST_LAND: (_IGNORE, _IGNORE, _force(Mode.LAND), _force(Mode.LAND)),
+    Event.SETPOINT_LOST_HOLD: (_IGNORE, _IGNORE, _force(Mode.HOLD), _force(Mode.HOLD)),
+    Event.SETPOINT_LOST_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
+    Event.SETPOINT_BACK: (_IGNORE, _IGNORE, _BACK, _BACK),
+    Event.BATTERY_RETURN: (_IGNORE, _IGNORE, _IGNORE, _LOW_RETURN),
+    Event.BATTERY_LAND: (_IGNORE, _IGNORE, _IGNORE, _LOW_LAND),
 }
+"""[event][phase]: what an event does in BOOT, STANDBY, GROUND and AIR; a test checks every pair."""
 
 
 def _unless_ignored(event: Event, phase: Phase) -> Event | None:

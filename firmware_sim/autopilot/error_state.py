@@ -17,15 +17,7 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.vehicle.rotation import (
-    Quat,
-    Vec,
-    conjugate,
-    exponential,
-    multiply,
-    normalize,
-    rotate,
-)
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, exponential, multiply, normalize, rotate
 
 N_STATES = 16
 POS, VEL, ATT, GYRO, ACC, BARO = 0, 3, 6, 9, 12, 15
@@ -165,11 +157,9 @@ def observe_heading(
 
 @kernel
 def gate_ratio(innovation: Vector, variance: Vector) -> float:
-    """Return the test ratio of a measurement: 1 = at the gate, NaN = an innovation is not finite.
+    """Return the test ratio of an innovation (m,) by its variance (m,).
 
-    Args:
-        innovation: (m,).
-        variance: (m,) of the innovation.
+    1 = at the gate, NaN = an innovation is not finite.
     """
     worst = 0.0
     for i in range(len(innovation)):

@@ -77,13 +77,7 @@ class Measurement:
     """Buffers of one kind of measurement: innovation, its variance and Jacobian."""
 
     def __init__(self, name: str, ratio: int, h: Vector) -> None:
-        """Allocate them.
-
-        Args:
-            name: Name that it is reported by.
-            ratio: Index of its test ratio among the four of the estimate.
-            h: Jacobian (m, 16).
-        """
+        """Allocate them: `ratio` is its index in the estimate's ratios, h the Jacobian (m, 16)."""
         self.name = name
         self.slot = es.RATIO + ratio
         self.h = h
@@ -99,12 +93,7 @@ class Estimator:
     """Turns noisy sensors into position, velocity, attitude and biases; never sees the truth."""
 
     def __init__(self, value: Callable[[str], float], new_filter: NewFilter = KernelFilter) -> None:
-        """Start unaligned.
-
-        Args:
-            value: Looks up EKF2_* parameters by name.
-            new_filter: Makes the filter.
-        """
+        """Start unaligned; `value` looks up EKF2_* parameters by name."""
         self._value = value
         self.origin: Geodetic | None = None
         """Where local NED is zero: the mean of the first fixes; None before alignment."""

@@ -79,12 +79,8 @@ class FailsafeTimers:
     ) -> list[Event | Message]:
         """Return the events and texts that are due, in the order in which they take effect.
 
-        Args:
-            flight: The commander's state.
-            time_us: Now.
-            battery: State of charge 0..1.
-            idle: Whether the motors are stopped: the spool-up and the ramp of a take-off do not
-                count as time on the ground.
+        `battery` is the state of charge 0..1. `idle`: the motors are stopped; the spool-up and the
+        ramp of a take-off do not count as time on the ground.
         """
         due: list[Event | Message] = []
         self._offboard(flight, time_us, due)

@@ -32,14 +32,7 @@ _MOVING = 9
 
 @kernel
 def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
-    """Write (f p)' for the moving rows of f and the first columns of p.
-
-    Args:
-        f: Transition matrix (16, 16).
-        p: (16, >= columns).
-        columns: How many columns of p.
-        out: (columns, 9), written.
-    """
+    """Write (f p)' (columns, 9) for the moving rows of f (16, 16) and the first columns of p."""
     for j in range(columns):
         ax, ay, az = p[ATT, j], p[ATT + 1, j], p[ATT + 2, j]
         bx, by, bz = p[ACC, j], p[ACC + 1, j], p[ACC + 2, j]

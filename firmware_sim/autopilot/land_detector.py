@@ -28,12 +28,8 @@ class LandDetector:
     def landed(self, state: Vector, time_us: int, thrust: float, *, descending: bool) -> bool:
         """Return whether a flying vehicle has come to stand.
 
-        Args:
-            state: The estimator's newest nominal state.
-            time_us: Its time.
-            thrust: Collective that is commanded, 0..1.
-            descending: Whether the setpoint asks to go down: a low-thrust moment in
-                level flight is no landing.
+        `thrust` is the collective that is commanded, 0..1. `descending`: the setpoint asks to go
+        down; a low-thrust moment in level flight is no landing.
         """
         if not (descending and self._carried(thrust) and self._still(state)):
             self._still_since_us = None

@@ -14,11 +14,7 @@ class Parameters:
     """A vehicle's parameters. Implements `port.ParameterStore`."""
 
     def __init__(self, overrides: Mapping[str, int | float] | None = None) -> None:
-        """Start from the defaults and a vehicle profile's overrides.
-
-        Raises:
-            UsageError: An override is unknown or out of range.
-        """
+        """Start from the defaults and a vehicle profile's overrides; see `parameter_values`."""
         values = parameter_values(overrides or {})
         self._values = list(values.values())
         self._floats = {name: float(value) for name, value in values.items()}

@@ -6,17 +6,11 @@ controllers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
-from airl_mav.profiles.vehicle import (
-    CORNERS,
-    COUNTER_CLOCKWISE,
-    ArduPilot,
-    Corner,
-    Px4,
-    VehicleProfile,
-)
+from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE, Corner, VehicleProfile
 from firmware_sim.external.parameter_client import Value, same
 from firmware_sim.flight_controller import FirmwareMissingError
 
@@ -41,150 +35,132 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 """Corner of each motor of ArduCopter's quad X: AP_MotorsMatrix, MOTOR_FRAME_TYPE_X."""
 
 
-class Airframe(Protocol):
+@dataclass(frozen=True)
+class Airframe:
     """What one kind of firmware must be configured to."""
 
     firmware: str
     """Name of the firmware in messages: PX4."""
-
-    @property
-    def motors(self) -> Sequence[Corner]:
-        """Corner of the motor on each of its outputs."""
-        ...
-
-    @property
-    def frame(self) -> Mapping[str, Value]:
-        """Parameters that select the frame and the motors' outputs: only checked, never set."""
-        ...
-
-    @property
-    def settings(self) -> Mapping[str, Value]:
-        """Parameters and their required values: set where that is allowed, checked otherwise."""
-        ...
+    motors: Sequence[Corner]
+    """Corner of the motor on each of its outputs."""
+    frame: Mapping[str, Value]
+    """Parameters that select the frame and the motors' outputs: only checked, never set."""
+    settings: Mapping[str, Value]
+    """Parameters and their required values: set where that is allowed, checked otherwise."""
+    problem: Callable[[Mapping[str, Value]], str | None]
+    """Says what is wrong with the frame that the parameters configure; None = nothing."""
+    also_read: tuple[str, ...] = ()
+    """Further parameters that must be known."""
+    autostart: int = 0
+    """PX4's SYS_AUTOSTART."""
 
     def names(self) -> list[str]:
         """Return the names of all parameters that must be known."""
-        ...
-
-    def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the configured frame; None = nothing."""
-        ...
+        return [*self.also_read, *self.frame, *self.settings]
 
 
-class Px4Airframe:
-    """A quad by PX4's control allocation: rotor positions and turns, output functions."""
+def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
+    """Return a quad by PX4's control allocation: rotor positions and turns, output functions.
 
-    firmware = "PX4"
+    Args:
+        vehicle: Its rotors, and its section on PX4.
+        output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
 
-    def __init__(self, vehicle: VehicleProfile, px4: Px4, output: str) -> None:
-        """Take the vehicle.
-
-        Args:
-            vehicle: Its rotors.
-            px4: The profile's section on PX4.
-            output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
-        """
-        self.motors = px4.motors
-        self.number = px4.airframe
-        """SYS_AUTOSTART."""
-        self._output = output
-        self.frame: dict[str, Value] = {
+    Raises:
+        FirmwareMissingError: The profile has no section on PX4.
+    """
+    px4 = vehicle.px4
+    if px4 is None:
+        raise _no_table("px4")
+    return Airframe(
+        "PX4",
+        px4.motors,
+        frame={
             "CA_AIRFRAME": _PX4_MULTIROTOR,
             "CA_ROTOR_COUNT": len(MOTORS),
-            **{output.format(i + 1): _PX4_MOTOR_1 + CORNERS.index(self.motors[i]) for i in MOTORS},
-        }
-        self.settings: dict[str, Value] = {
+            **{output.format(i + 1): _PX4_MOTOR_1 + CORNERS.index(px4.motors[i]) for i in MOTORS},
+        },
+        settings={
             "THR_MDL_FAC": vehicle.rotor.thrust_curve,
             **vehicle.rotor.px4_geometry(),
             **px4.parameters,
-        }
+        },
+        problem=partial(_px4_problem, px4.motors, output),
+        also_read=(GROUND_LOSS,),
+        autostart=px4.airframe,
+    )
 
-    def names(self) -> list[str]:
-        """Return the names of all parameters that must be known."""
-        return [GROUND_LOSS, *self.frame, *self.settings]
 
-    def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the frame that PX4 is configured for; None = nothing."""
-        if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
+def _px4_problem(motors: Sequence[Corner], output: str, held: Mapping[str, Value]) -> str | None:
+    if held["CA_AIRFRAME"] != _PX4_MULTIROTOR or held["CA_ROTOR_COUNT"] != len(MOTORS):
+        return (
+            f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
+            f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
+        )
+    for number, expected in enumerate(motors, start=1):
+        name = output.format(number)
+        motor = int(held[name]) - _PX4_MOTOR_1
+        if motor not in MOTORS:
+            return f"PX4's {name} is {held[name]}: expected a motor, 101 to 104"
+        found = _corner(held, motor)
+        if found != expected:
             return (
-                f"PX4 flies CA_AIRFRAME {held['CA_AIRFRAME']} with CA_ROTOR_COUNT "
-                f"{held['CA_ROTOR_COUNT']}: expected a multirotor (0) with 4"
+                f"PX4's output {number} ({name} = {held[name]}) turns the motor {found} "
+                f"(CA_ROTOR{motor}_PX, _PY), the vehicle's is {expected}: wrong motor order"
             )
-        for output, expected in enumerate(self.motors, start=1):
-            name = self._output.format(output)
-            motor = int(held[name]) - _PX4_MOTOR_1
-            if motor not in MOTORS:
-                return f"PX4's {name} is {held[name]}: expected a motor, 101 to 104"
-            found = _corner(held, motor)
-            if found != expected:
-                return (
-                    f"PX4's output {output} ({name} = {held[name]}) turns the motor {found} "
-                    f"(CA_ROTOR{motor}_PX, _PY), the vehicle's is {expected}: wrong motor order"
-                )
-            turn, positive = float(held[f"CA_ROTOR{motor}_KM"]), expected in COUNTER_CLOCKWISE
-            if (turn > 0.0) != positive:
-                way = "counter-clockwise" if turn > 0.0 else "clockwise"
-                return (
-                    f"PX4's motor {expected} turns {way} (CA_ROTOR{motor}_KM = {turn:g}), the "
-                    "vehicle's the other way: wrong motor order"
-                )
-        return None
+        turn, positive = float(held[f"CA_ROTOR{motor}_KM"]), expected in COUNTER_CLOCKWISE
+        if (turn > 0.0) != positive:
+            way = "counter-clockwise" if turn > 0.0 else "clockwise"
+            return (
+                f"PX4's motor {expected} turns {way} (CA_ROTOR{motor}_KM = {turn:g}), the "
+                "vehicle's the other way: wrong motor order"
+            )
+    return None
 
 
-class ArduPilotAirframe:
-    """A quad by ArduCopter's frame class and type, and its output functions."""
+def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
+    """Return a quad by ArduCopter's frame class and type, and its output functions.
 
-    firmware = "ArduPilot"
-
-    def __init__(self, ardupilot: ArduPilot) -> None:
-        self.motors = ardupilot.motors
-        self._kind: dict[str, int] = {
-            "FRAME_CLASS": ardupilot.frame_class,
-            "FRAME_TYPE": ardupilot.frame_type,
-        }
-        self.frame: dict[str, Value] = {
-            f"SERVO{i + 1}_FUNCTION": _ARDUPILOT_MOTOR_1 + CORNERS.index(self.motors[i])
+    Raises FirmwareMissingError if the profile has no section on ArduPilot.
+    """
+    copter = vehicle.ardupilot
+    if copter is None:
+        raise _no_table("ardupilot")
+    kind = {"FRAME_CLASS": copter.frame_class, "FRAME_TYPE": copter.frame_type}
+    return Airframe(
+        "ArduPilot",
+        copter.motors,
+        frame={
+            f"SERVO{i + 1}_FUNCTION": _ARDUPILOT_MOTOR_1 + CORNERS.index(copter.motors[i])
             for i in MOTORS
-        }
-        self.settings: dict[str, Value] = {**self._kind, **ardupilot.parameters}
-
-    def names(self) -> list[str]:
-        """Return the names of all parameters that must be known."""
-        return [*self.frame, *self.settings]
-
-    def problem(self, held: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with the frame that ArduCopter is configured for; None = nothing."""
-        for name, expected in self._kind.items():
-            if held[name] != expected:
-                return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
-        for output, corner in enumerate(self.motors, start=1):
-            function = int(held[f"SERVO{output}_FUNCTION"])
-            found = _ARDUPILOT_QUAD_X.get(function - _ARDUPILOT_MOTOR_1 + 1)
-            if found != corner:
-                return (
-                    f"ArduPilot's output {output} (SERVO{output}_FUNCTION = {function}) turns "
-                    f"{'no motor' if found is None else 'the motor ' + found}, the vehicle's is "
-                    f"{corner}: wrong motor order"
-                )
-        return None
+        },
+        settings={**kind, **copter.parameters},
+        problem=partial(_ardupilot_problem, copter.motors, kind),
+    )
 
 
-def px4_airframe(vehicle: VehicleProfile, output: str) -> Px4Airframe:
-    """Return PX4's airframe. Raises UsageError if the profile has no section on PX4."""
-    if vehicle.px4 is None:
-        raise FirmwareMissingError(
-            "--vehicle: its profile has no table [px4]: accepted: one like that of quad"
-        )
-    return Px4Airframe(vehicle, vehicle.px4, output)
+def _ardupilot_problem(
+    motors: Sequence[Corner], kind: Mapping[str, int], held: Mapping[str, Value]
+) -> str | None:
+    for name, expected in kind.items():
+        if held[name] != expected:
+            return f"ArduPilot's {name} is {held[name]}, the vehicle's {expected}: wrong frame"
+    for output, corner in enumerate(motors, start=1):
+        function = int(held[f"SERVO{output}_FUNCTION"])
+        found = _ARDUPILOT_QUAD_X.get(function - _ARDUPILOT_MOTOR_1 + 1)
+        if found != corner:
+            return (
+                f"ArduPilot's output {output} (SERVO{output}_FUNCTION = {function}) turns "
+                f"{'no motor' if found is None else 'the motor ' + found}, the vehicle's is "
+                f"{corner}: wrong motor order"
+            )
+    return None
 
 
-def ardupilot_airframe(vehicle: VehicleProfile) -> ArduPilotAirframe:
-    """Return ArduPilot's airframe. Raises UsageError if the profile has no section on ArduPilot."""
-    if vehicle.ardupilot is None:
-        raise FirmwareMissingError(
-            "--vehicle: its profile has no table [ardupilot]: accepted: one like that of quad"
-        )
-    return ArduPilotAirframe(vehicle.ardupilot)
+def _no_table(name: str) -> FirmwareMissingError:
+    return FirmwareMissingError(
+        f"--vehicle: its profile has no table [{name}]: accepted: one like that of quad"
+    )
 
 
 def differences(held: Mapping[str, Value], wanted: Mapping[str, Value]) -> list[str]:

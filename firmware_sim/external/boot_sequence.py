@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Protocol
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.vehicle import CORNERS
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.airframe_check import GROUND_LOSS, Airframe, differences
-from firmware_sim.external.bridge import Bridge
+from firmware_sim.external.airframe_check import GROUND_LOSS, differences
+from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample
@@ -33,42 +32,14 @@ READY_LIMIT_S = 120.0
 """Longest time from power-up until it may be armed: ArduPilot's EKF takes 40 [simulated s]."""
 
 
-class Launcher(Protocol):
-    """Starts one kind of firmware, or waits for it."""
-
-    airframe: Airframe
-    """The airframe that it must be configured for."""
-    may_set: bool
-    """Whether its parameters may be changed: it was started here, for this flight alone."""
-    reboots: bool
-    """Whether it reboots when told to; otherwise it can only be told to shut down."""
-
-    def launch(self) -> Bridge:
-        """Start it, or wait for it, and return the bridge, connected.
-
-        Raises:
-            FirmwareMissingError: It cannot be started, or never connects.
-            FirmwareLostError: It died while it started.
-        """
-        ...
-
-    def stop(self) -> None:
-        """End what was started; harmless when nothing was."""
-        ...
-
-    def close(self) -> None:
-        """End what was started, for good: nothing temporary is left."""
-        ...
-
-
 class ExternalFlightController:
     """External firmware behind a bridge. Implements `FlightController`."""
 
     internals = None
 
-    def __init__(self, bridge: Bridge, observer: Observer, launcher: Launcher) -> None:
-        """Take the bridge, the observer of its MAVLink, and what started it."""
-        self._bridge = bridge
+    def __init__(self, launcher: Launcher, observer: Observer) -> None:
+        """Start the firmware, or wait for it; see `Launcher.launch`. `observer`: of its MAVLink."""
+        self._bridge = bridge = launcher.launch()
         self._observer = observer
         self._launcher = launcher
         self._output = tuple(launcher.airframe.motors.index(corner) for corner in CORNERS)
@@ -102,7 +73,6 @@ class ExternalFlightController:
         """End it if it was started here; otherwise tell it to reboot or shut down."""
         if not self._launcher.may_set:
             self._send_shutdown()
-        self._bridge.close()
         self._launcher.stop()
 
     def _send_shutdown(self) -> None:
@@ -124,10 +94,7 @@ class ExternalFlightStack:
     def __init__(self, launcher: Launcher, observer: Observer, timeout_s: float) -> None:
         """Compose it; nothing is started yet.
 
-        Args:
-            launcher: Starts the firmware.
-            observer: Listens to its MAVLink.
-            timeout_s: Longest wait for each of its answers during the boot sequence [wall s].
+        `timeout_s` is the longest wait for each of its answers during the boot sequence [wall s].
         """
         self._launcher = launcher
         self._observer = observer
@@ -144,7 +111,7 @@ class ExternalFlightStack:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
         del setup  # Each start is a power-up: it knows nothing of the last flight.
         self._observer.restart()
-        return ExternalFlightController(self._launcher.launch(), self._observer, self._launcher)
+        return ExternalFlightController(self._launcher, self._observer)
 
     def connect(self, tick: Callable[[], int]) -> None:
         """Run the boot sequence on the ground until the frame is checked and it may be armed.

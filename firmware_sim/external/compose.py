@@ -21,15 +21,16 @@ from firmware_sim.external.airframe_check import (
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.ardupilot.program import Links, find_arducopter
 from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
-from firmware_sim.external.boot_sequence import ExternalFlightStack, Launcher
+from firmware_sim.external.boot_sequence import ExternalFlightStack
+from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
-from firmware_sim.external.process.sitl_launcher import SitlLauncher
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import WorkingFolders
 from firmware_sim.external.px4 import program as px4_program
-from firmware_sim.external.px4.hitl import HitlLauncher
+from firmware_sim.external.px4.board_link import BoardLink
+from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import Px4Bridge
-from firmware_sim.external.transport.router import Router, RouterEnd
+from firmware_sim.external.transport.router import Router
 from firmware_sim.mavlink.endpoint import Endpoint, UdpEndpoint
 from firmware_sim.mavlink.udp_links import UdpLinks
 
@@ -68,13 +69,13 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
         local_option="--instance",
         remote_option="--instance",
     )
-    launcher = SitlLauncher(
+    launcher = Launcher(
         airframe,
         partial(Px4Bridge, px4_program.SIMULATOR_PORT + instance),
-        None if program is None else partial(program.start, instance, airframe.number),
-        WorkingFolders("px4", options.firmware_dir, wanted.log),
-        timeout_s=options.firmware_timeout,
+        options.firmware_timeout,
         reboots=False,
+        program=None if program is None else partial(program.start, instance, airframe.autostart),
+        folders=WorkingFolders("px4", options.firmware_dir, wanted.log),
     )
     return launcher, endpoint
 
@@ -92,13 +93,14 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     )
     links = Links(ports.api_port, ports.gcs_port, endpoint.local[1])
     start = ardupilot_program.start
-    launcher = SitlLauncher(
+    launcher = Launcher(
         airframe,
         partial(ArdupilotBridge, ardupilot_program.simulator_port(instance)),
-        None if program is None else partial(start, program, instance, links, airframe.settings),
-        WorkingFolders("ardupilot", options.firmware_dir, wanted.log),
-        timeout_s=options.firmware_timeout,
-        reboots=True,
+        options.firmware_timeout,
+        program=None
+        if program is None
+        else partial(start, program, instance, links, airframe.settings),
+        folders=WorkingFolders("ardupilot", options.firmware_dir, wanted.log),
     )
     return launcher, endpoint
 
@@ -108,13 +110,11 @@ def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
     router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
-        launcher = HitlLauncher(
-            airframe, router, options.serial or "", options.baud, options.firmware_timeout
-        )
+        link = BoardLink(router, options.serial or "", options.baud)
     except UsageError:
         router.close()
         raise
-    return launcher, RouterEnd(router)
+    return Launcher(airframe, partial(HitlBridge, link), options.firmware_timeout), router
 
 
 _PARTS: dict[FirmwareName, Callable[[Wanted], tuple[Launcher, Endpoint]]] = {

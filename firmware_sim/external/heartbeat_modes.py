@@ -30,14 +30,9 @@ _IN_AIR = (
 def flight_of(
     autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
 ) -> Flight:
-    """Return phase and mode.
+    """Return phase and mode by the fields of HEARTBEAT and EXTENDED_SYS_STATE.
 
-    Args:
-        autopilot: HEARTBEAT's MAV_AUTOPILOT.
-        custom_mode: HEARTBEAT's.
-        landed_state: EXTENDED_SYS_STATE's MAV_LANDED_STATE.
-        armed: Whether motors may turn.
-        ready: Whether it may be armed.
+    `armed`: motors may turn; `ready`: it may be armed.
     """
     if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
         mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)

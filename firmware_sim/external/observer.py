@@ -48,12 +48,7 @@ class Observer:
     """One link to external firmware. Nothing blocks, and no received message raises."""
 
     def __init__(self, endpoint: Endpoint, name: str) -> None:
-        """Take the link.
-
-        Args:
-            endpoint: Where the firmware is received.
-            name: Name of the link in the traffic counters.
-        """
+        """Take the link to the firmware; `name` is its name in the traffic counters."""
         self._endpoint = endpoint
         self._name = name
         self._decoder = Decoder(datagrams=endpoint.datagrams)

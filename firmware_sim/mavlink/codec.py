@@ -13,7 +13,7 @@ import functools
 import inspect
 import re
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import accumulate
 from operator import itemgetter
 from typing import TypeAlias
@@ -100,12 +100,8 @@ class _ParamValue(dialect.MAVLink_param_value_message):  # type: ignore[misc]
 def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> WireMessage:
     """Return a PARAM_VALUE.
 
-    Args:
-        name: Parameter name, at most 16 characters.
-        raw: The value's four bytes, little endian.
-        kind: MAV_PARAM_TYPE of those bytes.
-        count: Number of parameters.
-        index: The parameter's index; 65535 = it has none.
+    The name has at most 16 characters; `raw` is the value's four bytes, little endian, and `kind`
+    their MAV_PARAM_TYPE; `count` is the number of parameters; index 65535 = it has none.
     """
     message = _ParamValue(name.encode("ascii"), 0.0, kind, count, index)
     message.raw_value = raw
@@ -121,7 +117,8 @@ class Layout:
         names = kind.ordered_fieldnames
         formats = dict(zip(names, _FIELD_FORMAT.findall(kind.unpacker.format), strict=True))
         sizes = dict(zip(names, kind.lengths, strict=True))
-        firsts = dict(zip(kind.fieldnames, _starts(sizes[n] for n in kind.fieldnames), strict=True))
+        starts = accumulate((sizes[n] for n in kind.fieldnames), initial=0)
+        firsts = dict(zip(kind.fieldnames, starts, strict=False))  # the last one is the end
         self._packers: dict[int, _Packer] = {}
         # Extension fields come last on the wire too: without them a payload is a shorter one.
         for end in range(len(names) - len(_extension_fields(kind)), len(names) + 1):
@@ -159,11 +156,6 @@ def _x25(data: bytes) -> int:
 # CRC-16/MCRF4XX. pymavlink's x25crc is a class around fastcrc's function (which a platform may
 # lack): making its object would cost more than the checksum.
 _checksum: Callable[[bytes], int] = _x25 if mavcrc.mcrf4xx is None else mavcrc.mcrf4xx
-
-
-def _starts(sizes: Iterable[int]) -> list[int]:
-    """Return where each of some consecutive runs of the given sizes begins."""
-    return [0, *accumulate(sizes)][:-1]
 
 
 def _extension_fields(kind: type[WireMessage]) -> list[str]:
@@ -208,9 +200,8 @@ class Decoder:
     def __init__(self, *, datagrams: bool) -> None:
         """Start empty.
 
-        Args:
-            datagrams: True when every chunk holds whole frames (UDP); False for a byte stream
-                (serial), where a frame may be continued in the next chunk.
+        `datagrams`: every chunk holds whole frames (UDP); else it is a byte stream (serial), where
+        a frame may be continued in the next chunk.
         """
         self.malformed = 0
         """Runs of bytes that belong to no valid frame."""
@@ -237,7 +228,8 @@ class Decoder:
                 end = None
             message = None if end is None else self._decode(buffer, start, end)
             if end is None or message is None:
-                self._reject()
+                self.malformed += not self._in_garbage
+                self._in_garbage = True
                 start += 1
                 continue
             self._in_garbage = False
@@ -249,11 +241,6 @@ class Decoder:
         if self._datagrams:
             self._in_garbage = False
         return found
-
-    def _reject(self) -> None:
-        if not self._in_garbage:
-            self.malformed += 1
-            self._in_garbage = True
 
     def _decode(self, buffer: bytes, start: int, end: int) -> WireMessage | None:
         try:

@@ -133,20 +133,20 @@ class UdpEndpoint:
         if remote is not None:
             remote = _usable(remote, remote_option, lowest_port=1, insecure=insecure)
         self._remote = remote
-        self._peer: Address | None = None
+        self.peer: Address | None = None
+        """The newest sender that is not the preset remote, None before any."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
             self._socket.bind(local)
         except OSError as error:
             self._socket.close()
-            raise UsageError(_bind_problem(local, local_option, error)) from error
+            problem = f"cannot be used ({error.strerror})"
+            if error.errno == errno.EADDRINUSE:
+                problem = "is taken (another simulator?)"
+            where = f"UDP port {local[1]} on {local[0]}"
+            raise UsageError(f"{where} {problem}: choose another with {local_option}") from error
         self.local: Address = self._socket.getsockname()
-
-    @property
-    def peer(self) -> Address | None:
-        """The newest sender that is not the preset remote, None before any."""
-        return self._peer
 
     def receive(self) -> list[bytes]:
         """Return the datagrams that have arrived, oldest first, and note their sender."""
@@ -158,14 +158,14 @@ class UdpEndpoint:
                 break
             except OSError:
                 continue  # an earlier send was refused (ICMP): nothing arrived
-            if address not in (self._remote, self._peer) and data and data[0] in _MARKERS:
-                self._peer = address
+            if address not in (self._remote, self.peer) and data and data[0] in _MARKERS:
+                self.peer = address
             chunks.append(data)
         return chunks
 
     def send(self, data: bytes) -> None:
         """Send one frame to the preset remote and to the learned peer."""
-        for address in (self._remote, self._peer):
+        for address in (self._remote, self.peer):
             if address is None:
                 continue
             try:
@@ -203,10 +203,3 @@ def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) 
             "unauthenticated (no signing yet): add --insecure to allow it on a trusted network"
         )
     return number, port
-
-
-def _bind_problem(local: Address, option: str, error: OSError) -> str:
-    where = f"UDP port {local[1]} on {local[0]}"
-    if error.errno == errno.EADDRINUSE:
-        return f"{where} is taken (another simulator?): choose another with {option}"
-    return f"{where} cannot be used ({error.strerror}): choose another with {option}"

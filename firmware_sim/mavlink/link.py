@@ -73,13 +73,7 @@ class Link:
         builders: Mapping[str, Builder],
         replies: Mapping[str, Builder] | None = None,
     ) -> None:
-        """Open the link.
-
-        Args:
-            config: What it is made of.
-            builders: What can be streamed.
-            replies: Builds the same messages on request; None = the same builders.
-        """
+        """Open a link that can stream `builders`, and reply with `replies`; None = the same."""
         self.name = config.name
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
@@ -89,7 +83,7 @@ class Link:
         self.tap: Callable[[bytes], None] | None = None
         """Called with every frame of both directions, if set."""
         self.ignored = 0
-        self._endpoint = config.endpoint
+        self.endpoint = config.endpoint
         self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder()
@@ -109,16 +103,13 @@ class Link:
             tx=self._tx,
             malformed=self._decoder.malformed,
             ignored=self.ignored + self._decoder.unknown,
-            send_errors=self._unsendable + self._endpoint.send_errors,
+            send_errors=self._unsendable + self.endpoint.send_errors,
         )
 
     def receive(self) -> list[WireMessage]:
         """Return the messages that have arrived, oldest first."""
         messages: list[WireMessage] = []
-        chunks = self._endpoint.receive()
-        if not chunks:
-            return messages
-        for chunk in chunks:
+        for chunk in self.endpoint.receive():
             messages += self._decoder.feed(chunk)
         self._rx += len(messages)
         if self.tap is not None:
@@ -148,7 +139,7 @@ class Link:
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
             self.flush()  # frames leave in the order of their sequence numbers
-        self._endpoint.send(frame)
+        self.endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
             self.tap(frame)
@@ -164,10 +155,7 @@ class Link:
     def stream_due(self, names: Iterable[str], state: AutopilotState, payloads: Payloads) -> None:
         """Add streams to this tick's telemetry; as `send` when their values do not fit.
 
-        Args:
-            names: The streams.
-            state: The snapshot of this tick.
-            payloads: What has been built from it so far; gets what is built here.
+        `payloads` is what has been built from this tick's snapshot; gets what is built here.
         """
         frames, encoder = self._pending, self._stream_encoder
         for name in names:
@@ -187,7 +175,7 @@ class Link:
         if not frames:
             return
         self._pending = []
-        self._endpoint.send_streams(frames)
+        self.endpoint.send_streams(frames)
         self._tx += len(frames)
         if self.tap is not None:
             for frame in frames:
@@ -199,14 +187,6 @@ class Link:
         except (struct.error, OverflowError):
             self._unsendable += 1
             return None
-
-    def fileno(self) -> int | None:
-        """Return the endpoint's descriptor, None when there is none."""
-        return self._endpoint.fileno()
-
-    def close(self) -> None:
-        """Close the endpoint."""
-        self._endpoint.close()
 
 
 def _payload(shape: Layout, values: Values | None) -> bytes | None:

@@ -6,8 +6,6 @@ src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Mode
 from firmware_sim.mavlink.codec import dialect
 
@@ -22,16 +20,28 @@ _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.POSITION: (MAIN_POSCTL, 0),
 }
 
-_AUTO_MODES = {sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO}
 
-# Modes of a real PX4 that need a pilot's input or a mission: known by name, never available.
-_UNAVAILABLE_MAIN = {1: "Manual", 2: "Altitude", 5: "Acro", 7: "Stabilized"}
-_UNAVAILABLE_AUTO = {
-    0: "Mission",
-    4: "Mission",
-    8: "Follow Target",
-    9: "Precision Landing",
-    **{sub: f"External {sub - 10}" for sub in range(11, 19)},
+def _unavailable(name: str) -> str:
+    return f"Switching to {name} is currently not available"
+
+
+# What can be asked for, by main mode, and in AUTO by sub mode. The texts: modes of a real PX4 that
+# need a pilot's input or a mission, known by name, never available.
+_MAIN_MODES: dict[int, Mode | str] = {
+    MAIN_OFFBOARD: Mode.OFFBOARD,
+    MAIN_POSCTL: Mode.POSITION,
+    1: _unavailable("Manual"),
+    2: _unavailable("Altitude"),
+    5: _unavailable("Acro"),
+    7: _unavailable("Stabilized"),
+}
+_AUTO_MODES: dict[int, Mode | str] = {
+    **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO},
+    0: _unavailable("Mission"),
+    4: _unavailable("Mission"),
+    8: _unavailable("Follow Target"),
+    9: _unavailable("Precision Landing"),
+    **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},
 }
 
 
@@ -55,58 +65,31 @@ def base_mode(status: CommanderStatus) -> int:
 
 def system_status(status: CommanderStatus) -> int:
     """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe."""
-    state: int
     if status.arming is Arming.ARMED:
-        state = dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE
-    elif status.arming is Arming.STANDBY:
-        state = dialect.MAV_STATE_STANDBY
-    else:
-        state = dialect.MAV_STATE_UNINIT
-    return state
+        return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
+    standby = status.arming is Arming.STANDBY
+    return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
 
 
-@dataclass(frozen=True, slots=True)
-class ModeRequest:
-    """What a DO_SET_MODE asks for: at most one field is set.
+def requested_mode(base: int, main: int, sub: int) -> Mode | str | None:
+    """Return what DO_SET_MODE's parameters 1..3 (MAV_MODE_FLAG bits, main, sub mode) ask for.
 
-    Neither set: PX4 accepts and changes nothing (its answer to an unknown main mode).
+    A text is PX4's for the operator, why the mode cannot be flown. None: PX4 accepts and changes
+    nothing (its answer to an unknown main mode).
     """
-
-    mode: Mode | None = None
-    refusal: str | None = None
-    """Why the mode cannot be flown: PX4's text for the operator."""
-
-
-def _unavailable(name: str) -> ModeRequest:
-    return ModeRequest(refusal=f"Switching to {name} is currently not available")
-
-
-def requested_mode(base: int, main: int, sub: int) -> ModeRequest:
-    """Return what DO_SET_MODE's parameters 1..3 (MAV_MODE_FLAG bits, main, sub mode) mean."""
     if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return _from_base_mode(base)
     if main == MAIN_AUTO:
-        if sub in _AUTO_MODES:
-            return ModeRequest(_AUTO_MODES[sub])
-        if sub in _UNAVAILABLE_AUTO:
-            return _unavailable(_UNAVAILABLE_AUTO[sub])
-        return ModeRequest(refusal="Unsupported auto mode")
-    if main == MAIN_OFFBOARD:
-        return ModeRequest(Mode.OFFBOARD)
-    if main == MAIN_POSCTL:
-        return ModeRequest(Mode.POSITION)
-    if main in _UNAVAILABLE_MAIN:
-        return _unavailable(_UNAVAILABLE_MAIN[main])
-    return ModeRequest()
+        return _AUTO_MODES.get(sub, "Unsupported auto mode")
+    return _MAIN_MODES.get(main)
 
 
-def _from_base_mode(base: int) -> ModeRequest:
+def _from_base_mode(base: int) -> Mode | str | None:
     """PX4's reading of the bits of clients that know no custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
-        return _unavailable(_UNAVAILABLE_AUTO[4])
+        return _AUTO_MODES[4]
     if not base & dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED:
-        return ModeRequest()
+        return None
     if base & dialect.MAV_MODE_FLAG_GUIDED_ENABLED:
-        return ModeRequest(Mode.POSITION)
-    stabilized = base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-    return _unavailable(_UNAVAILABLE_MAIN[7 if stabilized else 1])
+        return Mode.POSITION
+    return _MAIN_MODES[7 if base & dialect.MAV_MODE_FLAG_STABILIZE_ENABLED else 1]

@@ -10,9 +10,6 @@ from airl_mav.core.constants import TICK_US
 OFF = 0
 """Interval of a stream that is not sent."""
 
-_INDEX_BITS = 8
-_INDEX_MASK = (1 << _INDEX_BITS) - 1
-
 
 class StreamScheduler:
     """Intervals and due times of one link's streams.
@@ -24,24 +21,18 @@ class StreamScheduler:
     """
 
     def __init__(self, names: Sequence[str], default_us: Mapping[str, int]) -> None:
-        """Start at simulated time 0 with the default intervals.
+        """Start at simulated time 0 with the default intervals [µs].
 
-        Args:
-            names: All streams that can be sent; their order is the order within a tick.
-            default_us: Interval per stream [µs]; a stream not named here is off.
+        The order of the names is that within a tick; one without a default is off.
         """
         self._names = tuple(names)
         self._index = {name: i for i, name in enumerate(self._names)}
         self._default = [default_us.get(name, OFF) for name in self._names]
         self._interval = list(self._default)
-        self._heap: list[int] = []
-        """Due time and index of each stream that is on, in one number: quicker to compare."""
+        self._heap: list[tuple[int, int]] = []
+        """Due time [µs] and index of each stream that is on."""
         self._rebase_pending = False
         self._rebase(0)
-
-    def __contains__(self, name: str) -> bool:
-        """Tell whether there is such a stream."""
-        return name in self._index
 
     def interval_us(self, name: str) -> int:
         """Return a stream's interval [µs], `OFF` when it is not sent."""
@@ -59,9 +50,9 @@ class StreamScheduler:
         if interval_us == self._interval[index]:
             return
         self._interval[index] = interval_us
-        self._heap = [entry for entry in self._heap if entry & _INDEX_MASK != index]
+        self._heap = [entry for entry in self._heap if entry[1] != index]
         if interval_us != OFF:
-            self._heap.append(now_us << _INDEX_BITS | index)
+            self._heap.append((now_us, index))
         heapify(self._heap)
 
     def restart(self) -> None:
@@ -74,22 +65,20 @@ class StreamScheduler:
             self._rebase(now_us)
         heap = self._heap
         names: list[str] = []
-        horizon = now_us + 1 << _INDEX_BITS
-        while heap and (entry := heap[0]) < horizon:
-            index = entry & _INDEX_MASK
+        while heap and heap[0][0] <= now_us:
+            due_us, index = heap[0]
             interval = self._interval[index]
-            due_us = entry >> _INDEX_BITS
             next_us = due_us + interval
             if next_us <= now_us:
                 next_us = now_us + interval - (now_us - due_us) % interval
-            heapreplace(heap, next_us << _INDEX_BITS | index)
+            heapreplace(heap, (next_us, index))
             names.append(self._names[index])
         return names
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
         self._heap = [
-            now_us + index * TICK_US % interval << _INDEX_BITS | index
+            (now_us + index * TICK_US % interval, index)
             for index, interval in enumerate(self._interval)
             if interval != OFF
         ]

@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
-from firmware_sim.mavlink import identity
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
-from firmware_sim.mavlink.services import (
-    commands,
-    data_streams,
-    ftp,
-    heartbeats,
-    mission,
-    ping,
-    setpoints,
-    timesync,
-)
-from firmware_sim.mavlink.services.context import Context, Handler
-from firmware_sim.mavlink.services.params import ParameterService
+from firmware_sim.mavlink.services import handle, params, peers
+from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
-
-_STATELESS: dict[str, Handler] = {
-    **commands.HANDLERS,
-    **data_streams.HANDLERS,
-    **ftp.HANDLERS,
-    **heartbeats.HANDLERS,
-    **mission.HANDLERS,
-    **ping.HANDLERS,
-    **setpoints.HANDLERS,
-    **timesync.HANDLERS,
-}
-
 
 _DISCARD_CALLS = 4
 """Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
@@ -51,10 +28,8 @@ class _Session:
         self.link = link
         self.context: Context | None = None
         """None while there is no autopilot."""
-        self.parameters = ParameterService()
         self.texts = TextEncoder()
         self.reply_texts = TextEncoder(REPLY_IDS) if separate_replies else self.texts
-        self.handlers = _STATELESS | self.parameters.handlers
         self.announced_origin: Geodetic | None = None
 
 
@@ -69,12 +44,10 @@ class MavlinkServer:
     def __init__(
         self, links: Sequence[LinkConfig], port: AutopilotPort | None = None, *, boot_unix_us: int
     ) -> None:
-        """Open the links.
+        """Open the links: each streams its default rates from the first `send` on.
 
-        Args:
-            links: The links; each streams its default rates from the first `send` on.
-            port: The autopilot, None = not yet.
-            boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+        The autopilot may come later (`attach`). `boot_unix_us` is the calendar time of simulated
+        time 0 [µs since 1970, UTC].
         """
         self._port: AutopilotPort | None = None
         self._now_us = 0
@@ -83,11 +56,10 @@ class MavlinkServer:
         # The same functions on every link: what two links send in one tick is built once.
         self._builders: dict[str, Builder] = {
             **BUILDERS,
-            "AUTOPILOT_VERSION": identity.autopilot_version,
             "SYSTEM_TIME": system_time(boot_unix_us),
             "VIBRATION": lambda state: self._vibration.message(state),
             "BATTERY_STATUS": self._battery_status,
-            "TIMESYNC": timesync.request,
+            "TIMESYNC": peers.timesync_request,
         }
         self._sessions = [self._open(config) for config in links]
         if port is not None:
@@ -100,22 +72,22 @@ class MavlinkServer:
         autopilot (stale setpoints) are dropped. Simulated time may start anew.
         """
         if self._port is not None:
-            self._discard_received()
+            for session in self._sessions:
+                for _ in range(_DISCARD_CALLS):
+                    session.link.ignored += len(session.link.receive())
         self._port = port
         self._vibration = VibrationMeter()
         for session in self._sessions:
             session.context = Context(
                 session.link, port, self._now_us, self._texts.append, self._broadcast
             )
-            session.parameters.restart()
             session.announced_origin = None
             session.link.scheduler.restart()
 
     def receive(self, now_us: int) -> int:
-        """Read and carry out everything that has arrived; return how many messages took effect.
+        """Read and carry out everything that has arrived by simulated `now_us` [µs].
 
-        Args:
-            now_us: Simulated time [µs].
+        Returns how many messages took effect.
         """
         self._now_us = now_us
         effective = 0
@@ -130,10 +102,9 @@ class MavlinkServer:
         return effective
 
     def send(self, now_us: int) -> None:
-        """Send texts, pending parameters and the streams that are due; call once per tick.
+        """Send texts, pending parameters and the streams that are due at simulated `now_us` [µs].
 
-        Args:
-            now_us: Simulated time [µs].
+        To be called once per tick.
         """
         self._now_us = now_us
         port = self._port
@@ -158,7 +129,8 @@ class MavlinkServer:
                 if state.origin is not None and state.origin != session.announced_origin:
                     session.announced_origin = state.origin
                     link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
-            session.parameters.send_pending(link, port.parameters)
+            if session.context is not None:
+                params.send_pending(session.context)
             if state is not None:
                 link.stream_due(due, state, payloads)
             link.flush()
@@ -169,7 +141,7 @@ class MavlinkServer:
         The caller closes the writer. Raises ValueError if there is no such link.
         """
         (session,) = (session for session in self._sessions if session.link.name == link)
-        session.link.tap = None if tlog is None else self._tap(tlog)
+        session.link.tap = None if tlog is None else lambda frame: tlog.write(self._now_us, frame)
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return the traffic per link name."""
@@ -177,13 +149,13 @@ class MavlinkServer:
 
     def filenos(self) -> list[int]:
         """Return the descriptors that become readable when something arrives."""
-        numbers = (session.link.fileno() for session in self._sessions)
+        numbers = (session.link.endpoint.fileno() for session in self._sessions)
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
         """Close the endpoints."""
         for session in self._sessions:
-            session.link.close()
+            session.link.endpoint.close()
 
     def _open(self, config: LinkConfig) -> _Session:
         builders = self._link_builders()
@@ -192,21 +164,15 @@ class MavlinkServer:
         return _Session(Link(config, builders, replies), separate_replies=config.separate_replies)
 
     def _link_builders(self) -> dict[str, Builder]:
-        return {**self._builders, "PING": ping.PingRequests().message}
+        return {**self._builders, "PING": peers.ping_requests()}
 
     def _dispatch(self, session: _Session, message: WireMessage) -> bool:
         if (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, COMPONENT_ID):
             return False  # an echo of our own message
-        handler, context = session.handlers.get(message.get_type()), session.context
-        if handler is None or context is None:
+        if session.context is None:
             return False
-        context.now_us = self._now_us
-        return handler(message, context)
-
-    def _discard_received(self) -> None:
-        for session in self._sessions:
-            for _ in range(_DISCARD_CALLS):
-                session.link.ignored += len(session.link.receive())
+        session.context.now_us = self._now_us
+        return handle(message, session.context)
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""
@@ -223,8 +189,4 @@ class MavlinkServer:
     def _battery_status(self, state: AutopilotState) -> Values | None:
         if self._port is None:
             return None
-        charge = sensors.charge_state(state.battery.remaining, self._port.parameters)
-        return sensors.battery_status(state, charge)
-
-    def _tap(self, tlog: TlogWriter) -> Callable[[bytes], None]:
-        return lambda frame: tlog.write(self._now_us, frame)
+        return sensors.battery_status(state, self._port.parameters)

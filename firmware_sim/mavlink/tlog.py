@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
-from types import TracebackType
 
 from airl_mav.core.constants import US_PER_S
 
@@ -30,11 +29,9 @@ class TlogWriter:
     """
 
     def __init__(self, path: Path, start_unix_us: int) -> None:
-        """Open the file.
+        """Open the file, whose final name is `path`.
 
-        Args:
-            path: Final name.
-            start_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+        `start_unix_us` is the calendar time of simulated time 0 [µs since 1970, UTC].
         """
         self.path = path
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
@@ -67,16 +64,3 @@ class TlogWriter:
         self.flush()
         self._file.close()
         self.partial_path.replace(self.path)
-
-    def __enter__(self) -> TlogWriter:
-        """Return the writer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Complete the log."""
-        self.close()

@@ -57,10 +57,5 @@ def bind_udp_links(
 
 
 def udp_server(ends: UdpLinks, boot_unix_us: int) -> MavlinkServer:
-    """Return the server of both links, still without an autopilot.
-
-    Args:
-        ends: The vehicle's ends.
-        boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
-    """
+    """Return the server of both links, still without an autopilot; see `MavlinkServer`."""
     return MavlinkServer([onboard_link(ends.api), gcs_link(ends.gcs)], boot_unix_us=boot_unix_us)

@@ -12,104 +12,57 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
-from airl_mav.core.constants import DEG, US_PER_S
+from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import Vector
 from airl_mav.profiles.vehicle import Camera
-from airl_mav.vehicle.rotation import Quat, Vec
+from firmware_sim.plant.sensors import Rate
 
 
 class DepthCamera:
     """Takes frames of an arena at a fixed rate, from a vehicle's pose."""
 
-    def __init__(
-        self, intrinsics: Intrinsics, mount: Mount, rate_hz: float, max_range: float, arena: Arena
-    ) -> None:
-        """Make a camera whose first frame is due at time 0.
-
-        Args:
-            intrinsics: The lens and the image.
-            mount: The camera's place on the body.
-            rate_hz: Frames a second, > 0.
-            max_range: Greatest depth along the optical axis that gives a return [m].
-            arena: What is seen.
-        """
-        self._intrinsics = intrinsics
-        self._mount = mount
-        self._rate_hz = rate_hz
-        self._max_range = max_range
+    def __init__(self, camera: Camera, arena: Arena, start_us: int = 0) -> None:
+        """Make the camera of a vehicle profile; the first frame is due at `start_us` [µs]."""
+        self._intrinsics = Intrinsics.of(camera)
+        self._mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
+        self._rate_hz, self._max_range = camera.rate_hz, camera.range_m
         self._arena = arena
-        self._start_us = 0
-        self._slot = 0
         self._sequence = 0
         # The first picture loads or compiles the kernels: better here than in flight.
-        self._look(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), arena.obstacles.center)
+        self._look(0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        self.restart(start_us)
 
-    @classmethod
-    def from_profile(cls, camera: Camera, arena: Arena) -> DepthCamera:
-        """Make the camera of a vehicle profile."""
-        k = Intrinsics.of(camera)
-        mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
-        return cls(k, mount, camera.rate_hz, camera.range_m, arena)
-
-    def reset(self, arena: Arena, time_us: int) -> None:
-        """Look at another arena; the next frame is due at `time_us`.
+    def restart(self, time_us: int) -> None:
+        """Begin an episode, and with it its moving obstacles: the next frame is due at `time_us`.
 
         Sequence numbers go on, so that no frame of the new episode is taken for an old one.
         """
-        self._arena = arena
-        self._start_us = time_us
-        self._slot = 0
+        self._start_us = self.next_us = time_us
+        """`next_us`: simulated time from which on the next frame is due [µs]."""
+        self._rate = Rate(self._rate_hz)
 
-    @property
-    def next_us(self) -> int:
-        """Simulated time from which on the next frame is due [µs]."""
-        return self._slot_time_us(self._slot)
-
-    def due(self, time_us: int) -> bool:
-        """Return whether the next frame is due at a simulated time [µs]."""
-        return time_us >= self.next_us
-
-    def capture(
-        self,
-        time_us: int,
-        position: Vec | NDArray[np.float64],
-        quaternion: Quat | NDArray[np.float64],
-        centers: NDArray[np.float64],
-    ) -> Frame:
-        """Take a frame now; the next is due one period after the slot that this one fills.
+    def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
+        """Take a frame that is due; the next is due one period after the slot that this one fills.
 
         Slots lie at whole multiples of the period, so that a rate that the tick does not divide
         is kept on average. Slots that were missed are left out.
 
-        Args:
-            time_us: Simulated time of the exposure [µs].
-            position: (3,) vehicle NED [m].
-            quaternion: (4,) vehicle body -> NED [w, x, y, z].
-            centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
+        It is exposed at simulated `time_us` [µs], from the vehicle's `position` (3,) NED [m] and
+        `quaternion` (4,) body -> NED [w, x, y, z].
         """
-        self._slot = max(self._slot, self._slot_at(time_us)) + 1
-        depth = self._look(position, quaternion, centers)
+        elapsed_us = time_us - self._start_us
+        self._rate.due(elapsed_us)
+        self.next_us = self._start_us + math.ceil(self._rate.next_us)
+        depth = self._look(elapsed_us, position, quaternion)
         frame = Frame(self._sequence, time_us, depth_to_z16(depth), self._intrinsics)
         self._sequence += 1
         return frame
 
-    def _look(
-        self,
-        position: Vec | NDArray[np.float64],
-        quaternion: Quat | NDArray[np.float64],
-        centers: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
+    def _look(self, elapsed_us: int, position: Vector, quaternion: Vector) -> NDArray[np.float32]:
         at, attitude = camera_pose(position, quaternion, self._mount)
+        centers = self._arena.centers_at(elapsed_us)
         return render(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
-
-    def _slot_at(self, time_us: int) -> int:
-        """Return the slot whose period holds a time."""
-        slot = int((time_us - self._start_us) * self._rate_hz / US_PER_S)
-        # Rounding may put a time that is exactly on a slot into the one before.
-        return slot + 1 if self._slot_time_us(slot + 1) <= time_us else slot
-
-    def _slot_time_us(self, slot: int) -> int:
-        return self._start_us + math.ceil(slot * US_PER_S / self._rate_hz)
 
 
 class CameraServer:

@@ -28,12 +28,6 @@ POSE = slice(0, 10)
 
 
 @kernel
-def position(row: Vector) -> Vec:
-    """Return the position NED [m] of a row (16,)."""
-    return row[0], row[1], row[2]
-
-
-@kernel
 def velocity(row: Vector) -> Vec:
     """Return the velocity NED [m/s] of a row (16,)."""
     return row[3], row[4], row[5]

@@ -25,14 +25,7 @@ from firmware_sim.plant.dynamics import (
     power_row,
     supply,
 )
-from firmware_sim.plant.kinematics import (
-    POSITION,
-    QUATERNION,
-    RATES,
-    VELOCITY,
-    WIDTH,
-    from_bullet,
-)
+from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY, WIDTH, from_bullet
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.plant.wind import Wind
 from firmware_sim.plant.world import FLOOR, World
@@ -91,7 +84,8 @@ class Plant:
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
-        self._time_us = start_us
+        self.time_us = start_us
+        """Simulated time of the newest tick [µs]."""
         self._rate_hz, self._tick_s, self._ticks = rate_hz, tick_s, 0
         # What kernels take, as arrays: names would cost their callers a microsecond each.
         self._airframe = np.array(airframe)
@@ -99,16 +93,19 @@ class Plant:
         self._pack = np.array(pack_row(profile.battery))
         self._left = lag(airframe, tick_s)
         self._speeds = STOPPED
-        self._remaining = 1.0
-        self._power_w = IDLE_POWER_W
+        self.battery_remaining = 1.0
+        """State of charge, 1 to 0."""
+        self.power_w = IDLE_POWER_W
+        """Electrical power over the newest tick [W]."""
         self._body = self._build_body(profile)
         self._touching: set[int] = set()
-        self._motion = self._read()
-        self._battery = BatterySample(*supply(self._power_w, self._remaining, self._pack))
+        self.motion = self._read()
+        """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
+        self._battery = BatterySample(*supply(self.power_w, self.battery_remaining, self._pack))
 
     def begin(self) -> None:
         """Let what moves set out now; contacts so far are forgotten."""
-        self._moves_us = self._time_us
+        self._moves_us = self.time_us
         self.collisions.clear()
 
     def close(self) -> None:
@@ -116,37 +113,17 @@ class Plant:
         self.world.close()
 
     @property
-    def time_us(self) -> int:
-        """Simulated time of the newest tick [µs]."""
-        return self._time_us
-
-    @property
     def position(self) -> tuple[float, float, float]:
         """Where the vehicle is, NED [m]."""
-        at = self._motion.item
+        at = self.motion.item
         return at(0), at(1), at(2)
-
-    @property
-    def battery_remaining(self) -> float:
-        """State of charge, 1 to 0."""
-        return self._remaining
-
-    @property
-    def power_w(self) -> float:
-        """Electrical power over the newest tick [W]."""
-        return self._power_w
-
-    @property
-    def motion(self) -> Vector:
-        """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
-        return self._motion
 
     def step(self, controls: ActuatorControls) -> SensorSample:
         """Apply motor commands for one tick and return what the sensors then measure."""
-        world, body, before = self.world, self._body, self._motion
+        world, body, before = self.world, self._body, self.motion
         client, wind = world.number, self._wind.step()
         # An empty battery turns no motor.
-        motors = controls.motors if self._remaining > 0.0 else STOPPED
+        motors = controls.motors if self.battery_remaining > 0.0 else STOPPED
         speeds, here, force, torque = actuate(
             self._speeds, motors, before, wind, self._airframe, self._left
         )
@@ -154,26 +131,26 @@ class Plant:
         pybullet.applyExternalTorque(body, -1, torque, pybullet.WORLD_FRAME, client)
         self._ticks += 1
         # Of the count: not every rate has a period of whole microseconds.
-        self._time_us = self._start_us + self._ticks * US_PER_S // self._rate_hz
-        world.move_obstacles(self._time_us - self._moves_us, before)
+        self.time_us = self._start_us + self._ticks * US_PER_S // self._rate_hz
+        world.move_obstacles(self.time_us - self._moves_us, before)
         pybullet.stepSimulation(client)
         contacts = pybullet.getContactPoints(body, -1, _ANY_LINK, _ANY_LINK, client)
         if contacts or self._touching:
             self._watch(contacts, before)
         at, orientation = pybullet.getBasePositionAndOrientation(body, client)
         linear, angular = pybullet.getBaseVelocity(body, client)
-        self._motion = np.empty(WIDTH)
-        self._power_w, reading, self._remaining = absorb(
+        self.motion = np.empty(WIDTH)
+        self.power_w, reading, self.battery_remaining = absorb(
             at,
             orientation,
             linear,
             angular,
             before,
-            self._motion,
+            self.motion,
             wind,
             speeds,
             bool(self._touching),
-            self._remaining,
+            self.battery_remaining,
             self._airframe,
             self._power,
             self._pack,
@@ -184,19 +161,19 @@ class Plant:
 
     def sense(self) -> SensorSample:
         """Return a sensor sample of the present state."""
-        return self._sensors.sample(self._time_us, self._motion, self._battery)
+        return self._sensors.sample(self.time_us, self.motion, self._battery)
 
     def truth(self) -> Truth:
         """Return the true state."""
-        row = self._motion.copy()
+        row = self.motion.copy()
         return Truth(
-            self._time_us,
+            self.time_us,
             row[POSITION],
             row[VELOCITY],
             row[QUATERNION],
             row[RATES],
-            self._power_w,
-            self._remaining,
+            self.power_w,
+            self.battery_remaining,
         )
 
     def _build_body(self, profile: VehicleProfile) -> int:
@@ -248,5 +225,5 @@ class Plant:
             for other in sorted(touching - self._touching):
                 name = self.world.names[other]
                 if name != FLOOR or speed > REST_SPEED_M_S:
-                    self.collisions.append(Collision(self._time_us, name, speed))
+                    self.collisions.append(Collision(self.time_us, name, speed))
         self._touching = touching

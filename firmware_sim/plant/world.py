@@ -38,12 +38,10 @@ class World:
     def __init__(
         self, arena: Arena | None, vehicle_radius_m: float, tick_s: float = TICK_S
     ) -> None:
-        """Build the bodies of an arena.
+        """Build the bodies of an arena; None = an endless floor.
 
-        Args:
-            arena: None = an endless floor.
-            vehicle_radius_m: No part of the vehicle is further from its centre than this [m].
-            tick_s: Time step of the physics [s].
+        No part of the vehicle is further from its centre than `vehicle_radius_m` [m]; `tick_s` is
+        the time step of the physics [s].
         """
         self.client: Any = connect()
         self.number: int = number_of(self.client)

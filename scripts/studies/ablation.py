@@ -19,7 +19,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.experiments.experiment import Experiment, entry_of, make_cell
+from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import load_published
@@ -48,9 +48,10 @@ def declare(scenario: Scenario, title: str) -> Experiment:
     """Declare a policy with all inputs and without each."""
     flown = {name: scenario.model_copy(update={"ablate": name}) for name in INPUTS}
     flown["none"] = scenario
-    cells = tuple(make_cell(k, f"{title}, {label}", flown[k]) for k, label in INPUTS.items())
-    roles = {cell.name: entry_of(cell, label=INPUTS[cell.name]) for cell in cells}
-    return Experiment("compare", "ablation", {"what": title}, cells, roles)
+    cells = tuple(
+        make_cell(k, f"{title}, {label}", flown[k], label=label) for k, label in INPUTS.items()
+    )
+    return Experiment("compare", "ablation", {"what": title}, cells)
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:

@@ -20,7 +20,7 @@ from airl_mav.cli import train
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
-from airl_mav.experiments.experiment import Experiment, entry_of
+from airl_mav.experiments.experiment import Experiment
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import bootstrap_mean
 from airl_mav.flight.trajectory import Trajectory
@@ -96,8 +96,8 @@ def fly(
     if code or one_goal is None:
         return code
     one = declare(scenario.model_copy(update=one_goal.model_dump()))
-    roles = {cell.name: entry_of(cell) for cell in one.cells}
-    one = replace(one, kind="compare", roles=roles)
+    plain = tuple(replace(cell, label="", role="", group="") for cell in one.cells)
+    one = replace(one, kind="compare", cells=plain)
     code, flown = fly_and_show(one, root / "one-goal", console)
     for run in flown.cells:
         paths = flown.runs[run.cell.name].trajectories

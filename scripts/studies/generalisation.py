@@ -18,7 +18,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.experiments.evaluate import matrix
-from airl_mav.experiments.experiment import ExperimentRun
+from airl_mav.experiments.experiment import ExperimentRun, entry_of
 from airl_mav.flight.paired import compare_pairs
 from airl_mav.profiles.published import load_published
 from airl_mav.report.measures import with_interval
@@ -34,12 +34,8 @@ class GeneralisationConfig(StudyConfig):
 
 def away_from_home(flown: ExperimentRun) -> TableView:
     """Return the success of every policy against that in its own arena, the paper's below it."""
-    roles = flown.experiment.roles
-    at = {
-        (roles[run.cell.name].label, roles[run.cell.name].group): run.episodes
-        for run in flown.cells
-    }
-    homes = {roles[run.cell.name].label: roles[run.cell.name].trained_in for run in flown.cells}
+    at = {(run.cell.label, run.cell.group): run.episodes for run in flown.cells}
+    homes = {run.cell.label: entry_of(run.cell, "").trained_in for run in flown.cells}
     arenas = tuple(dict.fromkeys(arena for _, arena in at))
     rows: list[tuple[str, ...]] = []
     for policy, home in homes.items():

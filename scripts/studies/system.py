@@ -55,8 +55,7 @@ def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
     own = ("policy", "workload")
     facts = gaps[0].facts | {f: ", ".join(f"{gap.facts[f]}" for gap in gaps) for f in own}
     facts["reference_workload"] = facts["workload"]
-    roles = {name: entry for gap in gaps for name, entry in gap.roles.items()}
-    return Experiment("gap", "system", facts, cells, roles)
+    return Experiment("gap", "system", facts, cells)
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:

@@ -132,7 +132,8 @@ FLIGHTS = [
 
 
 def test_every_event_has_a_row_for_every_phase() -> None:
-    assert {(e, p) for e, row in TABLE.items() for p in row} == set(product(Event, Phase))
+    assert list(TABLE) == list(Event)
+    assert all(len(rows) == len(Phase) for rows in TABLE.values())
 
 
 @pytest.mark.parametrize("event", list(Event), ids=lambda e: e.name)

@@ -15,6 +15,8 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
+from firmware_sim.external.px4 import board_link, hitl
+from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.external.px4.hitl import HitlBridge
 from firmware_sim.external.transport.router import Router
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -53,6 +55,12 @@ def router() -> Iterator[Router]:
     router.close()
 
 
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A peer on a loaded machine may be silent for longer than a board."""
+    monkeypatch.setattr(hitl, "SILENCE_US", int(PATIENCE_S * 1e6))
+
+
 class Stepper:
     """Steps a bridge with samples of a vehicle at rest."""
 
@@ -74,12 +82,17 @@ class Stepper:
         self.until(lambda: False)
 
 
+def bridge_to(router: Router, device: str, *, rebooted: bool = False) -> HitlBridge:
+    """Make a bridge to a board, which is rebooted when found unless it has just been."""
+    link = BoardLink(router, device, 921_600)
+    link.went_down = rebooted
+    return HitlBridge(link)
+
+
 @contextmanager
-def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepper]:
+def connected(router: Router, peer: HitlPeer, *, rebooted: bool = True) -> Iterator[Stepper]:
     """Yield a bridge that has had its board's first motor commands."""
-    bridge = HitlBridge(
-        router, peer.device, **{"reboot": False, "silence_s": PATIENCE_S, **settings}
-    )
+    bridge = bridge_to(router, peer.device, rebooted=rebooted)
     try:
         bridge.wait_connected(PATIENCE_S, alive)
         stepper = Stepper(bridge)
@@ -93,7 +106,7 @@ def connected(router: Router, peer: HitlPeer, **settings: Any) -> Iterator[Stepp
 
 
 def test_a_board_is_rebooted_and_found_again(router: Router, peer: HitlPeer) -> None:
-    bridge = HitlBridge(router, peer.device, silence_s=PATIENCE_S)
+    bridge = bridge_to(router, peer.device)
     bridge.wait_connected(PATIENCE_S, alive)
     assert peer.boots == 2
     assert not bridge.armed
@@ -108,7 +121,7 @@ def test_a_board_behind_a_uart_is_rebooted_though_it_does_not_vanish(
     router: Router, peer: HitlPeer
 ) -> None:
     peer.vanishes, peer.down_s = False, 3.0
-    with connected(router, peer, reboot=True):
+    with connected(router, peer, rebooted=False):
         assert peer.boots == 2
 
 
@@ -120,7 +133,8 @@ def test_a_board_that_is_armed_is_disarmed_before_it_reboots(
 
     peer.board.armed = True
     monkeypatch.setattr(peer.board, "idle", beat)
-    bridge = HitlBridge(router, peer.device, reboot_s=2.0)
+    monkeypatch.setattr(board_link, "REBOOT_S", 2.0)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"does not reboot.*MAV_RESULT_DENIED"):
         bridge.wait_connected(PATIENCE_S, alive)
     bridge.close()
@@ -136,7 +150,7 @@ def decoded(frames: list[bytes], name: str) -> list[Any]:
 
 def test_a_board_that_does_not_come_back(router: Router, peer: HitlPeer) -> None:
     peer.down_s = 1e6
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareLostError, match=r"did not come back: --serial .*no such device"):
         bridge.wait_connected(4.0, alive)
 
@@ -156,7 +170,7 @@ def test_which_step_is_missing(
 ) -> None:
     peer = HitlPeer(tmp_path)
     vars(peer).update(fault)
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(FirmwareMissingError, match=f"--serial .* within 2 s: .*{words}"):
         bridge.wait_connected(2.0, alive)
     bridge.close()
@@ -166,7 +180,7 @@ def test_which_step_is_missing(
 
 def test_mavlink_without_an_autopilot(router: Router, peer: HitlPeer) -> None:
     peer.mute = True
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     radio = Encoder(51, 68).pack(dialect.MAVLink_radio_status_message(1, 1, 1, 1, 1, 1, 1))
 
     def talk() -> None:
@@ -191,7 +205,7 @@ def test_a_board_that_is_set_up_otherwise(
 ) -> None:
     peer.mute = True
     frame = Encoder().pack(dialect.MAVLink_heartbeat_message(*beat))
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
 
     def talk() -> None:
         peer.mute = False
@@ -205,7 +219,7 @@ def test_a_board_that_is_set_up_otherwise(
 
 
 def test_a_device_that_is_not_there_is_told_at_once(router: Router, tmp_path: Path) -> None:
-    bridge = HitlBridge(router, str(tmp_path / "ttyACM0"))
+    bridge = bridge_to(router, str(tmp_path / "ttyACM0"))
     with pytest.raises(UsageError, match="no such device"):
         bridge.wait_connected(1e6, alive)
 
@@ -217,7 +231,7 @@ def test_giving_up_while_it_waits(router: Router, peer: HitlPeer) -> None:
         raise StopError
 
     peer.mute = True
-    bridge = HitlBridge(router, peer.device)
+    bridge = bridge_to(router, peer.device)
     with pytest.raises(StopError):
         bridge.wait_connected(1e6, stop)
     bridge.close()
@@ -265,10 +279,15 @@ def test_ticks_keep_to_250_a_second_however_often_they_are_asked_for(
     ids=["mute", "no controls", "garbled", "unplugged", "no HIL", "flags"],
 )
 def test_a_flight_that_is_over(
-    router: Router, peer: HitlPeer, fault: Callable[[HitlPeer], None], words: str
+    router: Router,
+    peer: HitlPeer,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: Callable[[HitlPeer], None],
+    words: str,
 ) -> None:
-    silence_s = 3.0 if "silent" in words else PATIENCE_S
-    with connected(router, peer, silence_s=silence_s) as stepper:
+    if "silent" in words:
+        monkeypatch.setattr(hitl, "SILENCE_US", 3_000_000)
+    with connected(router, peer) as stepper:
         fault(peer)
         with pytest.raises(FirmwareLostError, match=words):
             stepper.forever()
@@ -309,9 +328,12 @@ def test_newer_boards_mark_their_motors(router: Router, peer: HitlPeer) -> None:
         stepper.step()
 
 
-def test_a_board_that_never_sends_motor_commands(router: Router, peer: HitlPeer) -> None:
+def test_a_board_that_never_sends_motor_commands(
+    router: Router, peer: HitlPeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     peer.controls = False
-    bridge = HitlBridge(router, peer.device, reboot=False, first_controls_s=0.5)
+    monkeypatch.setattr(hitl, "FIRST_CONTROLS_US", 500_000)
+    bridge = bridge_to(router, peer.device, rebooted=True)
     bridge.wait_connected(PATIENCE_S, alive)
     with pytest.raises(FirmwareMissingError, match=r"sends no HIL_ACTUATOR_CONTROLS.*pwm_out_sim"):
         Stepper(bridge).forever()
@@ -325,8 +347,11 @@ def test_noise_between_frames_does_no_harm(router: Router, peer: HitlPeer) -> No
         stepper.until(lambda: stepper.bridge.time_us > first + 1_500_000)
 
 
-def test_a_standstill_of_ours_is_no_silence_of_the_boards(router: Router, peer: HitlPeer) -> None:
-    with connected(router, peer, silence_s=1.5) as stepper:
+def test_a_standstill_of_ours_is_no_silence_of_the_boards(
+    router: Router, peer: HitlPeer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hitl, "SILENCE_US", 1_500_000)
+    with connected(router, peer) as stepper:
         time.sleep(0.5)
         router.pump()  # what had come before we stopped
         time.sleep(2.0)  # a board without sensors says nothing more

@@ -20,9 +20,12 @@ from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.external.airframe_check import HITL_OUTPUT, px4_airframe
 from firmware_sim.external.boot_sequence import ExternalFlightController, ExternalFlightStack
+from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
-from firmware_sim.external.px4.hitl import HitlLauncher
-from firmware_sim.external.transport.router import Router, RouterEnd
+from firmware_sim.external.px4 import hitl
+from firmware_sim.external.px4.board_link import BoardLink
+from firmware_sim.external.px4.hitl import HitlBridge
+from firmware_sim.external.transport.router import Router
 from firmware_sim.flight_controller import FirmwareMissingError
 from firmware_sim.mavlink.udp_links import bind_udp_links
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -56,18 +59,15 @@ class Flight:
             insecure=False,
         )
         self.router = Router(ends.by_name(), WallClock())
-        self.launcher = HitlLauncher(
-            *(px4_airframe(quad(), HITL_OUTPUT), self.router, peer.device, 921_600, PATIENCE_S),
-            silence_s=PATIENCE_S,
-        )
-        self.observer = Observer(RouterEnd(self.router), "observer")
+        bridge = partial(HitlBridge, BoardLink(self.router, peer.device, 921_600))
+        self.launcher = Launcher(px4_airframe(quad(), HITL_OUTPUT), bridge, PATIENCE_S)
+        self.observer = Observer(self.router, "observer")
         self.texts: list[str] = []
         self.simulation = self.boot()
 
     def boot(self) -> Simulation:
         self.observer.restart()
-        bridge = self.launcher.launch()
-        firmware = ExternalFlightController(bridge, self.observer, self.launcher)
+        firmware = ExternalFlightController(self.launcher, self.observer)
         firmware.on_message = lambda m: self.texts.append(m.text)
         self.firmware = firmware
         return Simulation(SETUP, start_us=7_000_000, clock=SimClock(), autopilot=firmware)
@@ -94,7 +94,8 @@ class Flight:
 
 
 @pytest.fixture
-def flight(peer: HitlPeer) -> Iterator[Flight]:
+def flight(peer: HitlPeer, monkeypatch: pytest.MonkeyPatch) -> Iterator[Flight]:
+    monkeypatch.setattr(hitl, "SILENCE_US", int(PATIENCE_S * 1e6))
     flight = Flight(peer)
     yield flight
     flight.close()

@@ -18,7 +18,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import UsageError
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.process.firmware_process import FirmwareProcess
+from firmware_sim.external.process import FirmwareProcess
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError

@@ -18,7 +18,6 @@ from firmware_sim.external.transport.router import (
     SIMULATOR_IDS,
     Budget,
     Router,
-    RouterEnd,
 )
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -72,7 +71,6 @@ class Bench:
         self.clock = SimClock()
         self.clients = {"onboard": MemoryEndpoint(), "gcs": MemoryEndpoint()}
         self.router = Router(self.clients, self.clock)
-        self.end = RouterEnd(self.router)
         self.heard: list[str] = []
         self.router.attach(self.line, budget_bytes_s)
         self.router.on_message = lambda m: self.heard.append(m.get_type())
@@ -91,7 +89,7 @@ class Bench:
 def bench() -> Iterator[Bench]:
     bench = Bench()
     yield bench
-    bench.end.close()
+    bench.router.close()
     bench.line.close()
 
 
@@ -120,7 +118,7 @@ def test_telemetry_passes_unchanged_however_the_line_cuts_it(bench: Bench) -> No
         count = int(rng.integers(1, 90))
         bench.line.say(stream[:count])
         stream = stream[count:]
-        heard += bench.end.receive()
+        heard += bench.router.receive()
     for got in (heard, bench.clients["onboard"].take(), bench.clients["gcs"].take()):
         assert got == frames
 
@@ -140,7 +138,7 @@ def test_the_simulators_messages_stay(bench: Bench) -> None:
     gps = dialect.MAVLink_hil_gps_message(1, 3, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 9)
     frames = bench.say(HEARTBEAT, controls, gps)
     assert bench.heard == ["HEARTBEAT", "HIL_ACTUATOR_CONTROLS", "HIL_GPS"]
-    assert bench.end.receive() == frames[:1]
+    assert bench.router.receive() == frames[:1]
     assert bench.clients["onboard"].take() == bench.clients["gcs"].take() == frames[:1]
     # Nor does anybody but us simulate for the board.
     bench.clients["gcs"].inbox.append(bench.station.pack(gps))
@@ -169,8 +167,8 @@ def test_a_boot_loader_is_told_nothing(bench: Bench) -> None:
 
     def offer() -> bytes:
         bench.clients["gcs"].inbox.append(frame)
-        bench.end.send(frame)
         bench.router.send(frame)
+        bench.router.send_ahead(frame)
         bench.router.pump()
         return bytes(bench.line.sent)
 
@@ -182,7 +180,7 @@ def test_a_boot_loader_is_told_nothing(bench: Bench) -> None:
     bench.line.sent.clear()
     bench.router.attach(bench.line, 10**6)  # it came back, and may be a boot loader again
     assert offer() == b""
-    assert bench.end.send_errors == 3
+    assert bench.router.send_errors == 3
 
 
 def test_clients_cannot_flood_the_line() -> None:
@@ -202,11 +200,11 @@ def test_clients_cannot_flood_the_line() -> None:
     assert 2_000 - len(frame) < flood() <= 2_000 + len(frame)
     # The simulator's own messages are none of this.
     before = len(bench.line.sent)
-    assert bench.router.send(frame)
+    assert bench.router.send_ahead(frame)
     assert len(bench.line.sent) == before + len(frame)
     bench.line.full = True
-    assert not bench.router.send(frame)
-    bench.end.close()
+    assert not bench.router.send_ahead(frame)
+    bench.router.close()
     bench.line.close()
 
 
@@ -231,10 +229,9 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
         insecure=False,
     )
     router, line = Router(ends.by_name(), WallClock()), Line()
-    end = RouterEnd(router)
 
     def wakes() -> bool:
-        number = end.fileno()
+        number = router.fileno()
         assert number is not None
         return bool(select.select([number], [], [], 0.0)[0])
 
@@ -242,26 +239,26 @@ def test_the_router_wakes_whoever_waits_for_it(tmp_path: Path) -> None:
     assert not wakes()
     line.say(b"x")
     assert wakes()
-    end.receive()
+    router.receive()
     assert not wakes()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.bind((LOOPBACK, gcs))
         line.say(Encoder().pack(HEARTBEAT))
-        end.receive()
+        router.receive()
         station.settimeout(PATIENCE_S)
         data, address = station.recvfrom(2048)
         assert data[7:10] == b"\0\0\0"
         assert address == (LOOPBACK, gcs_local)
         station.sendto(Encoder(255, 190).pack(HEARTBEAT), address)
-        number = end.fileno()
+        number = router.fileno()
         assert number is not None
         assert select.select([number], [], [], PATIENCE_S)[0]
-        end.receive()
+        router.receive()
     assert line.sent
     router.detach()
     assert not wakes()
-    end.close()
-    end.close()
-    assert end.fileno() is None
-    assert end.receive() == []
+    router.close()
+    router.close()
+    assert router.fileno() is None
+    assert router.receive() == []
     line.close()

@@ -7,7 +7,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.mavlink.identity import CAPABILITIES
+from firmware_sim.mavlink.streams.status import CAPABILITIES
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import Rig
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -230,7 +231,7 @@ def test_a_log_has_both_lanes_in_the_order_of_sending(tmp_path: Path) -> None:
     endpoint = MemoryEndpoint()
     server = MavlinkServer([onboard_link(endpoint)], autopilot, boot_unix_us=0)
     client = RawClient(endpoint)
-    with TlogWriter(tmp_path / "a.tlog", 0) as tlog:
+    with closing(TlogWriter(tmp_path / "a.tlog", 0)) as tlog:
         server.log_to(tlog)
         for _ in range(500):
             client.send(dialect.MAVLink_ping_message(1, 2, 0, 0))

@@ -121,8 +121,6 @@ def test_a_stream_that_fell_behind_skips_and_keeps_its_phase() -> None:
 
 def test_intervals_can_be_changed_stopped_and_restored() -> None:
     scheduler = StreamScheduler(["A", "B"], {"A": 8_000})
-    assert "B" in scheduler
-    assert "C" not in scheduler
     assert (scheduler.default_us("A"), scheduler.interval_us("B")) == (8_000, OFF)
     scheduler.due(0)
     scheduler.set_interval("A", OFF, 4_000)
@@ -425,8 +423,7 @@ def test_heartbeat(
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_requested_mode_is_the_reported_one(mode: Mode) -> None:
     number = custom_mode(mode)
-    request = requested_mode(129, number >> 16 & 0xFF, number >> 24)
-    assert (request.mode, request.refusal) == (mode, None)
+    assert requested_mode(129, number >> 16 & 0xFF, number >> 24) is mode
 
 
 @pytest.mark.parametrize(

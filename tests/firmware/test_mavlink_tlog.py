@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) ->
     bench.run(0.5)
     path = tmp_path / "flight-001.tlog"
     bench.memory.take()
-    with TlogWriter(path, BOOT_UNIX_US) as tlog:
+    with closing(TlogWriter(path, BOOT_UNIX_US)) as tlog:
         bench.server.log_to(tlog)
         client.send(dialect.MAVLink_ping_message(1, 77, 0, 0))
         station.send(dialect.MAVLink_ping_message(1, 99, 0, 0))
@@ -87,7 +88,7 @@ def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
 
 def test_a_record_cut_in_the_middle_costs_only_itself(tmp_path: Path) -> None:
     path = tmp_path / "cut.tlog"
-    with TlogWriter(path, BOOT_UNIX_US) as tlog:
+    with closing(TlogWriter(path, BOOT_UNIX_US)) as tlog:
         for i in range(10):
             tlog.write(i * 4_000, frame(i))
     path.write_bytes(path.read_bytes()[:-5])

@@ -138,7 +138,7 @@ def put(
     client, body = plant.world.client, plant._body
     client.resetBasePositionAndOrientation(body, ned_to_enu(np.array(position)), pose)
     client.resetBaseVelocity(body, ned_to_enu(np.array(velocity)), (0.0, 0.0, 0.0))
-    plant._motion = plant._read()
+    plant.motion = plant._read()
     plant.collisions.clear()
 
 

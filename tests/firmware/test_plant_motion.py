@@ -28,7 +28,7 @@ def plant() -> Iterator[Plant]:
     client, body = plant.world.client, plant._body
     _, attitude = client.getBasePositionAndOrientation(body)
     client.resetBasePositionAndOrientation(body, (0.0, 0.0, 50.0), attitude)
-    plant._motion = plant._read()
+    plant.motion = plant._read()
     yield plant
     plant.close()
 

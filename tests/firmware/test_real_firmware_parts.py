@@ -25,8 +25,7 @@ from airl_mav.scenario.model import Aircraft, LevelName, RealFirmware
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.external.airframe_check import (
-    ArduPilotAirframe,
-    Px4Airframe,
+    Airframe,
     ardupilot_airframe,
     differences,
     px4_airframe,
@@ -36,8 +35,7 @@ from firmware_sim.external.ardupilot.program import start as start_arducopter
 from firmware_sim.external.heartbeat_modes import flight_of
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.parameter_client import ParameterClient, same
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.external.programs import how_to_start, load_timeout_s
 from firmware_sim.external.px4.program import find_px4
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
@@ -52,7 +50,7 @@ PX4_ID, ARDUPILOT_ID = dialect.MAV_AUTOPILOT_PX4, dialect.MAV_AUTOPILOT_ARDUPILO
 HOLDER = """
 import sys, time
 from pathlib import Path
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
+from firmware_sim.external.process import FirmwareProcess, StartCommand
 folder = Path(sys.argv[1])
 child = FirmwareProcess("X", StartCommand(sys.argv[2:], {}), folder, folder / "x.log")
 print("up", flush=True)
@@ -135,9 +133,8 @@ def px4_set_right(vehicle: VehicleProfile) -> dict[str, int | float]:
     return held | {"MPC_THR_HOVER": 0.5, "THR_MDL_FAC": 0.0}
 
 
-def px4(vehicle: VehicleProfile) -> Px4Airframe:
-    assert vehicle.px4 is not None
-    return Px4Airframe(vehicle, vehicle.px4, "PWM_MAIN_FUNC{}")
+def px4(vehicle: VehicleProfile) -> Airframe:
+    return px4_airframe(vehicle, "PWM_MAIN_FUNC{}")
 
 
 def test_a_vehicle_that_says_nothing_of_a_firmware_is_told() -> None:
@@ -188,9 +185,8 @@ def test_a_wrong_px4_frame_is_told(change: dict[str, int | float], words: str) -
     assert re.search(words, problem), problem
 
 
-def ardupilot(vehicle: VehicleProfile) -> ArduPilotAirframe:
-    assert vehicle.ardupilot is not None
-    return ArduPilotAirframe(vehicle.ardupilot)
+def ardupilot(vehicle: VehicleProfile) -> Airframe:
+    return ardupilot_airframe(vehicle)
 
 
 def ardupilot_set_right() -> dict[str, int | float]:

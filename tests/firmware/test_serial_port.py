@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.px4.hitl import check_line
+from firmware_sim.external.px4.board_link import check_line
 from firmware_sim.external.transport.serial_port import BUFFER_BYTES, SerialLostError, SerialPort
 from tests.support.hitl_peer import HitlPeer
 

@@ -156,7 +156,7 @@ def test_what_is_hit_and_when_is_as_in_plain_pybullet(seed: int) -> None:
         client, body = plant.world.client, plant._body
         client.resetBasePositionAndOrientation(body, ned_to_enu(position), FACING_NORTH)
         client.resetBaseVelocity(body, ned_to_enu(velocity), (0.0, 0.0, 0.0))
-        plant._motion = plant._read()
+        plant.motion = plant._read()
         plant._touching.clear()
         plant.collisions.clear()
         for _ in range(THROW_TICKS):

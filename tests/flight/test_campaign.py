@@ -17,7 +17,7 @@ from airl_mav.core.progress import Progress
 from airl_mav.experiments import campaign
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
-from airl_mav.experiments.experiment import Experiment, entry_of, run_experiment
+from airl_mav.experiments.experiment import Experiment, run_experiment
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import (
     Declaration,
@@ -193,7 +193,7 @@ def test_one_evaluation_needs_no_campaign(tmp_path: Path, reference: Path) -> No
 
 
 def experiment_of(flown: list[Cell]) -> Experiment:
-    return Experiment("matrix", "test", {}, tuple(flown), {c.name: entry_of(c) for c in flown})
+    return Experiment("matrix", "test", {}, tuple(flown))
 
 
 def test_latencies_that_are_drawn_anew_are_other_flights(tmp_path: Path) -> None:

@@ -33,10 +33,10 @@ from airl_mav.conformance.steps import (
     BEFORE_S,
     MANOEUVRES,
     STEP_NAMES,
+    MeasuredStep,
     Step,
     StepResponse,
     measure,
-    median_response,
     plan,
     step_response,
 )
@@ -139,10 +139,11 @@ def test_median_of_flights() -> None:
     one = StepResponse(0.1, 0.2, 0.3, 0.4, 5.0, 0.01, 1.0)
     other = StepResponse(0.2, 0.2, 0.3, 0.6, 7.0, -0.03, float("nan"))
     third = StepResponse(0.0, 0.1, 0.4, 0.5, 9.0, 0.00, 2.0)
-    median = median_response([one, other, third])
+    step = Step("north-2", "north", 0.0, 2.0)
+    median = MeasuredStep(step, [one, other, third]).median
     assert median[:6] == pytest.approx((0.1, 0.2, 0.3, 0.5, 7.0, 0.0))
     assert math.isnan(median.settle_s)
-    assert median_response([one]) == one
+    assert MeasuredStep(step, [one]).median == one
 
 
 # --- steps read from telemetry

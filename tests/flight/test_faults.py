@@ -703,7 +703,6 @@ def occupied(kind: socket.SocketKind) -> Iterator[int]:
     ("option", "kind", "named"),
     [
         ("--api-port", socket.SOCK_DGRAM, "--api-port"),
-        ("--api-local-port", socket.SOCK_DGRAM, "--api-local-port"),
         ("--gcs-local-port", socket.SOCK_DGRAM, "--gcs-local-port"),
         ("--camera-port", socket.SOCK_STREAM, "--camera-port"),
     ],

@@ -15,7 +15,6 @@ from airl_mav.envs.estimation import (
     GROUPS,
     N_ERRORS,
     EstimationError,
-    first_errors,
     perturbed,
     step_errors,
 )
@@ -32,7 +31,7 @@ MODEL = EstimationError.from_profile(TABLE)
 def run(model: EstimationError, flights: int, samples: int, dt: float, seed: int) -> np.ndarray:
     """Return errors (flights, samples, 9) of the model."""
     rng = np.random.default_rng(seed)
-    errors = [first_errors(model, rng.standard_normal((flights, N_ERRORS)))]
+    errors = [model.sd * rng.standard_normal((flights, N_ERRORS))]
     for _ in range(samples - 1):
         errors.append(step_errors(model, errors[-1], rng.standard_normal((flights, N_ERRORS)), dt))
     return np.stack(errors, axis=1)

@@ -149,16 +149,15 @@ def test_parameters_and_macs_are_those_of_the_inference(name: str) -> None:
     network = network_of(make_model(algorithm, actions, **options))
     with FlopCounterMode(display=False) as counter:
         network(*ONE)
-    macs = sum(layer.macs for layer in export.layers(network, ONE))
+    layers, parameters = export.inspect_network(network, ONE)
+    macs = sum(layer.macs for layer in layers)
     assert macs == counter.get_total_flops() // 2
     # By hand: two convolutions to 11x15 and 5x7, dense 16, 16 and the output; no value function.
     outputs = 2 if actions == "velocity" else 25
     dense = (280 + 6) * 16 + 16 * 16 + 16 * outputs
     assert macs == 11 * 15 * 4 * 9 + 5 * 7 * 8 * 36 + dense
-    assert export.count_parameters(network, ONE) == (
-        (4 * 9 + 4) + (8 * 36 + 8) + dense + 16 + 16 + outputs
-    )
-    parts = [part.text for part in export.layers(network, ONE)]
+    assert parameters == (4 * 9 + 4) + (8 * 36 + 8) + dense + 16 + 16 + outputs
+    parts = [layer.text for layer in layers]
     assert parts == ["conv 4 3x3/2", "conv 8 3x3/2", "dense 16", "dense 16", f"dense {outputs}"]
 
 
@@ -187,8 +186,9 @@ def test_counts_of_the_papers_networks(workload: str) -> None:
     with torch.device("meta"):
         template = Template()
         inputs = (torch.zeros(1, 1, height, width), torch.zeros(1, 3), torch.zeros(1, 3))
-        assert export.count_parameters(template, inputs) == network.parameters
-        assert sum(layer.macs for layer in export.layers(template, inputs)) == network.macs
+        layers, parameters = export.inspect_network(template, inputs)
+        assert parameters == network.parameters
+        assert sum(layer.macs for layer in layers) == network.macs
 
 
 def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:

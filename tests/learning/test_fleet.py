@@ -10,7 +10,13 @@ import pytest
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.control.cascade import Demand, cascade, new_memory, trim_for_hover
+from airl_mav.control.cascade import (
+    Demand,
+    cascade_tick,
+    filters,
+    new_memory,
+    trim_for_hover,
+)
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from airl_mav.envs.arenas import ArenaBatch, batch_of, empty_batch, move_obstacles, put_arena
@@ -56,12 +62,12 @@ class PlantPilot:
 
     def __init__(self, altitude_m: float, battery: float = 1.0) -> None:
         self.plant = Plant(QUAD, None, np.random.default_rng(0))
-        self.plant._remaining = battery
+        self.plant.battery_remaining = battery
         self.energy = 0.0
         client, body = self.plant.world.client, self.plant._body
         half = math.sqrt(0.5)
         client.resetBasePositionAndOrientation(body, (0, 0, altitude_m), (0, 0, half, half))
-        self.plant._motion = self.plant._read()
+        self.plant.motion = self.plant._read()
         a = VEHICLE.airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()
@@ -79,7 +85,7 @@ class PlantPilot:
             nan = (math.nan,) * 3
             north, east, down = self.velocity
             demand = Demand(nan, (north, east, down), math.nan, float(setpoint[3]))
-            out = cascade(
+            out = cascade_tick(
                 tuple(truth.position),
                 tuple(truth.velocity),
                 tuple(truth.quaternion),
@@ -87,6 +93,7 @@ class PlantPilot:
                 demand,
                 self.memory,
                 VEHICLE.gains,
+                filters(VEHICLE.gains, TICK_S),
                 TICK_S,
             )
             self.plant.step(ActuatorControls(self.time_us, out.motors, True))
@@ -118,7 +125,8 @@ def test_flies_like_the_pybullet_plant(seed: int) -> None:
 
 def test_battery_runs_empty_when_the_plant_s_does() -> None:
     fleet, arenas, pilot = new_fleet(1), batch_of([OPEN]), PlantPilot(60.0, battery=0.02)
-    hover(fleet, 0, 60.0, VEHICLE, battery=0.02)
+    hover(fleet, 0, 60.0, VEHICLE)
+    fleet.battery[0] = 0.02
     setpoint = np.array([4.0, 0.0, 0.0, 0.3])
     command(fleet, 0, setpoint)
     fly(fleet, arenas, 10_000)
@@ -154,7 +162,8 @@ def test_verdicts_are_the_referee_s_to_the_tick() -> None:
         speed = rng.uniform(1.0, 5.0)
         setpoint = np.array([speed * north, speed * east, rng.uniform(-0.2, 0.2), 0.0])
         for each in (fleet, free):
-            hover(each, i, 2.5, VEHICLE, battery=battery)
+            hover(each, i, 2.5, VEHICLE)
+            each.battery[i] = battery
             command(each, i, setpoint)
         referee = Referee(Task(tuple(world.goal), rules.goal_radius, rules.time_limit_us / 1e6))
         referee.start_navigation(0)
@@ -200,7 +209,8 @@ def test_goal_comes_before_a_collision_in_the_same_tick() -> None:
     goal = dataclasses.replace(OPEN, goal=np.array([0.0, 0.0]))
     fleet = new_fleet(2)
     hover(fleet, 0, 0.01, VEHICLE)
-    hover(fleet, 1, 0.01, VEHICLE, battery=1e-12)
+    hover(fleet, 1, 0.01, VEHICLE)
+    fleet.battery[1] = 1e-12
     fly(fleet, batch_of([goal, dataclasses.replace(OPEN, goal=np.array([50.0, 0.0]))]), 1,
         Rules(3.0, TICK_US))  # fmt: skip
     assert list(fleet.verdict) == [Verdict.SUCCESS, Verdict.COLLISION]

@@ -18,10 +18,10 @@ from airl_mav.training.config import AlgorithmSpec, NetworkSpec
 from airl_mav.training.dqn import DoubleDQN
 from airl_mav.training.networks import (
     DepthExtractor,
-    count_parameters,
     flat_size,
     to_channels_last,
 )
+from tests.support.policy_kit import parameters_of
 from tests.support.toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
 
 
@@ -31,7 +31,7 @@ from tests.support.toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
 )
 def test_templates_have_the_papers_parameters(layers: int, filters: int, parameters: int) -> None:
     spec = NetworkSpec(kind="template", layers=layers, filters=filters)
-    assert count_parameters(spec, 154, 256, 25) == parameters
+    assert parameters_of(spec, 154, 256) == parameters
 
 
 def test_appendix_network_is_the_one_of_air_learnings_code() -> None:
@@ -40,7 +40,7 @@ def test_appendix_network_is_the_one_of_air_learnings_code() -> None:
     assert flat_size(spec, 154, 256) == 32_640
     convolutions = (16 + 1) * 32 + (16 * 32 + 1) * 64 + (4 * 64 + 1) * 128 + (128 + 1) * 64
     dense = (32_646 + 1) * 256 + 2 * (256 + 1) * 256 + (256 + 1) * 25
-    assert count_parameters(spec, 154, 256) == convolutions + dense
+    assert parameters_of(spec, 154, 256) == convolutions + dense
 
 
 def test_appendix_network_of_a_low_image_starts_with_stride_two() -> None:
@@ -59,7 +59,7 @@ def test_small_network(height: int, width: int, flat: int) -> None:
     assert flat_size(spec, height, width) == flat
     convolutions = (9 + 1) * 16 + (9 * 16 + 1) * 32 + 2 * (9 * 32 + 1) * 32
     dense = (flat + 6 + 1) * 128 + (128 + 1) * 128 + (128 + 1) * 25
-    assert count_parameters(spec, height, width) == convolutions + dense
+    assert parameters_of(spec, height, width) == convolutions + dense
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_policy_is_what_is_counted(spec: NetworkSpec, name: str) -> None:
         policy: Any = model.policy
         modules = [policy.features_extractor, policy.mlp_extractor.policy_net, policy.action_net]
     counted = sum(weights.numel() for module in modules for weights in module.parameters())
-    assert counted == count_parameters(spec, HEIGHT, WIDTH, outputs=3)
+    assert counted == parameters_of(spec, HEIGHT, WIDTH, outputs=3)
 
 
 def test_extractor_convolves_the_scaled_image_and_joins_the_vectors() -> None:

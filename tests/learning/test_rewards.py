@@ -5,19 +5,40 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.rewards import DecisionOutcome, RewardName, rewards
-from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.vector import NavigationVectorEnv, decision_outcome
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.rewards import rewards
+from airl_mav.envs.spec import EnvironmentSpec, RewardName
+from airl_mav.envs.vector import NavigationVectorEnv
 
 NEARER, AWAY, GOAL, CRASH, FAST, STILL = range(6)
-HAPPENED = DecisionOutcome(
-    success=np.array([False, False, True, False, False, False]),
-    failure=np.array([False, False, False, True, False, False]),
-    distance_before_m=np.array([20.0, 20.0, 4.0, 20.0, 20.0, 20.0]),
-    distance_m=np.array([18.0, 21.0, 2.5, 18.0, 16.0, 20.0]),
-    speed_m_s=np.array([4.0, 2.0, 3.0, 4.0, 7.0, 0.0]),
-    hold_s=0.5,
+HOLD_S = 0.5
+
+
+def flights(distance_m: list[float], speed_m_s: list[float], **verdicts: int) -> Flights:
+    """Return flights that go on, but for those with a verdict by its name."""
+    n = len(distance_m)
+    verdict = np.full(n, Verdict.FLYING, np.int64)
+    for name, i in verdicts.items():
+        verdict[i] = Verdict[name]
+    return Flights(
+        verdict=verdict,
+        time_s=np.zeros(n),
+        distance_m=np.zeros(n),
+        energy_j=np.zeros(n),
+        goal_distance_m=np.array(distance_m),
+        speed_m_s=np.array(speed_m_s),
+        battery=np.ones(n),
+        touched=np.zeros(n, np.int64),
+    )
+
+
+BEFORE = flights([20.0, 20.0, 4.0, 20.0, 20.0, 20.0], [0.0] * 6)
+NOW = flights(
+    [18.0, 21.0, 2.5, 18.0, 16.0, 20.0],
+    [4.0, 2.0, 3.0, 4.0, 7.0, 0.0],
+    SUCCESS=GOAL,
+    COLLISION=CRASH,
 )
 
 
@@ -44,21 +65,21 @@ HAPPENED = DecisionOutcome(
     ],
 )
 def test_by_hand(name: RewardName, case: int, expected: float) -> None:
-    assert rewards(name, HAPPENED)[case] == pytest.approx(expected, abs=1e-12)
+    assert rewards(name, BEFORE, NOW, HOLD_S)[case] == pytest.approx(expected, abs=1e-12)
 
 
 def test_the_paper_s_correction_rewards_slowness_on_the_way_to_the_goal() -> None:
     """Its text calls D_c a penalty; its formula adds it when nearer, less of it when faster."""
-    slow, fast = rewards("paper", HAPPENED)[[NEARER, FAST]] + HAPPENED.distance_m[[NEARER, FAST]]
+    paid = rewards("paper", BEFORE, NOW, HOLD_S) + NOW.goal_distance_m
+    slow, fast = paid[[NEARER, FAST]]
     assert slow > 0 > fast
 
 
 def test_shaped_pays_progress_once_whatever_the_steps() -> None:
     """The progress terms of a flight telescope: no reward for flying to and fro."""
-    way = np.array([30.0, 25.0, 27.0, 22.0, 10.0, 12.0, 2.0])
-    none = np.zeros(6, np.bool_)
-    h = DecisionOutcome(none, none, way[:-1], way[1:], np.zeros(6), 0.5)
-    assert rewards("shaped", h).sum() == pytest.approx(0.02 * 28.0 - 6 * 0.005)
+    way = [30.0, 25.0, 27.0, 22.0, 10.0, 12.0, 2.0]
+    before, now = flights(way[:-1], [0.0] * 6), flights(way[1:], [0.0] * 6)
+    assert rewards("shaped", before, now, HOLD_S).sum() == pytest.approx(0.02 * 28.0 - 6 * 0.005)
 
 
 def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
@@ -67,10 +88,8 @@ def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
     navigation.begin(range(5), range(5))
     before = navigation.flights()
     navigation._fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
-    found = decision_outcome(before, navigation.flights(), spec)
-    assert found.success.tolist() == [False, True, False, False, False]
-    assert found.failure.tolist() == [False, False, True, True, False]
-    assert rewards("shaped", found).round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]
+    found = rewards("shaped", before, navigation.flights(), spec.episode.hold_s)
+    assert found.round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]
 
 
 @pytest.mark.parametrize("name", ["shaped", "paper", "paper-scaled"])

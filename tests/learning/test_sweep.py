@@ -34,7 +34,7 @@ from airl_mav.sweep.store import SweepFolder, declaration
 from airl_mav.sweep.summary import Computer, estimated_ms, over_seeds, summarize, write_sweep
 from airl_mav.sweep.trial import size_of, training_of, trials
 from airl_mav.training.config import NetworkSpec
-from airl_mav.training.networks import count_parameters
+from tests.support.policy_kit import parameters_of
 from tests.support.sweep_kit import TINY, fake_results, write_sweep_file
 
 MADE = provenance("airl sweep")
@@ -165,7 +165,7 @@ def test_parameters_in_closed_form_are_those_of_torch(
     layers: int, filters: int, height: int, width: int
 ) -> None:
     spec = NetworkSpec(kind="template", layers=layers, filters=filters)
-    counted = count_parameters(spec, height, width)
+    counted = parameters_of(spec, height, width)
     assert template_size(layers, filters, height, width, 25).parameters == counted
 
 

@@ -11,6 +11,7 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -20,6 +21,7 @@ from airl_mav.policy.template import Size
 from airl_mav.sweep.config import load_sweep
 from airl_mav.sweep.store import SweepFolder
 from airl_mav.sweep.trial import size_of, trials
+from tests.support.command_line import airl
 from tests.support.processes import PATIENCE_S, Running, has_ended, running, wait_until
 from tests.support.sweep_kit import TINY, write_sweep_file
 
@@ -36,12 +38,6 @@ SMALL = (
 """Long enough to be killed in."""
 
 PLACE = "--out"
-
-NO_REPORT = """
-from airl_mav.cli import main, report
-report.run = lambda *_: 0  # figures take longer than flights
-main.main()
-"""
 
 
 def sweep(folder: Path, *options: str) -> list[str]:
@@ -119,10 +115,10 @@ def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
 
 def test_a_network_is_judged_as_airl_evaluate_judges_it(undisturbed: Path) -> None:
     name, result = max(outcome(undisturbed).items(), key=lambda item: item[1]["successes"])
-    words = ["-c", NO_REPORT, "evaluate", f"out/{name}/policy"]
-    words += ["--arena", "no-obstacles", "--episodes", "20", "--seed", "1", "--out", "judged"]
-    with running(words, undisturbed) as process:
-        assert process.wait() == 0, process.text()
+    words = ["--arena", "no-obstacles", "--episodes", "20", "--seed", "1"]
+    with patch("airl_mav.cli.evaluate.show_report"):  # Figures take longer than flights.
+        policy, out = undisturbed / "out" / name / "policy", undisturbed / "judged"
+        assert airl("evaluate", str(policy), *words, "--out", str(out))[0] == 0
     lines = (undisturbed / "judged" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
     flown = [json.loads(line) for line in lines]
     good = [each["quality"] for each in flown if each["outcome"] == "success"]
@@ -150,10 +146,8 @@ def test_with_workers_killed_it_ends_as_if_nothing_had_happened(
     tmp_path: Path, undisturbed: Path
 ) -> None:
     with running(sweep(tmp_path, "--workers", "2"), tmp_path) as process:
-        for _ in range(2):
-            wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
-            if workers := workers_of(process):
-                os.kill(workers[0], signal.SIGKILL)
+        wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
+        os.kill(workers_of(process)[0], signal.SIGKILL)
         assert process.wait(PATIENCE_S * 2) == 0, process.text()
         assert "a worker was lost by SIGKILL" in process.text()
     assert outcome(tmp_path) == outcome(undisturbed)
@@ -162,7 +156,7 @@ def test_with_workers_killed_it_ends_as_if_nothing_had_happened(
 def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
     tmp_path: Path, undisturbed: Path
 ) -> None:
-    words = sweep(tmp_path, "--workers", "2")
+    words = sweep(tmp_path, "--workers", "1")
     with running(words, tmp_path) as process:
         wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
         process.interrupt()
@@ -180,7 +174,7 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
         assert len(held) < TRIALS
         for pid in workers:
             wait_until(partial(has_ended, pid), "an orphan to end", 30.0)
-    with running(sweep(tmp_path, "--workers", "1"), tmp_path) as process:
+    with running(words, tmp_path) as process:
         assert process.wait(PATIENCE_S * 2) == 0, process.text()
     assert outcome(tmp_path) == outcome(undisturbed)
 

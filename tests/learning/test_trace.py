@@ -24,6 +24,7 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Observation
+from tests.support.recording import record_tick
 
 SEEDS = range(1, 13)
 
@@ -102,7 +103,7 @@ class TickByTick(Trace):
         state = fleet.position[0].copy(), fleet.velocity[0].copy(), fleet.quaternion[0].copy()
         ended = bool(fleet.verdict[0] != Verdict.FLYING)
         time_us = int(fleet.time_us[0])
-        self.recorder.add(time_us, *state, power_w, keep=ended)
+        record_tick(self.recorder, time_us, *state, power_w, keep=ended)
         self.poses[time_us] = state[0], state[2]
 
 

@@ -22,6 +22,8 @@ from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import Encoded
 from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.loading import list_profiles, load_profile
+from airl_mav.rehearsal import lock
+from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig
 from airl_mav.training.run import nominal
 from airl_mav.training.store import TrainingFolder
@@ -184,19 +186,18 @@ def test_a_wrong_configuration_gets_one_line(text: str, names: list[str], tmp_pa
 
 
 def test_a_folder_without_a_run_is_said_to_be_none(tmp_path: Path) -> None:
-    config = TrainingConfig(description="none")
     with pytest.raises(UsageError, match="no training run here"):
-        TrainingFolder.open(tmp_path, config)
+        TrainingFolder(tmp_path).about()
 
 
-def test_two_do_not_train_in_one_folder(tmp_path: Path) -> None:
+def test_two_do_not_train_in_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lock, "WAIT_S", 0.0)
     config = TrainingConfig(description="one")
-    one = TrainingFolder.create(tmp_path / "run", config, "airl train")
-    two = TrainingFolder.open(tmp_path / "run", config)
-    with one.locked(), pytest.raises(UsageError, match="another process"), two.locked():
-        pass
-    with two.locked():
-        pass
+    with (
+        lock.locked(tmp_path / "run", lambda _: None),
+        pytest.raises(UsageError, match="another run"),
+    ):
+        run.train(config, tmp_path / "run", name="one")
 
 
 @pytest.mark.slow

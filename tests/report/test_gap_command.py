@@ -30,8 +30,9 @@ from airl_mav.profiles.loading import profiles_dir
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
-from airl_mav.report.comparison.gap import columns_table, gaps_table, worst_seeds
+from airl_mav.report.comparison.gap import columns_table, gaps_table
 from airl_mav.report.comparison.model import load_comparison, save_comparison
+from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES
@@ -556,7 +557,7 @@ def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str
 def training_of(folder: Path) -> tuple[list[Any], tuple[str, ...]]:
     scenario = Scenario(level="gym", policy=DEFAULT_POLICY, computer="ras-pi-4", episodes=EPISODES)
     gap = declare_gap(scenario, mitigated=str(folder))
-    cells = [cell for cell in gap.cells if gap.roles[cell.name].role == "training"]
+    cells = [cell for cell in gap.cells if cell.role == "training"]
     return cells, gap.remarks
 
 

@@ -16,11 +16,10 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     Severity,
 )
-from firmware_sim.mavlink import identity
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link, LinkConfig
-from firmware_sim.mavlink.services import commands, data_streams, ping, timesync
+from firmware_sim.mavlink.services import commands, handle, peers
 from firmware_sim.mavlink.services.context import Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.texts import TextEncoder
@@ -54,7 +53,7 @@ class Manners:
         self.copter = copter
         builders: dict[str, Builder] = {
             **BUILDERS,
-            "TIMESYNC": timesync.request,
+            "TIMESYNC": peers.timesync_request,
             "HEARTBEAT": self._heartbeat,
             "SYS_STATUS": self._sys_status,
             "EXTENDED_SYS_STATE": lambda state: (3, _LANDED[state.status.landed]),
@@ -90,7 +89,7 @@ class Manners:
 
     def close(self) -> None:
         for link in self._links:
-            link.close()
+            link.endpoint.close()
 
     def _say(self, severity: int, text: str) -> None:
         for link in self._links:
@@ -146,10 +145,8 @@ class Manners:
             self._setpoint(message)
         elif kind in ("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_SET"):
             self._parameter(kind, message, link)
-        else:
-            handlers = {**timesync.HANDLERS, **ping.HANDLERS, **data_streams.HANDLERS}
-            if kind in handlers:
-                handlers[kind](message, context)
+        elif kind in ("TIMESYNC", "PING", "REQUEST_DATA_STREAM"):
+            handle(message, context)
 
     def _command(self, number: int, params: list[float], context: Context) -> int:
         copter = self.copter
@@ -217,6 +214,6 @@ class Manners:
 
 
 def _version(state: AutopilotState) -> Values:
-    first, _, *rest = identity.autopilot_version(state)
+    first, _, *rest = status.autopilot_version(state)
     del first
     return CAPABILITIES, VERSION, *rest

@@ -13,13 +13,15 @@ import stable_baselines3
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, create_mlp
 from torch import nn
 
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
+from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
+from airl_mav.training.networks import DepthExtractor, dense_units
 
 SPEC = ObservationSpec(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=20.0)
 """Fits the camera of the shipped vehicle `quad`: 64x48 px."""
@@ -70,6 +72,19 @@ def action_space(actions: ActionSpec) -> spaces.Space[Any]:
     if count is None:
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
     return spaces.Discrete(count)
+
+
+def parameters_of(spec: NetworkSpec, height_px: int, width_px: int, outputs: int = 25) -> int:
+    """Return the weights and biases of a network as torch builds it, from image to outputs."""
+    seen = Nowhere(
+        SPEC.model_copy(update={"height_px": height_px, "width_px": width_px}),
+        spaces.Discrete(outputs),
+    )
+    assert isinstance(seen.observation_space, spaces.Dict)
+    with torch.device("meta"):
+        extractor = DepthExtractor(seen.observation_space, spec)
+        head = nn.Sequential(*create_mlp(extractor.features_dim, outputs, dense_units(spec)))
+    return sum(each.numel() for part in (extractor, head) for each in part.parameters())
 
 
 def make_model(

@@ -19,6 +19,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from tests.support.recording import record_tick
 
 TICK_US = 20_000
 TAKEOFF_US = 5_000_000
@@ -83,11 +84,13 @@ def demo_episode(
         x, y, z = position
         sample = TruthSample(now, (x, y, z), _hit(arena, position, now - started_us), charge)
         ended = referee.observe(sample)
-        recorder.add(now, position, velocity, [1.0, 0.0, 0.0, 0.0], power, keep=ended is not None)
+        record_tick(
+            recorder, now, position, velocity, [1.0, 0.0, 0.0, 0.0], power, keep=ended is not None
+        )
     # A recording goes on until the vehicle is down, off the way it flew.
     for _ in range(50):
         now, position = now + TICK_US, position + np.array([0.1, -0.1, 0.02])
-        recorder.add(now, position, [5.0, -5.0, 1.0], [1.0, 0.0, 0.0, 0.0], 430.0)
+        record_tick(recorder, now, position, [5.0, -5.0, 1.0], [1.0, 0.0, 0.0, 0.0], 430.0)
     trajectory = recorder.trajectory()
     verdict = referee.verdict
     record = EpisodeRecord(

@@ -405,12 +405,12 @@ def test_what_is_usual_and_what_was_lost() -> None:
 def test_a_collision_taken_apart_and_one_that_was_none() -> None:
     box = arena_of((Shape.BOX, 9.3, 0.0, 1.0, 0.0))
     record = record_of(AHEAD, Outcome.COLLISION, "hit static-box-0")
-    found = examine_collision(record, AHEAD, stamps_of(AHEAD), box, SIGHT)
+    found = examine_collision(Evidence(record, AHEAD, stamps_of(AHEAD), box, SIGHT))
     assert found is not None
     assert found.what == "static-box-0"
     assert found.answer_m_s == pytest.approx(2.0)
     good = replace(record, outcome=Outcome.SUCCESS)
-    assert examine_collision(good, AHEAD, stamps_of(AHEAD), box, SIGHT) is None
+    assert examine_collision(Evidence(good, AHEAD, stamps_of(AHEAD), box, SIGHT)) is None
 
 
 def test_the_brakes_are_the_tilt_limit_of_the_vehicle() -> None:

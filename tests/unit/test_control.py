@@ -13,7 +13,14 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
-from airl_mav.control.cascade import Demand, Output, cascade, new_memory, reset_integrals
+from airl_mav.control.cascade import (
+    Demand,
+    Output,
+    cascade_tick,
+    filters,
+    new_memory,
+    reset_integrals,
+)
 from airl_mav.control.controller import Controller
 from airl_mav.control.gains import Gains, pack, unpack
 from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
@@ -30,6 +37,7 @@ from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.autopilot.parameter_store import Parameters
 
 GAINS = Gains.from_parameters(Parameters({"MPC_THR_HOVER": 0.52}).__getitem__)
+FILTERS = filters(GAINS, TICK_S)
 NAN = math.nan
 NAN3 = (NAN, NAN, NAN)
 ZERO = (0.0, 0.0, 0.0)
@@ -217,7 +225,7 @@ def test_thrust_axis_and_heading_are_as_asked(thrust: Vec, yaw: float) -> None:
     assume(np.linalg.norm(thrust) > 0.01)
     # Upwards thrust, no closer than 2 degrees to the horizon: there heading loses its meaning.
     assume(-thrust[2] > 0.03 * np.linalg.norm(thrust))
-    turn = scipy_of(attitude_setpoint(thrust, yaw))
+    turn = scipy_of(attitude_setpoint(thrust, math.cos(yaw), math.sin(yaw)))
     up = turn.apply([0.0, 0.0, -1.0])
     np.testing.assert_allclose(up, np.array(thrust) / np.linalg.norm(thrust), atol=1e-9)
     assert abs(wrap_pi(turn.as_euler("ZYX")[0] - yaw)) < 1e-7
@@ -227,7 +235,7 @@ def test_thrust_axis_and_heading_are_as_asked(thrust: Vec, yaw: float) -> None:
 def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust: Vec, yaw: float) -> None:
     thrust = (thrust[0], thrust[1], abs(thrust[2]))
     assume(thrust[2] > 0.03 * np.linalg.norm(thrust) > 1e-4)
-    turn = scipy_of(attitude_setpoint(thrust, yaw))
+    turn = scipy_of(attitude_setpoint(thrust, math.cos(yaw), math.sin(yaw)))
     up, nose = turn.apply([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     np.testing.assert_allclose(up, np.array(thrust) / np.linalg.norm(thrust), atol=1e-9)
     assert nose[:2] @ [math.cos(yaw), math.sin(yaw)] > 0.0
@@ -235,7 +243,7 @@ def test_upside_down_keeps_the_thrust_axis_and_the_nose_ahead(thrust: Vec, yaw: 
 
 @given(angles)
 def test_no_thrust_is_level(yaw: float) -> None:
-    turn = scipy_of(attitude_setpoint(ZERO, yaw))
+    turn = scipy_of(attitude_setpoint(ZERO, math.cos(yaw), math.sin(yaw)))
     np.testing.assert_allclose(turn.apply([0.0, 0.0, 1.0]), [0, 0, 1], atol=1e-12)
     assert abs(wrap_pi(turn.as_euler("ZYX")[0] - yaw)) < 1e-9
 
@@ -487,7 +495,7 @@ LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
 def test_at_rest_the_cascade_hovers() -> None:
-    out = cascade(ZERO, ZERO, LEVEL, ZERO, hover(), new_memory(), GAINS, TICK_S)
+    out = cascade_tick(ZERO, ZERO, LEVEL, ZERO, hover(), new_memory(), GAINS, FILTERS, TICK_S)
     np.testing.assert_allclose(out.motors, 0.52, atol=1e-12)
     assert (out.thrust, out.rates, out.velocity) == (0.52, ZERO, ZERO)
 
@@ -496,7 +504,7 @@ def test_what_was_before_does_not_kick_the_first_tick() -> None:
     """Filters start at the first sample: no derivative of a jump from zero."""
     v, w = (3.0, -1.0, 0.5), (0.3, 0.2, -0.4)
     demand = Demand(NAN3, v, 0.0, NAN)
-    out = cascade(ZERO, v, LEVEL, w, demand, new_memory(), GAINS, TICK_S)
+    out = cascade_tick(ZERO, v, LEVEL, w, demand, new_memory(), GAINS, FILTERS, TICK_S)
     np.testing.assert_allclose(out.rates, 0.0, atol=1e-9)
     expected = [-0.15 * 0.3, -0.15 * 0.2]
     delivered = EFFECT @ out.motors
@@ -509,7 +517,7 @@ def test_any_state_gives_commands(
 ) -> None:
     memory = new_memory()
     for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):
-        out = cascade(position, velocity, q, omega, demand, memory, GAINS, TICK_S)
+        out = cascade_tick(position, velocity, q, omega, demand, memory, GAINS, FILTERS, TICK_S)
         assert all(0.0 <= m <= 1.0 for m in out.motors)
         assert np.all(np.isfinite(memory))
 
@@ -519,7 +527,7 @@ def test_loops_hand_over_as_px4s_do() -> None:
     memory, climb = new_memory(), Demand(NAN3, (0.0, 0.0, -1.0), 0.0, NAN)
 
     def fly(demand: Demand) -> Output:
-        return cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+        return cascade_tick(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, FILTERS, TICK_S)
 
     fly(hover())
     steps = [fly(hover()), *(fly(climb) for _ in range(8))]
@@ -537,7 +545,7 @@ def test_a_turn_reaches_the_motors_after_three_loops() -> None:
     memory, turn = new_memory(), Demand(NAN3, ZERO, 1.0, NAN)
     wanted, yaw_torques = [], []
     for demand in (hover(), hover(), turn, turn, turn, turn):
-        out = cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+        out = cascade_tick(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, FILTERS, TICK_S)
         wanted.append(out.rates[2])
         yaw_torques.append((EFFECT @ out.motors)[2])
     assert wanted[:3] == [0.0, 0.0, 0.0]
@@ -550,7 +558,7 @@ def test_the_integral_grows_with_time() -> None:
     memory, error = new_memory(), Demand(NAN3, (0.01, 0.0, 0.0), 0.0, NAN)
     seconds = 2.0
     for _ in range(round(seconds / TICK_S)):
-        out = cascade(ZERO, ZERO, LEVEL, ZERO, error, memory, GAINS, TICK_S)
+        out = cascade_tick(ZERO, ZERO, LEVEL, ZERO, error, memory, GAINS, FILTERS, TICK_S)
     lean = math.atan((GAINS.vel_p_xy + GAINS.vel_i_xy * seconds) * 0.01 / GRAVITY_M_S2)
     assert -scipy_of(out.attitude).as_euler("ZYX")[1] == pytest.approx(lean, rel=0.01)
 
@@ -594,7 +602,7 @@ def test_heading_is_kept_without_a_heading() -> None:
     yaw = 1.1
     q = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
     demand = Demand(NAN3, ZERO, NAN, NAN)
-    out = cascade(ZERO, ZERO, q, ZERO, demand, new_memory(), GAINS, TICK_S)
+    out = cascade_tick(ZERO, ZERO, q, ZERO, demand, new_memory(), GAINS, FILTERS, TICK_S)
     np.testing.assert_allclose(out.rates, 0.0, atol=1e-9)
 
 
@@ -602,8 +610,10 @@ def test_a_row_of_a_batch_is_one_vehicle() -> None:
     one, many = new_memory(), new_memory(3)
     demand = Demand(NAN3, (1.0, 2.0, -0.5), 0.4, NAN)
     for _ in range(5):
-        a = cascade(ZERO, ZERO, LEVEL, (0.1, 0.0, 0.0), demand, one, GAINS, TICK_S)
-        b = cascade(ZERO, ZERO, LEVEL, (0.1, 0.0, 0.0), demand, many[1], GAINS, TICK_S)
+        a = cascade_tick(ZERO, ZERO, LEVEL, (0.1, 0.0, 0.0), demand, one, GAINS, FILTERS, TICK_S)
+        b = cascade_tick(
+            ZERO, ZERO, LEVEL, (0.1, 0.0, 0.0), demand, many[1], GAINS, FILTERS, TICK_S
+        )
     assert a == b
     np.testing.assert_array_equal(many[1], one)
     assert not many[[0, 2]].any()
@@ -617,13 +627,13 @@ def test_gains_cross_over_whole() -> None:
 
 
 @given(triples, triples, quaternions, triples, triples, triples, angles)
-def test_the_controller_is_the_cascade(
+def test_the_controller_is_the_cascade_tick(
     position: Vec, velocity: Vec, q: Quat, omega: Vec, p_sp: Vec, v_sp: Vec, yaw: float
 ) -> None:
     controller, memory = Controller(GAINS, TICK_S), new_memory()
     state = np.array([*position, *velocity, *q, *omega, 7.0, 8.0])
     for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):
-        out = cascade(position, velocity, q, omega, demand, memory, GAINS, TICK_S)
+        out = cascade_tick(position, velocity, q, omega, demand, memory, GAINS, FILTERS, TICK_S)
         assert controller.fly(state, demand) == out.motors
         told = controller.setpoints()
         assert tuple(told.attitude) == out.attitude
@@ -639,7 +649,7 @@ def test_a_controller_at_rest_winds_nothing_up() -> None:
     demand = Demand(NAN3, (1.0, 2.0, 0.5), 0.4, NAN)
     for _ in range(50):
         wound = controller.fly(state, demand)
-        cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S)
+        cascade_tick(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, FILTERS, TICK_S)
     assert controller.descending
     controller.rest()
     reset_integrals(memory)
@@ -647,7 +657,10 @@ def test_a_controller_at_rest_winds_nothing_up() -> None:
     told = controller.setpoints()
     assert (told.attitude.tolist(), told.rates.tolist()) == ([1.0, 0.0, 0.0, 0.0], [0.0] * 3)
     after = controller.fly(state, demand)
-    assert after == cascade(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, TICK_S).motors
+    assert (
+        after
+        == cascade_tick(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, FILTERS, TICK_S).motors
+    )
     assert after != wound
 
 

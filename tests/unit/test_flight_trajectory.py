@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from airl_mav.flight.quality import measure_leg, measure_quality
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory, TrajectoryRecorder
+from tests.support.recording import record_tick
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -95,7 +96,7 @@ def test_no_energy_is_lost_between_ticks_and_samples(powers: list[float], tick_u
     recorder = TrajectoryRecorder()
     for i, power in enumerate(powers):
         last = i == len(powers) - 1
-        recorder.add(i * tick_us, [0, 0, 0], [0, 0, 0], LEVEL, power, keep=last)
+        record_tick(recorder, i * tick_us, [0, 0, 0], [0, 0, 0], LEVEL, power, keep=last)
     flight = recorder.trajectory()
     end_us = (len(powers) - 1) * tick_us
     ticks_j = sum(powers[1:]) * tick_us / 1e6
@@ -109,29 +110,11 @@ def test_no_energy_is_lost_between_ticks_and_samples(powers: list[float], tick_u
 def test_a_recorder_at_250_hz_keeps_50() -> None:
     recorder = TrajectoryRecorder()
     for i in range(251):
-        recorder.add(i * 4_000, [i, 0, 0], [1, 2, 3], LEVEL, 100.0)
+        record_tick(recorder, i * 4_000, [i, 0, 0], [1, 2, 3], LEVEL, 100.0)
     flight = recorder.trajectory()
     assert len(flight) == 51
     assert flight.position[:, 0].tolist() == list(range(0, 251, 5))
     assert flight.velocity[-1].tolist() == [1.0, 2.0, 3.0]
-
-
-def test_integrating_and_keeping_is_adding() -> None:
-    """The way that costs a tick little records the same."""
-    rng = np.random.default_rng(1)
-    thorough, quick = TrajectoryRecorder(), TrajectoryRecorder()
-    time_us = 8_000
-    for i in range(500):
-        state, power = rng.normal(size=10), float(rng.uniform(0.0, 900.0))
-        last = i == 499
-        thorough.add(time_us, state[:3], state[3:6], state[6:], power, keep=last)
-        if quick.integrate(time_us, power) or last:
-            quick.keep(state)
-        time_us += int(rng.choice([4_000, 7_000]))
-    a, b = thorough.trajectory().arrays(), quick.trajectory().arrays()
-    assert 100 < len(a["time_us"]) < 200
-    for name, values in a.items():
-        np.testing.assert_array_equal(b[name], values)
 
 
 def test_a_sample_needs_a_tick() -> None:
@@ -141,9 +124,9 @@ def test_a_sample_needs_a_tick() -> None:
 
 def test_time_must_advance() -> None:
     recorder = TrajectoryRecorder()
-    recorder.add(4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
+    record_tick(recorder, 4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
     with pytest.raises(ValueError, match="must be later"):
-        recorder.add(4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
+        record_tick(recorder, 4_000, [0, 0, 0], [0, 0, 0], LEVEL, 1.0)
     with pytest.raises(ValueError, match="must be later"):
         recorder.integrate(3_999, 1.0)
     good = helix(1.0).arrays()

@@ -22,11 +22,11 @@ SPEC = ObservationSpec(width_px=16, height_px=12, horizontal_fov_deg=90.0, range
 @pytest.mark.parametrize(("layers", "filters"), [(1, 1), (2, 4), (5, 32)])
 def test_size_is_that_of_the_trained_template(layers: int, filters: int) -> None:
     from airl_mav.training.config import NetworkSpec
-    from airl_mav.training.networks import count_parameters
+    from tests.support.policy_kit import parameters_of
 
     spec = NetworkSpec(kind="template", layers=layers, filters=filters)
     found = template_size(layers, filters, 154, 256, 25)
-    assert found.parameters == count_parameters(spec, 154, 256)
+    assert found.parameters == parameters_of(spec, 154, 256)
 
 
 def test_multiply_accumulates_of_a_small_one_by_hand() -> None:

@@ -14,7 +14,7 @@ from airl_mav.flight.paired import compare_pairs, percent_change
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
-from airl_mav.latency.stages import ALL_STAGES, pool, stage_samples
+from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison.model import (
     ComparedRun,
@@ -96,6 +96,12 @@ def tests_of(run: LoadedRun) -> list[EpisodeRecord]:
     return [episode for episode in run.episodes if episode.outcome is not Outcome.ABORTED]
 
 
+def samples_of(run: LoadedRun) -> dict[str, Samples]:
+    """Return the durations of all stages [µs], without those of aborted flights."""
+    tests = tests_of(run)
+    return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
+
+
 def letter(index: int) -> str:
     """Return A to Z, then AA, AB and so on."""
     rest, last = divmod(index, 26)
@@ -117,7 +123,7 @@ def _marks(entries: Sequence[RunEntry]) -> dict[str, str]:
 def _compared_run(entry: RunEntry, mark: str, run: LoadedRun) -> ComparedRun:
     """Work out one run."""
     tests = tests_of(run)
-    samples = pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
+    samples = samples_of(run)
     planned = len(run.info.seeds) if entry.planned is None else entry.planned
     return ComparedRun(
         entry=entry,

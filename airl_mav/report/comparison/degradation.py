@@ -8,22 +8,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
-from airl_mav.report.comparison.model import (
-    Comparison,
-    Contrast,
-    ContrastEntry,
-    RunEntry,
-)
+from airl_mav.report.comparison.model import Comparison, Contrast, ContrastEntry, RunEntry
 from airl_mav.report.comparison.tables import common_rules, contrasts_table, plain_facts, signed
 from airl_mav.report.curves import Series, curves_picture
 from airl_mav.report.document import Document, Section
 from airl_mav.report.measures import DISTANCE, ENERGY, FLIGHT_TIME, MEASURES, Measure
-from airl_mav.report.table import US_PER_MS, Column, TableView, ms
+from airl_mav.report.table import Column, TableView, ms
 from airl_mav.report.theme import Picture
 
 AGAINST_FIRST, STEP = "against-first", "step"
@@ -38,32 +34,20 @@ FEWEST = 10
 def build_degradation(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a degradation curve for every policy.
+    """Work out a degradation curve for every policy; see `show.build_comparison`.
 
-    Args:
-        facts: What all runs share: `arena`, ...
-        entries: By policy, then by growing latency, the reference first; their `label` is the
-            latency, their `group` the policy.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    The facts are what all runs share: `arena`, ... The entries stand by policy, then by growing
+    latency, the reference first; their `label` is the latency, their `group` the policy.
     """
     contrasts: list[ContrastEntry] = []
     for policy in dict.fromkeys(entry.group for entry in entries):
         line = [entry for entry in entries if entry.group == policy]
-        contrasts += [
-            *(
-                ContrastEntry(
-                    b.name, line[0].name, AGAINST_FIRST, f"{b.label} against {line[0].label}"
-                )
-                for b in line[1:]
-            ),
-            *(
-                ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}")
-                for a, b in pairwise(line)
-            ),
-        ]
+        first = line[0]
+        for run in line[1:]:
+            title = f"{run.label} against {first.label}"
+            contrasts.append(ContrastEntry(run.name, first.name, AGAINST_FIRST, title))
+        for a, b in pairwise(line):
+            contrasts.append(ContrastEntry(b.name, a.name, STEP, f"{a.label} → {b.label}"))
     title = "Degradation by latency"
     comparison = compare(
         runs, contrasts, kind="degradation", title=title, facts=facts, entries=entries
@@ -131,7 +115,7 @@ def latency_quality_table(comparison: Comparison, policy: str) -> TableView:
         (
             run.label,
             ms(run.stages["t2"].mean, 0),
-            *(measure.with_interval(measure.of(run.quality)) for measure in MEASURES),
+            *(measure.with_interval(run.quality) for measure in MEASURES),
         )
         for run in comparison.group(policy)
     )

@@ -8,14 +8,7 @@ from pathlib import Path
 
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.model import Comparison
-from airl_mav.report.document import (
-    Document,
-    Facts,
-    Headline,
-    Section,
-    provenance_facts,
-    run_link,
-)
+from airl_mav.report.document import Document, Facts, Section, provenance_facts, run_link
 
 
 def comparison_document(
@@ -27,20 +20,18 @@ def comparison_document(
     sections: Sequence[Section],
     facts: Facts,
     lead: str = "",
-    headlines: tuple[Headline, ...] = (),
     facts_title: str = "What flew",
 ) -> Document:
-    """Return the document of a comparison.
+    """Return the document of a comparison; its parts are those of `Document`.
 
     Args:
         comparison: What is shown.
         runs: Its runs by name.
         folder: Where the document goes: links to the runs start there.
-        kicker: Kind of the document.
+        kicker: Kind of the document; the date is added.
         sections: What it says.
         facts: What was flown.
         lead: One sentence under the title.
-        headlines: Figures at the top of the page.
         facts_title: Heading of the facts.
     """
     first = comparison.runs[0]
@@ -54,7 +45,6 @@ def comparison_document(
         kicker=f"{kicker} · {created}",
         lead=lead,
         answers=comparison.answers,
-        headlines=headlines,
         sections=tuple(sections),
         facts=facts,
         facts_title=facts_title,

@@ -8,23 +8,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import Estimate
-from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
+from airl_mav.latency.stages import ALL_STAGES, Samples
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.arenas import arena_of
-from airl_mav.report.comparison.build import tests_of
+from airl_mav.report.comparison.build import samples_of, tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.comparison.tables import letters_of, published_change
 from airl_mav.report.flights_above import Panel, path_points
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
-from airl_mav.report.table import NONE, OUTCOME_LABELS, US_PER_MS
+from airl_mav.report.table import NONE, OUTCOME_LABELS
 
 ROW_IN = 0.5
 """Height of a contrast in a figure."""
@@ -123,7 +123,7 @@ def _finish_rows(ax: Axes, names: Sequence[str], ends: Sequence[float]) -> None:
 
 def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
     """Draw the cumulated distributions of all runs, one picture a stage that has samples."""
-    pooled = {name: _samples(run) for name, run in runs.items()}
+    pooled = {name: samples_of(run) for name, run in runs.items()}
     pictures = []
     for stage in (stage for stage in ALL_STAGES if stage.key in CDF_STAGES):
         having = [run for run in comparison.runs if pooled[run.name][stage.key].size]
@@ -143,9 +143,7 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
             medians.append(float(np.median(at_ms)))
             ends += [float(at_ms[0]), float(at_ms[-1])]
         if min(ends) > 0.0 and max(ends) > LONG_TAIL * min(medians):
-            ax.set_xscale("log")
-            ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            ax.xaxis.set_minor_formatter(NullFormatter())
+            theme.logarithmic(ax, "x")
         else:
             ax.set_xlim(left=0.0)
         ax.set_ylim(0.0, 104.0)
@@ -158,12 +156,6 @@ def latency_pictures(comparison: Comparison, runs: Runs) -> list[theme.Picture]:
         name = f"{comparison.kind}-{stage.key.replace('_', '-')}"
         pictures.append(theme.render(figure, name, alt))
     return pictures
-
-
-def _samples(run: LoadedRun) -> dict[str, Samples]:
-    """Return the durations of all stages [µs], without those of aborted flights."""
-    tests = tests_of(run)
-    return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
 
 
 def cumulated(samples: Samples) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import pair_by_seed
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
-from airl_mav.report.comparison.figures import (
-    contrast_pictures,
-    flight_panels,
-    seed_pictures,
-)
+from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_pictures
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
@@ -28,6 +21,7 @@ from airl_mav.report.comparison.model import (
     ContrastEntry,
     RunEntry,
 )
+from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.tables import (
     THE_PAPER,
     common_rules,
@@ -42,16 +36,10 @@ from airl_mav.report.flights_above import flight_pictures
 from airl_mav.report.measures import ALL_MEASURES, FLIGHT_TIME, interval_of
 from airl_mav.report.table import NONE, Column, TableView, ms
 
-Role = Literal["reference", "target", "mitigated", "training", "mitigated-reference"]
-"""Of `training` there may be several runs: one for each source of latency."""
-
 OVERLAID = 100
 """Flights of a run that are drawn over each other: the first seeds."""
 
-WORST = 6
-"""Seeds that are looked at one by one."""
-
-WORST_ROLES: tuple[Role, ...] = ("reference", "target", "mitigated")
+WORST_ROLES = ("reference", "target", "mitigated")
 """What is drawn of the worst seeds."""
 
 WITHOUT, WITH = "without-mitigation", "with-mitigation"
@@ -62,47 +50,28 @@ HEADLINED = (WITHOUT, WITH, WITH_TRAINED)
 """Gaps whose figures head an arena."""
 
 
-@dataclass(frozen=True)
-class _GapKind:
-    """Which two roles make a gap."""
-
-    key: str
-    target: Role
-    reference: Role
-    title: str
-    short: str
-
+_UNDELAYED = "mitigation, reference undelayed"
+_TRAINED = "mitigation, reference delay-trained (the paper's way)"
+_NO_MITIGATION, _MITIGATED = "no mitigation", "mitigated"
 
 GAP_KINDS = (
-    _GapKind(
-        WITHOUT, "target", "reference", "without mitigation, reference undelayed", "no mitigation"
+    ContrastEntry("target", "reference", WITHOUT, f"without {_UNDELAYED}", _NO_MITIGATION),
+    ContrastEntry("mitigated", "reference", WITH, f"with {_UNDELAYED}", _MITIGATED),
+    ContrastEntry("target", "training", WITHOUT_TRAINED, f"without {_TRAINED}", _NO_MITIGATION),
+    ContrastEntry("mitigated", "training", WITH_TRAINED, f"with {_TRAINED}", _MITIGATED),
+    ContrastEntry(
+        "mitigated", "target", HELP, "mitigation against none, both on the target", "mitigation"
     ),
-    _GapKind(WITH, "mitigated", "reference", "with mitigation, reference undelayed", "mitigated"),
-    _GapKind(
-        WITHOUT_TRAINED,
-        "target",
-        "training",
-        "without mitigation, reference delay-trained (the paper's way)",
-        "no mitigation",
-    ),
-    _GapKind(
-        WITH_TRAINED,
-        "mitigated",
-        "training",
-        "with mitigation, reference delay-trained (the paper's way)",
-        "mitigated",
-    ),
-    _GapKind(
-        HELP, "mitigated", "target", "mitigation against none, both on the target", "mitigation"
-    ),
-    _GapKind(
-        COST,
+    ContrastEntry(
         "mitigated-reference",
         "reference",
+        COST,
         "mitigated policy where nothing is late, reference undelayed",
         "mitigated, undelayed",
     ),
 )
+"""Which two roles make a gap; the runs that have them take their places. Of `training` there may be
+several runs: one for each source of latency."""
 
 
 def build_gap(
@@ -110,16 +79,11 @@ def build_gap(
 ) -> Comparison:
     """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
 
-    Args:
-        facts: What was asked for: `policy`, `computer`, `reference`, `latency`, ...
-        entries: The runs, each with its `role`; their group is the arena.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    See `show.build_comparison`; facts are `policy`, `computer`, `reference`, `latency`, ..., each
+    entry has its `role`, and its group is the arena.
     """
     contrasts = [
-        ContrastEntry(target.name, reference.name, kind.key, kind.title, kind.short)
+        replace(kind, target=target.name, reference=reference.name)
         for group in dict.fromkeys(entry.group for entry in entries)
         for kind in GAP_KINDS
         for target in entries
@@ -191,25 +155,6 @@ def _as_late(t2_us: float | None, published_ms: float) -> bool:
     return abs(t2_us / US_PER_MS - published_ms) <= max(0.2 * published_ms, 20.0)
 
 
-def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
-    """Return seeds that lost most: half of them failed, half took longest against the reference.
-
-    The reference reached the goal with all of them. Of those that failed the first seeds are taken.
-    """
-    failed: list[int] = []
-    slower: dict[int, float] = {}
-    for first, second in pair_by_seed(reference, target):
-        if first.outcome is not Outcome.SUCCESS or first.quality is None:
-            continue
-        if second.outcome is not Outcome.SUCCESS:
-            failed.append(first.seed)
-        elif second.quality is not None:
-            slower[first.seed] = second.quality.flight_time_s / first.quality.flight_time_s
-    longest = sorted(slower, key=lambda seed: (-slower[seed], seed))
-    chosen = sorted(failed)[: max(WORST // 2, WORST - len(longest))]
-    return [*chosen, *longest[: WORST - len(chosen)]]
-
-
 # --- the verdict
 
 
@@ -218,7 +163,7 @@ def _verdict(comparison: Comparison, arena: str) -> str:
     gaps = {c.entry.key: c for c in reversed(comparison.contrasts_of(arena))}
     if (gap := gaps.get(WITHOUT)) is None:
         return ""
-    target, reference = comparison.run(gap.entry.target), comparison.run(gap.entry.reference)
+    target, reference = comparison.pair(gap)
     place = "" if len(comparison.groups) == 1 else f" in {Path(arena).stem}"
     sentence = (
         f"On {_computer(target)}{place} {target.setup.policy.name} flies {_longer(gap)} than on "
@@ -295,7 +240,7 @@ def columns_table(comparison: Comparison, arena: str) -> TableView:
         rows.append(
             (
                 f"{measure.title} [{measure.unit}]",
-                *(measure.with_interval(measure.of(run.quality)) for run in runs),
+                *(measure.with_interval(run.quality) for run in runs),
                 *(NONE if figure is None else f"{figure:.4g}" for figure in told),
             )
         )
@@ -341,15 +286,6 @@ def gaps_table(comparison: Comparison, arena: str) -> TableView:
         if published.note and "mitigated" in roles:
             notes.append(published.note)
     return contrasts_table(comparison, comparison.contrasts_of(arena), "Hardware gap", notes)
-
-
-def gap_tables(comparison: Comparison, arena: str) -> list[TableView]:
-    """Return all tables of an arena."""
-    contrasts = comparison.contrasts_of(arena)
-    tables = [columns_table(comparison, arena)]
-    if contrasts:
-        tables.append(gaps_table(comparison, arena))
-    return [*tables, *(contrast_table(comparison, c, ALL_MEASURES) for c in contrasts)]
 
 
 def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: Path) -> Document:

@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import pair_by_seed
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.comparison.build import compare, tests_of
+from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
 from airl_mav.report.comparison.figures import contrast_pictures
-from airl_mav.report.comparison.model import (
-    ComparedRun,
-    Comparison,
-    Contrast,
-    RunEntry,
-)
+from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast, RunEntry
+from airl_mav.report.comparison.seeds import split_seeds, widest_seeds
 from airl_mav.report.comparison.tables import (
     contrast_headlines,
     contrast_table,
@@ -36,66 +29,23 @@ from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, ms
 MAX_SPLIT = 50
 """Seeds in the table of flights that did not end alike."""
 
-WIDEST = 3
-"""Pairs that are named for differing most."""
-
 
 def build_ladder(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a ladder.
+    """Work out a ladder of levels, the reference first; see `show.build_comparison`.
 
-    Args:
-        facts: What all levels share: `policy`, `arena`, ...
-        entries: The levels, the reference first.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    The facts are what all levels share: `policy`, `arena`, ...
     """
     title = f"{facts.get('policy')} in {facts.get('arena')}"
     comparison = compare(runs, kind="ladder", title=title, facts=facts, entries=entries)
     widest = {
-        contrast.entry.target: _widest(runs[contrast.entry.reference], runs[contrast.entry.target])
+        contrast.entry.target: widest_seeds(
+            runs[contrast.entry.reference], runs[contrast.entry.target]
+        )
         for contrast in comparison.contrasts
     }
     return replace(comparison, extra={"split": split_seeds(runs), "widest_percent": widest})
-
-
-def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
-    """Return the seeds of which not all flights reached the goal, but one did.
-
-    Returns:
-        For each its `seed`, and its `outcomes` by run; aborted flights are left out.
-    """
-    flights: dict[int, dict[str, EpisodeRecord]] = {}
-    for name, run in runs.items():
-        for episode in tests_of(run):
-            flights.setdefault(episode.seed, {})[name] = episode
-    return [
-        {"seed": seed, "outcomes": {name: f.outcome.value for name, f in flights[seed].items()}}
-        for seed in sorted(flights)
-        if len({f.outcome is Outcome.SUCCESS for f in flights[seed].values()}) > 1
-    ]
-
-
-def _widest(reference: LoadedRun, level: LoadedRun) -> dict[str, Any] | None:
-    """Return the median difference in flight time and the seeds of the widest [%].
-
-    None with fewer than three common successes.
-    """
-    percent = {
-        first.seed: 100.0 * (second.quality.flight_time_s / first.quality.flight_time_s - 1.0)
-        for first, second in pair_by_seed(reference.episodes, level.episodes)
-        if first.outcome is second.outcome is Outcome.SUCCESS and first.quality and second.quality
-    }
-    if len(percent) < WIDEST:
-        return None
-    widest = sorted(percent, key=lambda seed: -abs(percent[seed]))[:WIDEST]
-    return {
-        "median": median(percent.values()),
-        "seeds": [{"seed": seed, "percent": percent[seed]} for seed in widest],
-    }
 
 
 def start_table(comparison: Comparison) -> TableView:

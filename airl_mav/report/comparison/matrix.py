@@ -9,11 +9,7 @@ from typing import Any
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
-from airl_mav.report.comparison.model import (
-    ComparedRun,
-    Comparison,
-    RunEntry,
-)
+from airl_mav.report.comparison.model import ComparedRun, Comparison, RunEntry
 from airl_mav.report.comparison.tables import plain_facts
 from airl_mav.report.document import Document, Section
 from airl_mav.report.heatmap import Field, HeatMap, heat_picture
@@ -24,15 +20,10 @@ from airl_mav.report.table import NONE, Column, TableView
 def build_matrix(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a table of policies x arenas.
+    """Work out a table of policies x arenas; see `show.build_comparison`.
 
-    Args:
-        facts: What all cells share: level, seed, episodes, vehicle, computer.
-        entries: One for each cell: its `label` is the policy, its `group` the arena.
-        runs: By name.
-
-    Raises:
-        UsageError: There is no run, or a run holds no flight.
+    The facts are what all cells share: level, seed, episodes, vehicle, computer. The `label` of an
+    entry is the policy, its `group` the arena.
     """
     title = "Policies by arenas"
     return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)
@@ -62,7 +53,7 @@ def _cell(run: ComparedRun | None, measure: Measure) -> str:
     """Return a figure with its interval; a star where the policy was trained."""
     if run is None:
         return NONE
-    text = measure.with_interval(measure.of(run.quality))
+    text = measure.with_interval(run.quality)
     return f"{text} *" if text != NONE and trained_here(run) else text
 
 

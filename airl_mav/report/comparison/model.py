@@ -195,6 +195,10 @@ class Comparison:
                 return run
         raise KeyError(name)
 
+    def pair(self, contrast: Contrast) -> tuple[ComparedRun, ComparedRun]:
+        """Return the target and the reference of a contrast."""
+        return self.run(contrast.entry.target), self.run(contrast.entry.reference)
+
     @property
     def different(self) -> tuple[str, ...]:
         """The terms in which the facts of the runs differ."""

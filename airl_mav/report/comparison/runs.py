@@ -65,7 +65,7 @@ def compare_folders(
 def build_runs(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Compare all other runs with the first. Raises UsageError: a run holds no flight."""
+    """Compare all other runs with the first; see `show.build_comparison`."""
     return compare(runs, title=f"{len(runs)} runs compared", facts=facts, entries=entries)
 
 

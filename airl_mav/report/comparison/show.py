@@ -50,7 +50,7 @@ def build_comparison(
     Args:
         folder: Of the comparison: the runs lie in it.
         kind: Which comparison; its module says what it asks of facts and entries.
-        facts: What was asked for.
+        facts: What was asked for, and all runs share.
         entries: The runs, in the order of the tables.
 
     Returns:

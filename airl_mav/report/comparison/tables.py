@@ -68,8 +68,8 @@ def signed(value: float | None, digits: int = 1) -> str:
 
 def letters_of(comparison: Comparison, contrast: Contrast) -> str:
     """Return the runs of a contrast as `B against A`."""
-    entry = contrast.entry
-    return f"{comparison.run(entry.target).mark} against {comparison.run(entry.reference).mark}"
+    target, reference = comparison.pair(contrast)
+    return f"{target.mark} against {reference.mark}"
 
 
 # --- runs by themselves
@@ -92,7 +92,7 @@ def runs_table(
         (
             run.mark,
             f"{run.quality.success_rate.n:,}",
-            *(measure.with_interval(measure.of(run.quality)) for measure in measures),
+            *(measure.with_interval(run.quality) for measure in measures),
         )
         for run in runs
     )
@@ -166,9 +166,7 @@ def contrast_table(
     comparison: Comparison, contrast: Contrast, measures: Sequence[Measure] = MEASURES
 ) -> TableView:
     """Return one contrast, measure by measure."""
-    target, reference = (
-        comparison.run(name) for name in (contrast.entry.target, contrast.entry.reference)
-    )
+    target, reference = comparison.pair(contrast)
     columns = [
         Column("same seeds", number=False),
         Column(reference.mark),
@@ -194,7 +192,7 @@ def contrast_table(
     ]
     if 1 < n < FEW_FLIGHTS:
         notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
-    title = f"{target.mark} against {reference.mark}"
+    title = letters_of(comparison, contrast)
     if contrast.entry.short:
         title += f": {contrast.entry.title}"
     key = f"{contrast.entry.target}-against-{contrast.entry.reference}"
@@ -272,12 +270,10 @@ def contrasts_table(
     )
 
 
-def contrast_headlines(
-    contrast: Contrast, measures: Sequence[Measure] = MEASURES, digits: int = 2
-) -> tuple[Headline, ...]:
+def contrast_headlines(contrast: Contrast, digits: int = 2) -> tuple[Headline, ...]:
     """Return the differences of a contrast as headlines."""
     headlines = []
-    for measure in measures:
+    for measure in MEASURES:
         d = measure.change(contrast.paired).difference
         told = published_change(contrast, measure)
         more = [] if told is None else [f"{THE_PAPER} {told:+.1f}"]
@@ -293,9 +289,7 @@ def pair_sentences(comparison: Comparison) -> tuple[str, ...]:
     """Return how many pairs there are of every contrast, and why no more."""
     sentences = []
     for contrast in comparison.contrasts:
-        target, reference = (
-            comparison.run(name).mark for name in (contrast.entry.target, contrast.entry.reference)
-        )
+        target, reference = (run.mark for run in comparison.pair(contrast))
         unmatched = ""
         if contrast.unmatched:
             unmatched = (

@@ -136,10 +136,16 @@ def view_obstacle(
     )
     spot = nearest_spot(arena.obstacles, i, centers_then[i], pose_at(path, hit_us)[0])
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
-    whole, alone, empty = (
-        _depth(arena, keep, centers, camera, position, quaternion)
-        for keep in (slice(None), slice(i, i + 1), slice(0, 0))
-    )
+    eye, attitude = camera_pose(position, quaternion, camera.mount)
+
+    def depth(keep: slice) -> NDArray[np.float32]:
+        """Return the depth image (h, w) of the arena with some of its obstacles only."""
+        o = arena.obstacles
+        some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
+        bare = replace(arena, obstacles=some, tours=())
+        return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
+
+    whole, alone, empty = depth(slice(None)), depth(slice(i, i + 1)), depth(slice(0, 0))
     outline = np.abs(alone - empty) > SAME_DEPTH_M
     shown = outline & (np.abs(whole - alone) <= SAME_DEPTH_M)
     return ObstacleView(
@@ -163,19 +169,3 @@ def view_wall(path: Trajectory, frame_us: int, hit_us: int, arena: Arena) -> Obs
     return ObstacleView(
         float(np.linalg.norm(offset)), bearing(quaternion, offset), None, hidden=False
     )
-
-
-def _depth(
-    arena: Arena,
-    keep: slice,
-    centers: Floats,
-    camera: PolicyCamera,
-    position: Floats,
-    quaternion: Floats,
-) -> NDArray[np.float32]:
-    """Return the depth image (h, w) of the arena with some of its obstacles only."""
-    o = arena.obstacles
-    some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
-    bare = replace(arena, obstacles=some, tours=())
-    eye, attitude = camera_pose(position, quaternion, camera.mount)
-    return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)

@@ -36,9 +36,7 @@ def cause_of(flight: Evidence, usual: UsualFlight) -> Cause:
     if outcome is Outcome.ABORTED:
         return Cause("aborted", (f"{flight.record.reason}.",))
     if outcome is Outcome.COLLISION:
-        crash = examine_collision(
-            flight.record, flight.path, flight.stamps, flight.arena, flight.camera
-        )
+        crash = examine_collision(flight)
         return Cause(NO_CAUSE, ()) if crash is None else _cause_of_collision(flight, crash)
     if not len(flight.path):
         return Cause(NO_CAUSE, ())

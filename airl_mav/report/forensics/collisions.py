@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.quality import measure_leg
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
-    PolicyCamera,
     bearing,
     pose_at,
     view_obstacle,
     view_wall,
 )
+from airl_mav.report.forensics.evidence import Evidence
 
 LOOK_BACK = 5
 """Decisions before the collision whose frames are looked at."""
@@ -41,8 +40,6 @@ class Collision:
 
     what: str
     """As the plant calls it: `static-box-3`, `wall`, `floor`."""
-    obstacle: int | None
-    """Number of the obstacle; None for a wall or the floor, or where the arena is not known."""
     speed_m_s: float
     """At the collision."""
     off_heading_rad: float
@@ -88,14 +85,9 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(
-    record: EpisodeRecord,
-    path: Trajectory,
-    stamps: Mapping[str, NDArray[Any]],
-    arena: Arena | None,
-    camera: PolicyCamera | None,
-) -> Collision | None:
+def examine_collision(flight: Evidence) -> Collision | None:
     """Take a collision apart; None for a flight that hit nothing, or that has no recording."""
+    record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
         return None
     hit_us = record.ended_us
@@ -107,17 +99,22 @@ def examine_collision(
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
         frame_us = int(frames[-1])
-        before_s, blind_m = (hit_us - frame_us) / US_PER_S, _way(path, frame_us, hit_us)
+        before_s, blind_m = (
+            (hit_us - frame_us) / US_PER_S,
+            measure_leg(path, frame_us, hit_us).distance_m,
+        )
         motor_us = int(stamps.get("motor_us", stamps["sent_us"])[decisions[-1]])
         if motor_us != NO_STAMP:
-            lag_s, lag_m = (motor_us - frame_us) / US_PER_S, _way(path, frame_us, motor_us)
+            lag_s, lag_m = (
+                (motor_us - frame_us) / US_PER_S,
+                measure_leg(path, frame_us, motor_us).distance_m,
+            )
             answer_m_s = float(np.linalg.norm(pose_at(path, motor_us)[1]))
-        if arena is not None and camera is not None:
+        if arena is not None and flight.camera is not None:
             if number is not None:
+                began_us, camera = record.started_us, flight.camera
                 views = [
-                    view_obstacle(
-                        path, int(frame), hit_us, arena, record.started_us, number, camera
-                    )
+                    view_obstacle(path, int(frame), hit_us, arena, began_us, number, camera)
                     for frame in frames
                 ]
                 view = views[-1]
@@ -126,7 +123,6 @@ def examine_collision(
                 view = view_wall(path, frame_us, hit_us, arena)
     return Collision(
         what=record.reason.removeprefix("hit ").removesuffix(" during the take-off"),
-        obstacle=number,
         speed_m_s=float(np.linalg.norm(velocity)),
         off_heading_rad=bearing(quaternion, velocity) if math.hypot(*velocity[:2]) > 0.2 else 0.0,
         before_s=before_s,
@@ -137,9 +133,3 @@ def examine_collision(
         view=view,
         seen=seen,
     )
-
-
-def _way(path: Trajectory, start_us: int, end_us: int) -> float:
-    """Return the length [m] of a part of the path."""
-    part = path.between(start_us, end_us)
-    return float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum())

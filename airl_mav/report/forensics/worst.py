@@ -92,31 +92,20 @@ def examine_worst(
     usual = usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else max_acceleration(vehicle)
-    return [
-        ExaminedFlight(
+    examined = []
+    for record in ranked(run)[:EXAMINED]:
+        path = flown_path(run, record)
+        flight = Evidence(
             record,
-            cause_of(_evidence(run, record, arenas, camera, brake), usual),
-            time_lost_s(record, usual),
-            path_excess(record),
+            NOT_RECORDED if path is None else path,
+            run.latency.get(record.index, {}),
+            arenas.get(record.index),
+            camera,
+            brake,
         )
-        for record in ranked(run)[:EXAMINED]
-    ]
-
-
-def _evidence(
-    run: LoadedRun,
-    record: EpisodeRecord,
-    arenas: Mapping[int, Arena],
-    camera: PolicyCamera | None,
-    brake_m_s2: float | None,
-) -> Evidence:
-    """Gather what is known of a flight."""
-    path = flown_path(run, record)
-    stamps = run.latency.get(record.index, {})
-    arena = arenas.get(record.index)
-    return Evidence(
-        record, NOT_RECORDED if path is None else path, stamps, arena, camera, brake_m_s2
-    )
+        lost_s, excess = time_lost_s(record, usual), path_excess(record)
+        examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
+    return examined
 
 
 def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:

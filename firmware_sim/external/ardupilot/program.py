@@ -10,7 +10,7 @@ from pathlib import Path
 from airl_mav.core.location import HOME
 from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.parameter_file import ardupilot_file
-from firmware_sim.external.process.firmware_process import StartCommand
+from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT, PORTS_PER_INSTANCE = 9002, 10
@@ -41,8 +41,7 @@ class Links:
 def find_arducopter(path: Path) -> Path:
     """Return the program of a build or a source tree, or itself.
 
-    Raises:
-        FirmwareMissingError: There is none.
+    Raises FirmwareMissingError when there is none.
     """
     if path.is_file():
         return path.resolve()
@@ -64,11 +63,8 @@ def simulator_port(instance: int) -> int:
 def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
     """Return program and arguments.
 
-    Args:
-        program: The executable.
-        instance: Its instance number, which moves the simulator's port.
-        links: Ports that it sends MAVLink to.
-        defaults: File of default parameters, relative to its working directory.
+    The instance number moves the simulator's port; `defaults` is a file of default parameters,
+    relative to its working directory.
     """
     home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
     return [
@@ -84,15 +80,7 @@ def command(program: str, instance: int, links: Links, defaults: str) -> list[st
 def start(
     program: Path, instance: int, links: Links, settings: Mapping[str, float], folder: Path
 ) -> StartCommand:
-    """Write its parameter file, and return the command that starts it.
-
-    Args:
-        program: The program itself.
-        instance: Its instance number, which moves the simulator's port.
-        links: Ports that it sends MAVLink to.
-        settings: Parameters, by name.
-        folder: Its working folder, which gets the file.
-    """
+    """Write its parameter file into its working folder; return the command that starts it there."""
     (folder / PARAMETERS).write_text(ardupilot_file(settings), encoding="ascii")
     return StartCommand(command(str(program), instance, links, PARAMETERS), {})
 

@@ -47,6 +47,9 @@ _SLICE_S = 0.1
 
 _MAX_DATAGRAM = 4096
 
+PWM_MIN_US, PWM_MAX_US = 1000, 2000
+"""Pulses of a stopped motor (MOT_PWM_MIN) and of full thrust (MOT_PWM_MAX) [µs]."""
+
 MOTORS = 4
 """Servo outputs 1 to 4 are the motors; the airframe says which is which."""
 
@@ -54,30 +57,15 @@ MOTORS = 4
 class ArdupilotBridge:
     """One ArduPilot, one episode. Implements `bridge.Bridge`."""
 
-    def __init__(
-        self,
-        port: int = SIMULATOR_PORT,
-        *,
-        pwm_min_us: int = 1000,
-        pwm_max_us: int = 2000,
-        rate_hz: int | None = None,
-        silence_s: float = SILENCE_S,
-    ) -> None:
-        """Open the port; nothing is sent before ArduPilot sends a packet.
+    def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
+        """Open a UDP port on the loopback address; nothing is sent before ArduPilot sends a packet.
 
-        Args:
-            port: UDP port on the loopback address, see `program.simulator_port`.
-            pwm_min_us: Pulse of a stopped motor (MOT_PWM_MIN) [µs].
-            pwm_max_us: Pulse of full thrust (MOT_PWM_MAX) [µs].
-            rate_hz: Lines a second of simulated time; None = what ArduPilot asks for. It goes by
-                the time of the lines, whatever it asks for, but arms only with 1.8 times its loop
-                rate (SCHED_LOOP_RATE, 400 Hz) or more.
-            silence_s: Longest wait for a packet [wall s].
-
-        Raises:
-            UsageError: The port is taken.
+        `silence_s` is the longest wait for a packet [wall s]. Raises UsageError if the port is
+        taken.
         """
-        self.rate_hz = rate_hz or 0
+        self.rate_hz = 0
+        """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
+        400 Hz) or more."""
         self.armed = False
         self.time_us = 0
         self.port = port
@@ -85,7 +73,6 @@ class ArdupilotBridge:
         """Datagrams so far that were not servo packets."""
         self._run = 0
         """How many of them were consecutive."""
-        self._pwm_min_us, self._span_us = pwm_min_us, pwm_max_us - pwm_min_us
         self._silence_us = int(silence_s * US_PER_S)
         self._alive: Callable[[], None] = no_process
         self._truth: Callable[[], Truth] | None = None
@@ -113,12 +100,7 @@ class ArdupilotBridge:
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
         """Wait for the first servo packet; ArduPilot waits for our answer from then on.
 
-        Args:
-            timeout_s: How long [wall s].
-            alive: Called at intervals, here and in `step`; raises when the process has died.
-
-        Raises:
-            FirmwareMissingError: No servo packet arrived in time, or it asks for an invalid rate.
+        See `Bridge`. Raises FirmwareMissingError also when it asks for an invalid rate.
         """
         self._alive = alive
         stopwatch = WallClock()
@@ -127,7 +109,7 @@ class ArdupilotBridge:
             if stopwatch.time_us() > timeout_s * US_PER_S:
                 raise FirmwareMissingError(self._not_connected(timeout_s))
             self._packet = self._receive()
-        self.rate_hz = self.rate_hz or self._packet.frame_rate_hz
+        self.rate_hz = self._packet.frame_rate_hz
         if self.rate_hz not in RATES_HZ:
             raise FirmwareMissingError(
                 f"ArduPilot asks for {self.rate_hz} Hz (SIM_RATE_HZ): must be in "
@@ -139,13 +121,10 @@ class ArdupilotBridge:
         self._truth = truth
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Answer the pending packet, and return the motor commands of the next one.
+        """Answer the pending packet, and return the motor commands of the next one; see `Bridge`.
 
         The motors are outputs 1 to 4 in this order. ArduCopter's quad X (FRAME_TYPE 1) numbers
         them as PX4 does: front right, rear left, front left, rear right.
-
-        Raises:
-            FirmwareLostError: ArduPilot died, is silent, restarted or sends garbage.
         """
         answered, truth, address = self._packet, self._truth, self._address
         if answered is None or truth is None or address is None:
@@ -158,7 +137,7 @@ class ArdupilotBridge:
         line = state_line(self.time_us, sample, truth())
         self._socket.sendto(line, address)
         self._packet = packet = self._next(answered, line)
-        motors = self._motors(packet.pwm_us)
+        motors = _motors(packet.pwm_us)
         self.armed = any(motors)
         return ActuatorControls(sample.time_us, motors, self.armed)
 
@@ -237,12 +216,6 @@ class ArdupilotBridge:
                 f"{self._run} consecutive datagrams are not servo packets: {error}"
             )
 
-    def _motors(self, pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
-        """Return the commands 0..1 of outputs 1 to 4, in this order."""
-        low, span = self._pwm_min_us, self._span_us
-        a, b, c, d = (min(max((pwm - low) / span, 0.0), 1.0) for pwm in pwm_us[:MOTORS])
-        return a, b, c, d
-
     def _not_connected(self, timeout_s: float) -> str:
         heard = f", only {self.garbage} other datagrams" if self.garbage else ""
         if self._veteran:
@@ -261,3 +234,10 @@ def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
     if after.frame_count < before.frame_count:
         raise FirmwareLostError(_RESTARTED)
     return after
+
+
+def _motors(pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
+    """Return the commands 0..1 of outputs 1 to 4, in this order."""
+    span_us = PWM_MAX_US - PWM_MIN_US
+    a, b, c, d = (min(max((pwm - PWM_MIN_US) / span_us, 0.0), 1.0) for pwm in pwm_us[:MOTORS])
+    return a, b, c, d

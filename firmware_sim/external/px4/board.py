@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from firmware_sim.external.px4 import hil_messages as hil
+from firmware_sim.external.transport.router import Router
 from firmware_sim.mavlink.codec import WireMessage, dialect
 
 HIL_SETUP = "set SYS_HITL = 1 with the airframe HIL Quadcopter X (SYS_AUTOSTART 1001) and reboot it"
@@ -108,14 +107,7 @@ class Board:
         return None
 
 
-class Heard(Protocol):
-    """What was received on a line; `router.Router` counts it."""
-
-    received_bytes: int
-    speaks_mavlink: bool
-
-
-def silence(board: Board, line: Heard) -> str:
+def silence(board: Board, line: Router) -> str:
     """Return why a connection was not completed: how far it got."""
     if line.received_bytes == 0:
         return (

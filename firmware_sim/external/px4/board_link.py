@@ -6,12 +6,17 @@ import select
 from collections.abc import Callable
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.errors import UsageError
-from firmware_sim.external.observer import SYSTEM_ID
+from firmware_sim.external.observer import FORCE, SYSTEM_ID
 from firmware_sim.external.px4.board import Board, silence
 from firmware_sim.external.transport.router import Router
-from firmware_sim.external.transport.serial_port import SerialPort
+from firmware_sim.external.transport.serial_port import (
+    BITS_PER_BYTE,
+    SerialPort,
+    carries_bytes_s,
+    check_baud,
+)
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Encoder, Layout, Values, WireMessage, dialect
 
@@ -21,8 +26,20 @@ REBOOT_S = 10.0
 SILENCE_S = 1.5
 """A board that is silent for this long is down: its heartbeat is due every second [wall s]."""
 
-FORCE = 21196.0
-"""COMPONENT_ARM_DISARM in any state."""
+SENSOR_BYTES, GPS_BYTES = 76, 51
+"""Longest frames of HIL_SENSOR and HIL_GPS."""
+
+GPS_HZ = 10
+
+HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
+"""What the simulator sends [bytes/s]."""
+
+HIL_SHARE = 2 / 3
+"""Largest share of a line's capacity that this may take: companion and ground station need the
+rest."""
+
+USB_CLIENTS_BYTES_S = 100_000
+"""What those may send over USB [bytes/s]: a tenth of its capacity at full speed."""
 
 _POLL_S = 0.02
 _AGAIN_S = 0.2
@@ -36,26 +53,28 @@ class BoardLink:
     Nothing is sent to a board before something was received from it.
     """
 
-    def __init__(
-        self, router: Router, device: str, baud: int, *, budget_bytes_s: int, reboot_s: float
-    ) -> None:
+    def __init__(self, router: Router, device: str, baud: int) -> None:
         """Configure the connection; nothing is opened yet.
 
         Args:
-            router: Gets the line; its clients stay.
+            router: Gets its line; its clients stay.
             device: Serial device.
             baud: Bits a second.
-            budget_bytes_s: Most that clients may send to the board [bytes/s].
-            reboot_s: Longest time from a reboot command until it goes down [wall s].
+
+        Raises:
+            UsageError: The line is too slow.
         """
+        self.known = False
+        """Whether the board was looked for already: its device may be absent for a while."""
+        self.went_down = False
+        """Whether others have told it to reboot, and it was down when it was released."""
         self.device = device
         self.clock = WallClock()
         self.board = Board(self.clock)
         """What was received from it; a new object each time that the device is opened."""
         self._router = router
         self._baud = baud
-        self._budget_bytes_s = budget_bytes_s
-        self._reboot_us = int(reboot_s * US_PER_S)
+        self._budget_bytes_s = check_line(device, baud)
         self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_USER1)
         self._line: SerialPort | None = None
         self._beat_due_us = 0
@@ -119,11 +138,10 @@ class BoardLink:
     def go_down(self, alive: Callable[[], None]) -> None:
         """Reboot a board in HIL mode; return when it is down and the device closed.
 
-        Raises:
-            FirmwareLostError: It stays up.
+        Raises FirmwareLostError when it stays up.
         """
         board, clock = self.board, self.clock
-        deadline_us = clock.time_us() + self._reboot_us
+        deadline_us = clock.time_us() + int(REBOOT_S * US_PER_S)
         due_us, heard_us, heard = 0, clock.time_us(), -1
         while self._router.lost is None and not board.restarted:
             alive()
@@ -146,8 +164,7 @@ class BoardLink:
         self.close()
 
     def _listen(self, *, beat: bool = True) -> None:
-        select.select([self._router.fileno()], [], [], _POLL_S)
-        self._router.pump()
+        self._router.pump(_POLL_S)
         if beat:
             self.beat()
 
@@ -155,7 +172,7 @@ class BoardLink:
 
     def send(self, layout: Layout, values: Values) -> bool:
         """Send a message of the simulator; False when the line did not accept it."""
-        return self._router.send(self._encoder.frame(layout, layout.payload(values)))
+        return self._router.send_ahead(self._encoder.frame(layout, layout.payload(values)))
 
     def pump(self) -> None:
         """Take the messages received, and pass on those for clients."""
@@ -186,7 +203,7 @@ class BoardLink:
         )
 
     def _tell(self, message: WireMessage) -> None:
-        self._router.send(self._encoder.pack(message))
+        self._router.send_ahead(self._encoder.pack(message))
 
     def close(self) -> None:
         """Close the device; harmless when called again."""
@@ -203,3 +220,21 @@ def _result(answer: int | None) -> str:
         return "nothing"
     known = dialect.enums["MAV_RESULT"].get(answer)
     return f"MAV_RESULT {answer}" if known is None else str(known.name)
+
+
+def check_line(device: str, baud: int) -> int:
+    """Return what clients may send to the board [bytes/s].
+
+    Raises UsageError when the line does not carry the sensors.
+    """
+    check_baud(baud)
+    carries = carries_bytes_s(device, baud)
+    if carries is None:
+        return USB_CLIENTS_BYTES_S
+    if carries * HIL_SHARE < HIL_BYTES_S:
+        raise UsageError(
+            f"--baud {baud}: {TICK_HZ} HIL_SENSOR a second are {HIL_BYTES_S * BITS_PER_BYTE} bit/s,"
+            f" {device} would carry {baud} for everything: accepted: at least "
+            f"{int(HIL_BYTES_S * BITS_PER_BYTE / HIL_SHARE)} (usual: 460800, 921600), or USB"
+        )
+    return carries - HIL_BYTES_S

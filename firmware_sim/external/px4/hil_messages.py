@@ -20,25 +20,15 @@ SENSOR = layout("HIL_SENSOR")
 GPS = layout("HIL_GPS")
 STATE = layout("HIL_STATE_QUATERNION")
 
-IMU_FIELDS = (
-    dialect.HIL_SENSOR_UPDATED_XACC
-    | dialect.HIL_SENSOR_UPDATED_YACC
-    | dialect.HIL_SENSOR_UPDATED_ZACC
-    | dialect.HIL_SENSOR_UPDATED_XGYRO
-    | dialect.HIL_SENSOR_UPDATED_YGYRO
-    | dialect.HIL_SENSOR_UPDATED_ZGYRO
-)
-MAG_FIELDS = (
-    dialect.HIL_SENSOR_UPDATED_XMAG
-    | dialect.HIL_SENSOR_UPDATED_YMAG
-    | dialect.HIL_SENSOR_UPDATED_ZMAG
-)
+
+def _updated(*fields: str) -> int:
+    return sum(getattr(dialect, f"HIL_SENSOR_UPDATED_{field}") for field in fields)
+
+
+IMU_FIELDS = _updated("XACC", "YACC", "ZACC", "XGYRO", "YGYRO", "ZGYRO")
+MAG_FIELDS = _updated("XMAG", "YMAG", "ZMAG")
 # The temperature goes with them: PX4 reads it as the barometer's, and only together with it.
-BARO_FIELDS = (
-    dialect.HIL_SENSOR_UPDATED_ABS_PRESSURE
-    | dialect.HIL_SENSOR_UPDATED_PRESSURE_ALT
-    | dialect.HIL_SENSOR_UPDATED_TEMPERATURE
-)
+BARO_FIELDS = _updated("ABS_PRESSURE", "PRESSURE_ALT", "TEMPERATURE")
 
 MOTORS = 4
 STILL = (0.0, 0.0, 0.0, 0.0)
@@ -145,39 +135,27 @@ def lockstep(message: WireMessage) -> bool:
 
 
 def controls(message: WireMessage, time_us: int) -> ActuatorControls:
-    """Return the motor commands of HIL_ACTUATOR_CONTROLS.
+    """Return the motor commands of HIL_ACTUATOR_CONTROLS, which hold from `time_us` on [µs].
 
     Motors are stopped while disarmed, whatever is commanded: PX4 in HITL sends commands then, too.
-
-    Args:
-        message: HIL_ACTUATOR_CONTROLS.
-        time_us: Simulated time at which they hold [µs].
-
-    Raises:
-        ControlsError: While armed, a command is not a number in 0..1.
+    Raises ControlsError when, while armed, a command is not a number in 0..1.
     """
     if not armed(message):
         return ActuatorControls(time_us, STILL, armed=False)
-    a, b, c, d = message.controls[:MOTORS]
-    if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0:
-        return ActuatorControls(time_us, (a, b, c, d), armed=True)
-    for i, value in enumerate((a, b, c, d)):
+    for i, value in enumerate(message.controls[:MOTORS]):
         # Written so that NaN fails.
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
             raise ControlsError(
                 f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}, a motor takes 0..1: is its "
                 "airframe a quadrotor?"
             )
-    a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
+    a, b, c, d = (min(1.0, max(0.0, value)) for value in message.controls[:MOTORS])
     return ActuatorControls(time_us, (a, b, c, d), armed=True)
 
 
 def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
     """Return three axes, each within +-limit."""
-    x, y, z = measured.tolist()
-    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
-        return x, y, z
-    x, y, z = (min(limit, max(-limit, value)) for value in (x, y, z))
+    x, y, z = (min(limit, max(-limit, value)) for value in measured.tolist())
     return x, y, z
 
 

@@ -14,44 +14,20 @@ from contextlib import suppress
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
-from airl_mav.core.errors import UsageError
-from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.external.px4.board_link import REBOOT_S, BoardLink
-from firmware_sim.external.transport.router import Router
-from firmware_sim.external.transport.serial_port import (
-    BITS_PER_BYTE,
-    DEFAULT_BAUD,
-    carries_bytes_s,
-    check_baud,
-)
+from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
-SILENCE_S = 1.0
-"""Longest time without motor commands, once there were some [wall s]."""
+SILENCE_US = US_PER_S
+"""Longest time without motor commands, once there were some [wall µs]."""
 
-FIRST_CONTROLS_S = 10.0
-"""Longest time with sensors but without motor commands [wall s]."""
+FIRST_CONTROLS_US = 10 * US_PER_S
+"""Longest time with sensors but without motor commands [wall µs]."""
 
 EPOCH_US = US_PER_S
 """Time in the first sample [µs]; the board takes its own clock's instead."""
-
-SENSOR_BYTES, GPS_BYTES = 76, 51
-"""Longest frames of HIL_SENSOR and HIL_GPS."""
-
-GPS_HZ = 10
-
-HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
-"""What the simulator sends [bytes/s]."""
-
-HIL_SHARE = 2 / 3
-"""Largest share of a line's capacity that this may take: companion and ground station need the
-rest."""
-
-USB_CLIENTS_BYTES_S = 100_000
-"""What those may send over USB [bytes/s]: a tenth of its capacity at full speed."""
 
 _CREEP_US = 20
 _BEHIND_US = 20_000
@@ -94,48 +70,12 @@ class HitlBridge:
 
     rate_hz = TICK_HZ
 
-    def __init__(
-        self,
-        router: Router,
-        device: str,
-        baud: int = DEFAULT_BAUD,
-        *,
-        reboot: bool = True,
-        returning: bool = False,
-        silence_s: float = SILENCE_S,
-        first_controls_s: float = FIRST_CONTROLS_S,
-        reboot_s: float = REBOOT_S,
-    ) -> None:
-        """Configure the connection; nothing is opened yet.
-
-        Args:
-            router: Gets its line; its clients stay.
-            device: Serial device.
-            baud: Bits a second.
-            reboot: Whether the board is rebooted once found: its estimator may hold a flight.
-            returning: Whether the device may be absent at first: it was there before.
-            silence_s: Longest time between motor commands [wall s].
-            first_controls_s: Longest time until the first motor commands [wall s].
-            reboot_s: Longest time from a reboot command until it goes down [wall s].
-
-        Raises:
-            UsageError: The line is too slow.
-        """
+    def __init__(self, link: BoardLink) -> None:
+        """Take the link to the board, which goes from episode to episode; it is not opened yet."""
         self.armed = False
         self.time_us = 0
-        self.went_down = False
-        """Whether others told the board to reboot, and it was down when this was closed."""
-        self._link = BoardLink(
-            router,
-            device,
-            baud,
-            budget_bytes_s=check_line(device, baud),
-            reboot_s=reboot_s,
-        )
-        self._reboot, self._returning = reboot, returning
-        self._silence_us = int(silence_s * US_PER_S)
-        self._first_us = int(first_controls_s * US_PER_S)
-        self._pace = Pace(self._link.clock)
+        self._link = link
+        self._pace = Pace(link.clock)
         self._epoch_us: int | None = None
         """Simulated time that is 0 to the board [µs]."""
         self._began_us = 0
@@ -155,17 +95,20 @@ class HitlBridge:
             FirmwareMissingError: No board in HIL mode was found within `timeout_s`, each time.
             FirmwareLostError: It does not reboot, or does not come back.
         """
-        self._link.connect(timeout_s, alive, returning=self._returning)
-        if self._reboot:
-            self._link.go_down(alive)
-            self._link.connect(timeout_s, alive, returning=True)
+        link = self._link
+        returning, link.known = link.known, True
+        rebooted, link.went_down = link.went_down, False
+        link.connect(timeout_s, alive, returning=returning)
+        if not rebooted:
+            # Its estimator may hold a flight.
+            link.go_down(alive)
+            link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Send a tick's sensors, return the newest motor commands; at first motors are stopped.
+        """Send a tick's sensors, return the newest motor commands; see `Bridge`.
 
-        Raises:
-            FirmwareLostError: The flight is over.
-            FirmwareMissingError: Its first messages show a configuration that cannot be flown.
+        At first motors are stopped. Raises FirmwareMissingError when its first messages show a
+        configuration that cannot be flown.
         """
         self._pace.wait(sample.time_us)
         link = self._link
@@ -175,7 +118,7 @@ class HitlBridge:
             self._epoch_us = sample.time_us - EPOCH_US
             self._began_us = now_us
             link.board.controls = None  # of before
-        if now_us - self._stepped_us > self._silence_us // 2:
+        if now_us - self._stepped_us > SILENCE_US // 2:
             self._resumed_us = now_us  # a board without sensors sends no commands
         self._stepped_us = now_us
         self._check(now_us)
@@ -202,7 +145,7 @@ class HitlBridge:
             # Whoever finds it next must not take it for a board that has come up.
             with suppress(FirmwareLostError):
                 link.go_down(no_process)
-                self.went_down = True
+                link.went_down = True
         elif self.armed or link.board.armed:
             link.disarm()
         link.close()
@@ -219,13 +162,13 @@ class HitlBridge:
         if not board.hil:
             raise FirmwareLostError(f"{device}: the board has left HIL mode")
         quiet_us = now_us - max(board.controls_us, self._resumed_us)
-        if board.controls is not None and quiet_us > self._silence_us:
+        if board.controls is not None and quiet_us > SILENCE_US:
             raise FirmwareLostError(
                 f"{device}: board silent: no HIL_ACTUATOR_CONTROLS for "
                 f"{(now_us - board.controls_us) / US_PER_S:.1f} s"
             )
         problem = board.setup_problem()
-        if board.controls is None and now_us - self._began_us > self._first_us:
+        if board.controls is None and now_us - self._began_us > FIRST_CONTROLS_US:
             problem = (
                 "it sends no HIL_ACTUATOR_CONTROLS: does its firmware have pwm_out_sim, does the "
                 "link allow more than 5000 bytes/s (MAV_0_RATE; USB always does)?"
@@ -234,7 +177,7 @@ class HitlBridge:
             raise FirmwareMissingError(f"--serial {device}: the board: {problem}")
         if problem is not None:
             raise FirmwareLostError(f"{device}: the board: {problem}")
-        if self._stuck_us is not None and now_us - self._stuck_us > self._silence_us:
+        if self._stuck_us is not None and now_us - self._stuck_us > SILENCE_US:
             raise FirmwareLostError(f"{device}: the line accepts no more data: the board hangs")
 
     def _send(self, sample: SensorSample, time_us: int, now_us: int) -> None:
@@ -244,87 +187,3 @@ class HitlBridge:
             self._stuck_us = now_us if self._stuck_us is None else self._stuck_us
         if sample.gps is not None:
             self._link.send(hil.GPS, hil.gps(sample.gps, time_us))
-
-
-class HitlLauncher:
-    """Finds and reboots the same board for each episode. Implements `boot_sequence.Launcher`."""
-
-    may_set = False
-    reboots = True
-
-    def __init__(
-        self,
-        airframe: Airframe,
-        router: Router,
-        device: str,
-        baud: int,
-        timeout_s: float,
-        *,
-        silence_s: float = SILENCE_S,
-    ) -> None:
-        """Configure the connection.
-
-        Args:
-            airframe: What it must be configured to.
-            router: Where its MAVLink goes.
-            device: Serial device.
-            baud: Bits a second.
-            timeout_s: Longest wait for its heartbeat [wall s].
-            silence_s: Longest time between motor commands [wall s].
-
-        Raises:
-            UsageError: The line is too slow.
-        """
-        check_line(device, baud)
-        self.airframe = airframe
-        self._router = router
-        self._device, self._baud = device, baud
-        self._timeout_s, self._silence_s = timeout_s, silence_s
-        self._bridge: HitlBridge | None = None
-
-    def launch(self) -> HitlBridge:
-        """Find the board and reboot it; see `boot_sequence.Launcher`."""
-        last = self._bridge
-        self.stop()
-        self._bridge = HitlBridge(
-            self._router,
-            self._device,
-            self._baud,
-            reboot=last is None or not last.went_down,
-            returning=last is not None,
-            silence_s=self._silence_s,
-        )
-        try:
-            self._bridge.wait_connected(self._timeout_s, no_process)
-        except BaseException:
-            self.stop()
-            raise
-        return self._bridge
-
-    def stop(self) -> None:
-        """Release the board."""
-        if self._bridge is not None:
-            self._bridge.close()
-
-    def close(self) -> None:
-        """Release the board for good."""
-        self.stop()
-
-
-def check_line(device: str, baud: int) -> int:
-    """Return what clients may send to the board [bytes/s].
-
-    Raises:
-        UsageError: The line does not carry the sensors.
-    """
-    check_baud(baud)
-    carries = carries_bytes_s(device, baud)
-    if carries is None:
-        return USB_CLIENTS_BYTES_S
-    if carries * HIL_SHARE < HIL_BYTES_S:
-        raise UsageError(
-            f"--baud {baud}: {TICK_HZ} HIL_SENSOR a second are {HIL_BYTES_S * BITS_PER_BYTE} bit/s,"
-            f" {device} would carry {baud} for everything: accepted: at least "
-            f"{int(HIL_BYTES_S * BITS_PER_BYTE / HIL_SHARE)} (usual: 460800, 921600), or USB"
-        )
-    return carries - HIL_BYTES_S

@@ -6,16 +6,14 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from firmware_sim.external.process.firmware_process import StartCommand
+from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
 SIMULATOR_PORT = 4560
 API_PORT, API_LOCAL_PORT = 14540, 14580
 PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
-"""Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink)."""
-
-GREATEST_INSTANCE = 9
-"""Instances above this one share one API port in PX4."""
+"""Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink).
+Instances above 9 share one API port."""
 
 MODEL = "none_iris"
 """PX4_SIM_MODEL without which PX4's scripts would start a simulator of their own."""
@@ -35,12 +33,9 @@ class Px4Program:
     """Folder of its start-up scripts."""
 
     def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
-        """Return the command that starts it: in the background, without a shell.
+        """Return the command that starts it in a folder: in the background, without a shell.
 
-        Args:
-            instance: PX4's instance number, which moves all its ports.
-            airframe: SYS_AUTOSTART.
-            folder: Where it runs.
+        The instance number moves all its ports; `airframe` is its SYS_AUTOSTART.
         """
         argv = [
             str(self.binary),
@@ -53,8 +48,7 @@ class Px4Program:
 def find_px4(folder: Path) -> Px4Program:
     """Return the PX4 of a build, a source tree or an unpacked package.
 
-    Raises:
-        FirmwareMissingError: There is none.
+    Raises FirmwareMissingError when there is none.
     """
     for layout in LAYOUTS:
         root = (folder / layout).resolve()

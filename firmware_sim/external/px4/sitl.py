@@ -11,7 +11,6 @@ from collections.abc import Callable
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
-from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT
@@ -64,26 +63,11 @@ class Px4Bridge:
 
     rate_hz = TICK_HZ
 
-    def __init__(
-        self,
-        port: int,
-        host: str = LOOPBACK,
-        *,
-        answer_s: float = ANSWER_S,
-        start_s: float = START_S,
-        option: str = "--instance",
-    ) -> None:
-        """Listen for PX4.
+    def __init__(self, port: int, *, answer_s: float = ANSWER_S, start_s: float = START_S) -> None:
+        """Listen for PX4 on a TCP port: 4560 + instance, 0 = any free one.
 
-        Args:
-            port: TCP port, 4560 + instance; 0 = any free one.
-            host: Address to bind.
-            answer_s: Longest wait for an answer [wall s].
-            start_s: Longest wait for the first one [wall s].
-            option: The command line option that moves the port, for messages.
-
-        Raises:
-            UsageError: The port is taken, or cannot be used.
+        `answer_s` and `start_s` are the longest waits for an answer, and for the first one
+        [wall s]. Raises UsageError if the port is taken, or cannot be used.
         """
         self.armed = False
         self.time_us = 0
@@ -91,7 +75,7 @@ class Px4Bridge:
         """Samples sent before PX4's first answer."""
         self.duplicates = 0
         """Answers beyond the first to a sample."""
-        self._tcp = TcpPort(host, port, option)
+        self._tcp = TcpPort(port)
         self.port = self._tcp.port
         """The port it listens on."""
         self._answer_s, self._start_s = answer_s, start_s

@@ -77,12 +77,7 @@ class Budget:
     """A token bucket: a rate in bytes per second, and a burst."""
 
     def __init__(self, bytes_s: int, clock: Clock) -> None:
-        """Start with a full burst.
-
-        Args:
-            bytes_s: Long-term rate [bytes/s].
-            clock: Wall time.
-        """
+        """Start with a full burst; `bytes_s` is the long-term rate [bytes/s]."""
         self._bytes_s = bytes_s
         self._clock = clock
         self._left = float(BURST_BYTES)
@@ -132,19 +127,20 @@ class Router:
     """Forwards frames whenever `pump` is called. Nothing blocks or raises; see `lost`.
 
     The line may change (a board's USB device vanishes while it reboots), the clients stay.
+
+    For a listener in this process it is an endpoint, which is pumped between ticks. Implements
+    `Endpoint`.
     """
 
-    def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
-        """Take the clients' ends.
+    datagrams = True
 
-        Args:
-            clients: Endpoints by the names of their links; the router closes them.
-            clock: Wall time.
-        """
+    def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
+        """Take the clients' ends by the names of their links; the router closes them."""
         self.lost: str | None = None
         """Why the line is gone; None while there is one, or none was there yet."""
         self.on_message: Callable[[WireMessage], None] | None = None
         """Called with every message of the board that the dialect knows, if set."""
+        self.send_errors = 0
         self.received_bytes = 0
         """Bytes received on the line since it was attached."""
         self.speaks_mavlink = False
@@ -157,7 +153,7 @@ class Router:
         self._decoder = FrameDecoder(datagrams=False)
         self._budget = Budget(0, clock)
         self._heard: deque[bytes] = deque(maxlen=HEARD_FRAMES)
-        self._refused = 0
+        self._closed = False
         self._selector = selectors.DefaultSelector()
         for client in self._clients.values():
             number = client.endpoint.fileno()
@@ -167,11 +163,9 @@ class Router:
     # --- the line
 
     def attach(self, line: Line, budget_bytes_s: int) -> None:
-        """Use a line, in place of another; the caller closes it.
+        """Use a line to the board, in place of another; the caller closes it.
 
-        Args:
-            line: To the board.
-            budget_bytes_s: Most that clients may send to the board [bytes/s].
+        Clients may send at most `budget_bytes_s` to the board [bytes/s].
         """
         self.detach()
         self._line, self._line_fd = line, line.fileno()
@@ -187,18 +181,26 @@ class Router:
             self._selector.unregister(self._line_fd)
             self._line = None
 
-    def send(self, frame: bytes) -> bool:
+    def send_ahead(self, frame: bytes) -> bool:
         """Send a frame of the simulator: outside the budget, ahead of the clients' frames.
 
         Returns whether it was sent; False when the line is full, lost (see `lost`), or has not
         shown to speak MAVLink.
         """
-        return self._to_line(frame)
+        if self._line is None or not self.speaks_mavlink:
+            return False
+        try:
+            return self._line.write(frame)
+        except SerialLostError as error:
+            self._lose(error)
+            return False
 
     # --- forwarding
 
-    def pump(self) -> None:
-        """Forward everything that has arrived."""
+    def pump(self, wait_s: float = 0.0) -> None:
+        """Forward everything that has arrived, or arrives within `wait_s` [wall s]."""
+        if wait_s > 0.0:
+            self._selector.select(wait_s)
         for frame in self._from_line():
             if frame.known:
                 self.speaks_mavlink = True
@@ -219,7 +221,7 @@ class Router:
 
     def pass_to_board(self, frame: bytes) -> bool:
         """Send a client's frame to the board; False when budget or line do not allow it."""
-        return self.speaks_mavlink and self._budget.take(len(frame)) and self._to_line(frame)
+        return self.speaks_mavlink and self._budget.take(len(frame)) and self.send_ahead(frame)
 
     def _from_line(self) -> list[Frame]:
         line = self._line
@@ -234,31 +236,36 @@ class Router:
         self.received_bytes += len(data)
         return self._decoder.frames(data) if data else []
 
-    def _to_line(self, frame: bytes) -> bool:
-        if self._line is None or not self.speaks_mavlink:
-            return False
-        try:
-            return self._line.write(frame)
-        except SerialLostError as error:
-            self._lose(error)
-            return False
-
     def _lose(self, error: SerialLostError) -> None:
         # A line that hung up stays readable: selecting on it would never wait again.
         self.detach()
         self.lost = str(error)
 
-    # --- the listener in this process
+    # --- the listener in this process (Endpoint)
 
-    def take_heard(self) -> list[bytes]:
-        """Return and forget the board's frames that have come since the last call."""
+    def receive(self) -> list[bytes]:
+        """Forward what has arrived; return the board's frames since the last call, oldest first."""
+        if self._closed:
+            return []
+        self.pump()
         heard = list(self._heard)
         self._heard.clear()
         return heard
 
-    def fileno(self) -> int:
-        """Return a descriptor that is readable while the line or a client is."""
-        return self._selector.fileno()  # epoll's or kqueue's, which can be waited for itself
+    def send(self, data: bytes) -> None:
+        """Send one frame to the board, as a client does."""
+        if not self.pass_to_board(data):
+            self.send_errors += 1
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send frames to the board."""
+        for frame in frames:
+            self.send(frame)
+
+    def fileno(self) -> int | None:
+        """Return a descriptor that is readable while the line or a client is; None once closed."""
+        # epoll's or kqueue's, which can be waited for itself
+        return None if self._closed else self._selector.fileno()
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return the traffic with each client."""
@@ -275,48 +282,8 @@ class Router:
 
     def close(self) -> None:
         """Close the clients' ends; harmless when called again."""
+        self._closed = True
         self.detach()
         for client in self._clients.values():
             client.endpoint.close()
         self._selector.close()
-
-
-class RouterEnd:
-    """The router as an endpoint for a listener in this process. Implements `Endpoint`.
-
-    It pumps the router between ticks, and closes it.
-    """
-
-    datagrams = True
-
-    def __init__(self, router: Router) -> None:
-        self.send_errors = 0
-        self._router = router
-        self._closed = False
-
-    def receive(self) -> list[bytes]:
-        """Forward what has arrived and return the board's frames, oldest first."""
-        if self._closed:
-            return []
-        self._router.pump()
-        return self._router.take_heard()
-
-    def send(self, data: bytes) -> None:
-        """Send one frame to the board."""
-        if not self._router.pass_to_board(data):
-            self.send_errors += 1
-
-    def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send frames to the board."""
-        for frame in frames:
-            self.send(frame)
-
-    def fileno(self) -> int | None:
-        """Return a descriptor that is readable when anything of the router's is."""
-        return None if self._closed else self._router.fileno()
-
-    def close(self) -> None:
-        """Close the router."""
-        if not self._closed:
-            self._closed = True
-            self._router.close()

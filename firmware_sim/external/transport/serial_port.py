@@ -49,12 +49,8 @@ class SerialPort:
     def __init__(self, device: str, baud: int = DEFAULT_BAUD) -> None:
         """Open it exclusively, 8N1, without flow control; what had arrived before is dropped.
 
-        Args:
-            device: Path: /dev/ttyACM0, or better one of /dev/serial/by-id.
-            baud: Bits a second; USB and pseudo-terminals ignore it.
-
-        Raises:
-            UsageError: It cannot be opened.
+        `device` is a path: /dev/ttyACM0, or better one of /dev/serial/by-id. USB and
+        pseudo-terminals ignore `baud` [bits/s]. Raises UsageError if it cannot be opened.
         """
         check_baud(baud)
         self.device = device

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK
 
 WATCH_S = 0.1
 """Longest wait without checking that the other program is alive [wall s]."""
@@ -21,19 +22,10 @@ _READ, _WRITE = select.POLLIN, select.POLLOUT
 
 
 class TcpPort:
-    """Listens, accepts one connection, refuses every further one."""
+    """Listens on the loopback address, accepts one connection, refuses every further one."""
 
-    def __init__(self, host: str, port: int, option: str) -> None:
-        """Listen.
-
-        Args:
-            host: Address to bind.
-            port: TCP port; 0 = any free one.
-            option: The command line option that moves the port, for messages.
-
-        Raises:
-            UsageError: The port is taken, or cannot be used.
-        """
+    def __init__(self, port: int) -> None:
+        """Listen on a TCP port, 0 = any free one. Raises UsageError if it cannot be used."""
         self.refused = 0
         """Further connections that were refused."""
         self._clock = WallClock()
@@ -42,27 +34,17 @@ class TcpPort:
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self._listener.setblocking(False)
         try:
-            self._listener.bind((host, port))
+            self._listener.bind((LOOPBACK, port))
             self._listener.listen()
         except (OSError, OverflowError) as error:
             self._listener.close()
-            raise UsageError(_listen_problem(host, port, option, error)) from error
+            raise UsageError(_listen_problem(port, error)) from error
         self.port: int = self._listener.getsockname()[1]
         self._poll = select.poll()
         self._poll.register(self._listener, _READ)
 
-    @property
-    def connected(self) -> bool:
-        """Whether there has been a connection; it may have ended since."""
-        return self._connection is not None
-
     def accept(self, timeout_s: float, alive: Callable[[], None]) -> bool:
-        """Wait for the connection; return whether it was made.
-
-        Args:
-            timeout_s: Longest wait [wall s].
-            alive: Called at intervals; may raise.
-        """
+        """Wait for the connection [wall s]; return whether it was made; `alive` may raise."""
         deadline_us = self._deadline_us(timeout_s)
         while self._connection is None:
             alive()
@@ -70,27 +52,26 @@ class TcpPort:
             if left_s <= 0.0:
                 return False
             if self._poll.poll(min(left_s, WATCH_S) * MS_PER_S):
-                self._take()
+                self._connection = self._newcomer()
+        self._connection.setblocking(False)
+        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._poll.register(self._connection, _READ)
         return True
 
     def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
         """Send all of it; False when the connection has ended or does not accept it in time."""
-        connection = self._connected()
-        sent = _send(connection, data)
-        if sent == len(data):
-            return True
+        connection, left = self._connected(), data
         deadline_us = self._deadline_us(timeout_s)
-        writable = select.poll()
-        writable.register(connection, _WRITE)
-        while sent is not None and sent < len(data):
+        while (sent := _send(connection, left)) is not None:
+            left = left[sent:]
             left_s = self._left_s(deadline_us)
-            if left_s <= 0.0:
-                return False
+            if not left or left_s <= 0.0:
+                return not left
             alive()
+            writable = select.poll()
+            writable.register(connection, _WRITE)
             writable.poll(min(left_s, WATCH_S) * MS_PER_S)
-            more = _send(connection, data[sent:])
-            sent = None if more is None else sent + more
-        return sent is not None
+        return False
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return what has arrived, b"" when nothing did in time [wall s], None at the end.
@@ -106,7 +87,10 @@ class TcpPort:
                     return b""
                 except OSError:
                     return None
-            self._refuse()
+            newcomer = self._newcomer()
+            if newcomer is not None:
+                newcomer.close()
+                self.refused += 1
         return b""
 
     def close(self) -> None:
@@ -120,23 +104,12 @@ class TcpPort:
             raise RuntimeError("there is no connection yet")
         return self._connection
 
-    def _take(self) -> None:
+    def _newcomer(self) -> socket.socket | None:
+        """Return who asked to be connected; None when it is gone again."""
         try:
-            connection, _ = self._listener.accept()
+            return self._listener.accept()[0]
         except OSError:
-            return  # gone again
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._connection = connection
-        self._poll.register(connection, _READ)
-
-    def _refuse(self) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:
-            return
-        connection.close()
-        self.refused += 1
+            return None
 
     def _deadline_us(self, timeout_s: float) -> int:
         return self._clock.time_us() + int(timeout_s * US_PER_S)
@@ -155,10 +128,10 @@ def _send(connection: socket.socket, data: bytes) -> int | None:
         return None
 
 
-def _listen_problem(host: str, port: int, option: str, error: OSError | OverflowError) -> str:
-    where = f"TCP port {port} on {host}"
+def _listen_problem(port: int, error: OSError | OverflowError) -> str:
+    where = f"TCP port {port} on {LOOPBACK}"
     if isinstance(error, OverflowError):
-        return f"{option}: {where}: must be in 0..65535"
+        return f"--instance: {where}: must be in 0..65535"
     if error.errno == errno.EADDRINUSE:
-        return f"{where} is taken (another simulator?): choose another with {option}"
-    return f"{where} cannot be used ({error.strerror}): choose another with {option}"
+        return f"{where} is taken (another simulator?): choose another with --instance"
+    return f"{where} cannot be used ({error.strerror}): choose another with --instance"

@@ -1,5 +1,50 @@
-"""MAVLink microservices, one file each.
+"""MAVLink microservices: a table from message name to its addressees and its handler."""
 
-A service is a table from message name to handler. A handler gets the message and a `Context`
-and tells whether the message was meant for this vehicle and did something.
-"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from firmware_sim.mavlink.codec import WireMessage
+from firmware_sim.mavlink.services import (
+    absent,
+    commands,
+    data_streams,
+    params,
+    peers,
+    setpoints,
+)
+from firmware_sim.mavlink.services.context import Context, for_vehicle, for_vehicle_or_all
+
+Handler = Callable[[WireMessage, Context], bool]
+"""Handles one message for this vehicle; returns False if it has no effect."""
+
+
+def _for_anyone(_message: WireMessage) -> bool:
+    return True
+
+
+HANDLERS: Mapping[str, tuple[Callable[[WireMessage], bool], Handler]] = MappingProxyType(
+    {
+        "COMMAND_LONG": (commands.is_addressed, commands.handle_command_long),
+        "COMMAND_INT": (commands.is_addressed, commands.handle_command_int),
+        "SET_MODE": (_for_anyone, commands.handle_set_mode),
+        "REQUEST_DATA_STREAM": (for_vehicle_or_all, data_streams.handle_request),
+        "PARAM_REQUEST_LIST": (for_vehicle, params.handle_list),
+        "PARAM_REQUEST_READ": (for_vehicle, params.handle_read),
+        "PARAM_SET": (for_vehicle, params.handle_set),
+        "SET_POSITION_TARGET_LOCAL_NED": (for_vehicle_or_all, setpoints.handle_setpoint),
+        "HEARTBEAT": (_for_anyone, peers.handle_heartbeat),
+        "PING": (_for_anyone, peers.handle_ping),
+        "TIMESYNC": (_for_anyone, peers.handle_timesync),
+        "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, absent.handle_file_transfer),
+        "MISSION_REQUEST_LIST": (absent.is_for_planner, absent.handle_download),
+        **dict.fromkeys(absent.MISSION_RESULTS, (absent.is_for_planner, absent.acknowledge)),
+    }
+)
+
+
+def handle(message: WireMessage, context: Context) -> bool:
+    """Return whether a message was for this vehicle and did something; now it has."""
+    is_addressed, handler = HANDLERS.get(message.get_type(), (None, None))
+    return bool(is_addressed and handler and is_addressed(message) and handler(message, context))

@@ -18,7 +18,6 @@ from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services.context import (
     ANY,
     Context,
-    Handler,
     for_vehicle,
     sender,
 )
@@ -78,23 +77,17 @@ def _takeoff(command: Command, context: Context) -> Result:
     return context.port.takeoff(altitude - home.altitude_m)
 
 
-def _land(_command: Command, context: Context) -> Result:
-    return context.port.set_mode(Mode.LAND)
-
-
-def _return(_command: Command, context: Context) -> Result:
-    return context.port.set_mode(Mode.RETURN)
-
-
 def _set_mode(command: Command, context: Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
+    return _change_mode(base, main, sub, context)
+
+
+def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
     request = requested_mode(base, main, sub)
-    if request.refusal is not None:
-        context.announce(Message(Severity.CRITICAL, request.refusal))
+    if isinstance(request, str):
+        context.announce(Message(Severity.CRITICAL, request))
         return Result.TEMPORARILY_REJECTED
-    if request.mode is None:
-        return Result.ACCEPTED  # PX4 too accepts a main mode it does not know, and does nothing
-    return context.port.set_mode(request.mode)
+    return Result.ACCEPTED if request is None else context.port.set_mode(request)
 
 
 def _set_home(command: Command, context: Context) -> Result:
@@ -110,7 +103,7 @@ def _reboot(command: Command, _context: Context) -> Result:
 
 def _set_message_interval(command: Command, context: Context) -> Result:
     """Parameter 1: message id; 2: interval [µs], 0 = default, negative = off."""
-    name = _stream_name(command, context)
+    name = _stream_name(command.integer(1), context)
     interval = command.params[1]
     if name is None:
         return Result.UNSUPPORTED
@@ -136,24 +129,18 @@ def _get_message_interval(command: Command, context: Context) -> Result:
 
 def _request_message(command: Command, context: Context) -> Result:
     """Parameter 1: message id. Known but nothing to say yet: DENIED, as PX4."""
-    name = _stream_name(command, context)
+    name = _stream_name(command.integer(1), context)
     if name is not None:
-        sent = context.link.send_stream(name, context.port.state())
-        return Result.ACCEPTED if sent else Result.DENIED
+        return _send_stream(name, context)
     if command.integer(1) == dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
         asked = command.integer(2)
         return Result.DENIED if asked is None else _send_interval(asked & 0xFFFF, context)
     return Result.UNSUPPORTED
 
 
-def _request(name: str) -> Action:
-    """Return the action of an old command that asks for one certain message."""
-
-    def action(_command: Command, context: Context) -> Result:
-        sent = context.link.send_stream(name, context.port.state())
-        return Result.ACCEPTED if sent else Result.DENIED
-
-    return action
+def _send_stream(name: str, context: Context) -> Result:
+    sent = context.link.send_stream(name, context.port.state())
+    return Result.ACCEPTED if sent else Result.DENIED
 
 
 _REQUEST_CAPABILITIES: int = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
@@ -162,16 +149,16 @@ _REQUEST_PROTOCOL: int = dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
 ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
-    dialect.MAV_CMD_NAV_LAND: _land,
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _return,
+    dialect.MAV_CMD_NAV_LAND: lambda _, context: context.port.set_mode(Mode.LAND),
+    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, context: context.port.set_mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_message_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_message_interval,
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    dialect.MAV_CMD_GET_HOME_POSITION: _request("HOME_POSITION"),
-    _REQUEST_CAPABILITIES: _request("AUTOPILOT_VERSION"),
+    dialect.MAV_CMD_GET_HOME_POSITION: lambda _, context: _send_stream("HOME_POSITION", context),
+    _REQUEST_CAPABILITIES: lambda _, context: _send_stream("AUTOPILOT_VERSION", context),
 }
 """Everything else is UNSUPPORTED, MAV_CMD_REQUEST_PROTOCOL_VERSION too: its answer is not in
 pymavlink's dialect, and clients then go by the MAVLink 2 frames they see."""
@@ -195,22 +182,11 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     if message.target_system != SYSTEM_ID:
         return False
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-    nan = math.nan
-    params = (float(message.base_mode), float(main), float(sub), nan, nan, nan, nan)
-    _set_mode(Command(dialect.MAV_CMD_DO_SET_MODE, params), context)
+    _change_mode(message.base_mode, main, sub, context)
     return True
 
 
-HANDLERS: dict[str, Handler] = {
-    "COMMAND_LONG": handle_command_long,
-    "COMMAND_INT": handle_command_int,
-    "SET_MODE": handle_set_mode,
-}
-
-
 def _handle(message: WireMessage, command: Command, context: Context) -> bool:
-    if not _is_addressed(message, command):
-        return False
     action = ACTIONS.get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     context.link.send(
@@ -219,23 +195,22 @@ def _handle(message: WireMessage, command: Command, context: Context) -> bool:
     return True
 
 
-def _is_addressed(message: WireMessage, command: Command) -> bool:
-    if command.number in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
+def is_addressed(message: WireMessage) -> bool:
+    """Return whether a command is for this vehicle: who it is may be asked of all systems."""
+    if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
         return message.target_system in (SYSTEM_ID, ANY)
     return for_vehicle(message)
 
 
-def _stream_name(command: Command, context: Context) -> str | None:
-    """Return the stream whose message id is parameter 1, None when there is none."""
-    number = command.integer(1)
+def _stream_name(number: int | None, context: Context) -> str | None:
+    """Return the stream with a message id, None when there is none."""
     return next((name for name in context.link.builders if message_id(name) == number), None)
 
 
 def _send_interval(number: int, context: Context) -> Result:
-    interval = _INTERVAL_UNAVAILABLE
-    for name in context.link.builders:
-        if message_id(name) == number:
-            interval = context.link.scheduler.interval_us(name)
-            interval = _INTERVAL_DISABLED if interval == OFF else interval
+    name, interval = _stream_name(number, context), _INTERVAL_UNAVAILABLE
+    if name is not None:
+        interval = context.link.scheduler.interval_us(name)
+        interval = _INTERVAL_DISABLED if interval == OFF else interval
     context.link.send(dialect.MAVLink_message_interval_message(number, interval))
     return Result.ACCEPTED

@@ -26,10 +26,8 @@ class Context:
     """Sends a text to the operators on all links."""
     broadcast: Callable[[WireMessage], None]
     """Sends a message on all links."""
-
-
-Handler = Callable[[WireMessage, Context], bool]
-"""Handles one message; returns False if it is not for this vehicle, or has no effect."""
+    next_parameter: int | None = None
+    """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
 
 
 def for_vehicle(message: WireMessage) -> bool:

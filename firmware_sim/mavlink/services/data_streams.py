@@ -9,7 +9,7 @@ from __future__ import annotations
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.scheduler import OFF
-from firmware_sim.mavlink.services.context import Context, Handler, for_vehicle_or_all
+from firmware_sim.mavlink.services.context import Context
 
 GROUPS: dict[int, tuple[str, ...]] = {
     dialect.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU", "SCALED_PRESSURE", "GPS_RAW_INT"),
@@ -30,8 +30,6 @@ GROUPS: dict[int, tuple[str, ...]] = {
 
 def handle_request(message: WireMessage, context: Context) -> bool:
     """Raise the rates of a group of streams, or restore its default rates."""
-    if not for_vehicle_or_all(message):
-        return False
     if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL:
         names = tuple(name for group in GROUPS.values() for name in group)
     else:
@@ -47,6 +45,3 @@ def handle_request(message: WireMessage, context: Context) -> bool:
         if present_us == OFF or max(asked_us, 1) < present_us:
             scheduler.set_interval(name, max(asked_us, 1), context.now_us)
     return bool(names)
-
-
-HANDLERS: dict[str, Handler] = {"REQUEST_DATA_STREAM": handle_request}

@@ -8,8 +8,7 @@ import zlib
 
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.link import Link
-from firmware_sim.mavlink.services.context import Context, Handler, for_vehicle, sender
+from firmware_sim.mavlink.services.context import Context, sender
 
 HASH_NAME = "_HASH_CHECK"
 """Pseudo parameter: a checksum by which a ground station recognises its cached values."""
@@ -23,92 +22,68 @@ _ERROR_TYPE_MISMATCH = 7
 """MAV_PARAM_ERROR_TYPE_MISMATCH, newer than pymavlink's dialect."""
 
 
-class ParameterService:
-    """Parameters of the vehicle over one link."""
-
-    def __init__(self) -> None:
-        self._next: int | None = None
-        """Index that a running list sends next; -1 = the hash; None = no list is running."""
-        self.handlers: dict[str, Handler] = {
-            "PARAM_REQUEST_LIST": self._handle_list,
-            "PARAM_REQUEST_READ": self._handle_read,
-            "PARAM_SET": self._handle_set,
-        }
-
-    def restart(self) -> None:
-        """Cancel a running list: the vehicle was replaced."""
-        self._next = None
-
-    def send_pending(self, link: Link, store: ParameterStore) -> None:
-        """Send the next few parameters of a running list; call once per tick."""
-        if self._next is None:
-            return
-        for _ in range(PARAMETERS_PER_TICK):
-            if self._next < 0:
-                link.send(_hash_message(store))
-            else:
-                parameter = store.by_index(self._next)
-                if parameter is None:
-                    self._next = None
-                    return
-                link.send(_value_message(parameter, len(store)))
-            self._next += 1
-
-    def _handle_list(self, message: WireMessage, _context: Context) -> bool:
-        if not for_vehicle(message):
-            return False
-        # As PX4: a client that asks again does not need the hash.
-        self._next = -1 if self._next is None else 0
-        return True
-
-    def _handle_read(self, message: WireMessage, context: Context) -> bool:
-        if not for_vehicle(message):
-            return False
-        store = context.port.parameters
-        index: int = message.param_index
-        if index < 0 and message.param_id == HASH_NAME:
+def send_pending(context: Context) -> None:
+    """Send the next few parameters of a running list; call once per tick."""
+    if context.next_parameter is None:
+        return
+    store = context.port.parameters
+    for _ in range(PARAMETERS_PER_TICK):
+        if context.next_parameter < 0:
             context.link.send(_hash_message(store))
-            return True
-        parameter = store.by_index(index) if index >= 0 else store.by_name(message.param_id)
-        if parameter is None:
-            _send_error(message, index, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, context)
         else:
+            parameter = store.by_index(context.next_parameter)
+            if parameter is None:
+                context.next_parameter = None
+                return
             context.link.send(_value_message(parameter, len(store)))
+        context.next_parameter += 1
+
+
+def handle_list(_message: WireMessage, context: Context) -> bool:
+    """Begin to send all parameters."""
+    # As PX4: a client that asks again does not need the hash.
+    context.next_parameter = -1 if context.next_parameter is None else 0
+    return True
+
+
+def handle_read(message: WireMessage, context: Context) -> bool:
+    """Send one parameter, by index or by name."""
+    store = context.port.parameters
+    index: int = message.param_index
+    if index < 0 and message.param_id == HASH_NAME:
+        context.link.send(_hash_message(store))
         return True
+    parameter = store.by_index(index) if index >= 0 else store.by_name(message.param_id)
+    if parameter is None:
+        _send_error(message, index, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, context)
+    else:
+        context.link.send(_value_message(parameter, len(store)))
+    return True
 
-    def _handle_set(self, message: WireMessage, context: Context) -> bool:
-        if not for_vehicle(message):
-            return False
-        if message.param_id == HASH_NAME:
-            self._next = None  # "my cached values are good: stop the list"
-            return True
-        store = context.port.parameters
-        present = store.by_name(message.param_id)
-        error = _set_error(present, message)
-        if present is None or error is not None:
-            _send_error(message, -1, error, context)
-            return True
-        stored = store.set(present.name, _received_value(message))
-        if stored is None:
-            _send_error(message, -1, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, context)
-        else:
-            context.broadcast(_value_message(stored, len(store)))
+
+def handle_set(message: WireMessage, context: Context) -> bool:
+    """Set a parameter, and send its new value on all links."""
+    if message.param_id == HASH_NAME:
+        context.next_parameter = None  # "my cached values are good: stop the list"
         return True
-
-
-def _set_error(present: ParameterValue | None, message: WireMessage) -> int | None:
-    """Return the MAV_PARAM_ERROR of a PARAM_SET, None when it can be done."""
-    error: int | None = None
+    store = context.port.parameters
+    present = store.by_name(message.param_id)
     if present is None:
         error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
     elif message.param_type != _kind(present.value):
         error = _ERROR_TYPE_MISMATCH
-    elif not math.isfinite(_received_value(message)):
+    elif not math.isfinite(value := _received_value(message)):
         error = dialect.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
-    return error
+    elif (stored := store.set(present.name, value)) is None:
+        error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
+    else:
+        context.broadcast(_value_message(stored, len(store)))
+        return True
+    _send_error(message, -1, error, context)
+    return True
 
 
-def _send_error(message: WireMessage, index: int, error: int | None, context: Context) -> None:
+def _send_error(message: WireMessage, index: int, error: int, context: Context) -> None:
     context.link.send(
         dialect.MAVLink_param_error_message(
             *sender(message), message.param_id.encode("ascii", errors="replace"), index, error
@@ -117,10 +92,8 @@ def _send_error(message: WireMessage, index: int, error: int | None, context: Co
 
 
 def _kind(value: int | float) -> int:
-    kind: int = (
-        dialect.MAV_PARAM_TYPE_INT32 if isinstance(value, int) else dialect.MAV_PARAM_TYPE_REAL32
-    )
-    return kind
+    whole = isinstance(value, int)
+    return int(dialect.MAV_PARAM_TYPE_INT32 if whole else dialect.MAV_PARAM_TYPE_REAL32)
 
 
 def _encoded(value: int | float) -> bytes:
@@ -130,11 +103,9 @@ def _encoded(value: int | float) -> bytes:
 
 def _received_value(message: WireMessage) -> int | float:
     """Return the value of a PARAM_SET from its bytes (they lead the payload)."""
-    raw = payload(message)[:4].ljust(4, b"\0")
+    shape = "<i" if message.param_type == dialect.MAV_PARAM_TYPE_INT32 else "<f"
     value: int | float
-    (value,) = struct.unpack(
-        "<i" if message.param_type == dialect.MAV_PARAM_TYPE_INT32 else "<f", raw
-    )
+    (value,) = struct.unpack(shape, payload(message)[:4].ljust(4, b"\0"))
     return value
 
 

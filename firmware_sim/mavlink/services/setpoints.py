@@ -14,7 +14,7 @@ import numpy as np
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import Context, Handler, for_vehicle_or_all
+from firmware_sim.mavlink.services.context import Context
 
 _NAME = "SET_POSITION_TARGET_LOCAL_NED"
 _POSITION_SHIFT, _VELOCITY_SHIFT = 0, 3
@@ -23,8 +23,6 @@ _POSITION_SHIFT, _VELOCITY_SHIFT = 0, 3
 
 def handle_setpoint(message: WireMessage, context: Context) -> bool:
     """Pass a valid setpoint to the autopilot; report what is wrong with an invalid one."""
-    if not for_vehicle_or_all(message):
-        return False
     mask: int = message.type_mask
     position = _masked((message.x, message.y, message.z), mask >> _POSITION_SHIFT)
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
@@ -45,9 +43,6 @@ def handle_setpoint(message: WireMessage, context: Context) -> bool:
     setpoint = Setpoint(position, velocity, _finite(yaw), _finite(yaw_rate), wire)
     context.port.offer_setpoint(setpoint, context.now_us)
     return True
-
-
-HANDLERS: dict[str, Handler] = {_NAME: handle_setpoint}
 
 
 def _masked(values: tuple[float, float, float], ignore: int) -> Vector:

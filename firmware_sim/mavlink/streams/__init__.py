@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import attitude, position, sensors, status
+from firmware_sim.mavlink.streams import pose, sensors, status
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in the order of its definition, from a snapshot; None = there is
@@ -20,25 +20,26 @@ nothing to say yet. Plain values, because message objects would cost more than a
 BUILDERS: Mapping[str, Builder] = MappingProxyType(
     {
         "HEARTBEAT": status.heartbeat,
-        "ATTITUDE": attitude.attitude,
-        "ATTITUDE_QUATERNION": attitude.attitude_quaternion,
-        "LOCAL_POSITION_NED": position.local_position_ned,
-        "ODOMETRY": position.odometry,
-        "GLOBAL_POSITION_INT": position.global_position_int,
+        "ATTITUDE": pose.attitude,
+        "ATTITUDE_QUATERNION": pose.attitude_quaternion,
+        "LOCAL_POSITION_NED": pose.local_position_ned,
+        "ODOMETRY": pose.odometry,
+        "GLOBAL_POSITION_INT": pose.global_position_int,
         "HIGHRES_IMU": sensors.highres_imu,
-        "ALTITUDE": position.altitude,
-        "ATTITUDE_TARGET": attitude.attitude_target,
-        "POSITION_TARGET_LOCAL_NED": position.position_target_local_ned,
+        "ALTITUDE": pose.altitude,
+        "ATTITUDE_TARGET": pose.attitude_target,
+        "POSITION_TARGET_LOCAL_NED": pose.position_target_local_ned,
         "SERVO_OUTPUT_RAW": sensors.servo_output_raw,
-        "VFR_HUD": position.vfr_hud,
+        "VFR_HUD": pose.vfr_hud,
         "GPS_RAW_INT": sensors.gps_raw_int,
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": status.sys_status,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
-        "HOME_POSITION": position.home_position,
-        "GPS_GLOBAL_ORIGIN": position.gps_global_origin,
+        "HOME_POSITION": pose.home_position,
+        "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
+        "AUTOPILOT_VERSION": status.autopilot_version,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

@@ -4,25 +4,11 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.core.kernels import kernel
 from airl_mav.vehicle import atmosphere
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.streams.units import (
-    INT16_MAX,
-    UINT16_MAX,
-    UINT32_MAX,
-    boot_ms,
-    centidegrees,
-    deg_e7,
-    int16,
-    int32,
-    mm,
-    saturate,
-    uint16,
-    uint32,
-)
+from firmware_sim.mavlink.streams import units
 
 _IMU_FIELDS = 0b1_1011_1111_1111
 """HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
@@ -33,7 +19,7 @@ _NO_AIRSPEED = 0.0
 _PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
 """Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
-_NO_CELL_VOLTAGES = (UINT16_MAX,) * 9
+_NO_CELL_VOLTAGES = (units.UINT16_MAX,) * 9
 """BATTERY_STATUS.voltages[1:]."""
 
 _CHARGE_WARNINGS = (
@@ -47,20 +33,11 @@ _CHARGE_WARNINGS = (
 def highres_imu(state: AutopilotState) -> Values:
     """Newest IMU sample with the estimated biases removed, as PX4 sends it; mag and baro raw."""
     estimate = state.estimate
-    xacc, yacc, zacc = _difference(state.accel, estimate.accel_bias)
-    xgyro, ygyro, zgyro = _difference(state.gyro, estimate.gyro_bias)
-    xmag, ymag, zmag = state.mag.tolist()
     return (
         state.time_us,
-        xacc,
-        yacc,
-        zacc,
-        xgyro,
-        ygyro,
-        zgyro,
-        xmag,
-        ymag,
-        zmag,
+        *(state.accel - estimate.accel_bias).tolist(),
+        *(state.gyro - estimate.gyro_bias).tolist(),
+        *state.mag.tolist(),
         state.pressure_hpa,
         _NO_AIRSPEED,
         atmosphere.altitude_m(state.pressure_hpa),
@@ -71,8 +48,8 @@ def highres_imu(state: AutopilotState) -> Values:
 
 def scaled_pressure(state: AutopilotState) -> Values:
     """Static pressure [hPa] and temperature [0.01 °C]."""
-    temperature = int16(state.temperature_c * 100.0)
-    return boot_ms(state.time_us), state.pressure_hpa, _NO_AIRSPEED, temperature
+    temperature = units.int16(state.temperature_c * 100.0)
+    return units.boot_ms(state.time_us), state.pressure_hpa, _NO_AIRSPEED, temperature
 
 
 def gps_raw_int(state: AutopilotState) -> Values | None:
@@ -84,46 +61,41 @@ def gps_raw_int(state: AutopilotState) -> Values | None:
     return (
         state.time_us,
         fix.fix_type,
-        deg_e7(fix.position.latitude_deg),
-        deg_e7(fix.position.longitude_deg),
-        mm(fix.position.altitude_m),
-        UINT16_MAX,
-        UINT16_MAX,
-        uint16(math.hypot(north, east) * 100.0),
-        centidegrees(math.atan2(east, north)),
-        saturate(fix.satellites, 0, 254, 255),
-        mm(fix.position.altitude_m),
-        uint32(fix.eph_m * 1e3),
-        uint32(fix.epv_m * 1e3),
+        units.deg_e7(fix.position.latitude_deg),
+        units.deg_e7(fix.position.longitude_deg),
+        units.mm(fix.position.altitude_m),
+        units.UINT16_MAX,
+        units.UINT16_MAX,
+        units.uint16(math.hypot(north, east) * 100.0),
+        units.centidegrees(math.atan2(east, north)),
+        units.saturate(fix.satellites, 0, 254, 255),
+        units.mm(fix.position.altitude_m),
+        units.uint32(fix.eph_m * 1e3),
+        units.uint32(fix.epv_m * 1e3),
     )
 
 
-def battery_status(state: AutopilotState, charge_state: int) -> Values:
-    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge.
-
-    Args:
-        state: The snapshot.
-        charge_state: MAV_BATTERY_CHARGE_STATE.
-    """
+def battery_status(state: AutopilotState, parameters: ParameterStore) -> Values:
+    """Battery 0: pack voltage in the first slot (cells are not measured), current, charge."""
     battery = state.battery
-    number, no_temperature, no_energy, no_time_remaining = 0, INT16_MAX, -1, 0
+    number, no_temperature, no_energy, no_time_remaining = 0, units.INT16_MAX, -1, 0
     return (
         number,
         dialect.MAV_BATTERY_FUNCTION_ALL,
         dialect.MAV_BATTERY_TYPE_LIPO,
         no_temperature,
-        uint16(battery.voltage_v * 1e3),
+        units.uint16(battery.voltage_v * 1e3),
         *_NO_CELL_VOLTAGES,
-        int16(battery.current_a * 100.0, unknown=-1),
-        int32(battery.consumed_mah, unknown=-1),
+        units.int16(battery.current_a * 100.0, unknown=-1),
+        units.int32(battery.consumed_mah, unknown=-1),
         no_energy,
         percent(battery.remaining),
         no_time_remaining,
-        charge_state,
+        _charge_state(battery.remaining, parameters),
     )
 
 
-def charge_state(remaining: float, parameters: ParameterStore) -> int:
+def _charge_state(remaining: float, parameters: ParameterStore) -> int:
     """Return the MAV_BATTERY_CHARGE_STATE of a charge 0..1, by PX4's warning thresholds."""
     state: int = dialect.MAV_BATTERY_CHARGE_STATE_OK
     for name, warning in _CHARGE_WARNINGS:
@@ -138,18 +110,13 @@ def charge_state(remaining: float, parameters: ParameterStore) -> int:
 def servo_output_raw(state: AutopilotState) -> Values:
     """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
     if state.status.arming is Arming.ARMED:
-        pulses = [_PWM_MIN + saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
+        pulses = [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
     else:
         pulses = [_PWM_DISARMED] * len(state.motors)
     port = 0
-    return state.time_us & UINT32_MAX, port, *pulses, 0, 0, 0, 0
-
-
-@kernel
-def _difference(a: Vector, b: Vector) -> tuple[float, float, float]:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+    return state.time_us & units.UINT32_MAX, port, *pulses, 0, 0, 0, 0
 
 
 def percent(share: float) -> int:
     """Return a share 0..1 as percent for an int8 field, -1 when unknown."""
-    return saturate(share * 100.0, 0, 100, -1)
+    return units.saturate(share * 100.0, 0, 100, -1)

@@ -1,4 +1,4 @@
-"""How the vehicle is: heartbeat, health, landed state, estimator, clock."""
+"""Who and how the vehicle is: identity, heartbeat, health, landed state, estimator, clock."""
 
 from __future__ import annotations
 
@@ -9,7 +9,29 @@ from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Lande
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, custom_mode, system_status
 from firmware_sim.mavlink.streams.sensors import percent
-from firmware_sim.mavlink.streams.units import NAN, boot_ms, int16, uint16
+from firmware_sim.mavlink.streams.units import boot_ms, int16, uint16
+
+CAPABILITIES: int = (
+    dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
+    | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+)
+"""Of a real PX4's 0xE8FF only what is true here: no missions, fence, rally points, FTP, attitude
+setpoints or flight termination."""
+
+_FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
+"""The PX4 release whose behaviour is emulated: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
+
+_BOARD_VERSION = 1
+"""As PX4 SITL reports."""
+
+_CUSTOM_VERSION = b"airl-mav"
+"""Where a real PX4 puts the first 8 bytes of its git hash."""
+
+_UID = 0x4149_524C_4D41_5601
+"""Constant hardware id: every emulated vehicle is the same piece of hardware."""
 
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
@@ -103,24 +125,27 @@ def estimator_status(state: AutopilotState) -> Values:
         flags = _ESTIMATOR_GOOD | (_ESTIMATOR_GOOD_GLOBAL if state.origin is not None else 0)
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
-    return (
-        estimate.time_us,
-        flags,
-        max(horizontal, vertical),
-        horizontal,
-        height,
-        mag,
-        NAN,
-        NAN,
-        math.hypot(north, east),
-        down,
-    )
+    airspeed = terrain = math.nan
+    ratios = (max(horizontal, vertical), horizontal, height, mag, terrain, airspeed)
+    return estimate.time_us, flags, *ratios, math.hypot(north, east), down
 
 
 def mission_current(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
     """There is no mission."""
     sequence, total = 0, 0
     return sequence, total, dialect.MISSION_STATE_NO_MISSION
+
+
+def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
+    """The identity and the true capabilities of the built-in autopilot."""
+    os_version = vendor = product = 0
+    middleware_custom_version = os_custom_version = (0,) * 8
+    return (
+        CAPABILITIES,
+        *(_FIRMWARE_VERSION, _FIRMWARE_VERSION, os_version, _BOARD_VERSION),
+        *(*_CUSTOM_VERSION, *middleware_custom_version, *os_custom_version),
+        *(vendor, product, _UID),
+    )
 
 
 def system_time(boot_unix_us: int) -> Callable[[AutopilotState], Values]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-NAN: Final = math.nan
+from numba.extending import register_jitable
+
 INT16_MAX: Final = 32_767
 INT32_MAX: Final = 2_147_483_647
 UINT16_MAX: Final = 65_535
@@ -23,21 +24,13 @@ def saturate(value: float, low: int, high: int, unknown: int) -> int:
     return low if value <= low else round(value)
 
 
-# The common case, a value within range, is told apart first: it is asked for thousands of times a
-# second.
-
-
 def int16(value: float, unknown: int = 0) -> int:
     """Return a value for an int16 field."""
-    if -INT16_MAX <= value <= INT16_MAX:
-        return round(value)
     return saturate(value, -INT16_MAX - 1, INT16_MAX, unknown)
 
 
 def int32(value: float, unknown: int = 0) -> int:
     """Return a value for an int32 field."""
-    if -INT32_MAX <= value <= INT32_MAX:
-        return round(value)
     return saturate(value, -INT32_MAX - 1, INT32_MAX, unknown)
 
 
@@ -58,20 +51,17 @@ def boot_ms(time_us: int) -> int:
 
 def deg_e7(angle_deg: float) -> int:
     """Return an angle [deg] as degE7."""
-    value = angle_deg * 1e7
-    return round(value) if -INT32_MAX <= value <= INT32_MAX else int32(value)
+    return int32(angle_deg * 1e7)
 
 
 def mm(length_m: float) -> int:
     """Return a length [m] as int32 millimetres."""
-    value = length_m * 1e3
-    return round(value) if -INT32_MAX <= value <= INT32_MAX else int32(value)
+    return int32(length_m * 1e3)
 
 
 def cm_s(speed_m_s: float) -> int:
     """Return a velocity [m/s] as int16 cm/s."""
-    value = speed_m_s * 1e2
-    return round(value) if -INT16_MAX <= value <= INT16_MAX else int16(value)
+    return int16(speed_m_s * 1e2)
 
 
 def centidegrees(angle_rad: float) -> int:
@@ -79,3 +69,7 @@ def centidegrees(angle_rad: float) -> int:
     if not math.isfinite(angle_rad):
         return UINT16_MAX
     return round(math.degrees(angle_rad % TWO_PI) * 100.0) % 36_000
+
+
+for _function in (saturate, int16, int32, boot_ms, deg_e7, mm, cm_s, centidegrees):
+    register_jitable(_function)  # so that kernels can call them, as Python can

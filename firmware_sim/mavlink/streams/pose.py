@@ -1,4 +1,4 @@
-"""Where the vehicle is, where it should be, and where its origin and home are."""
+"""Where the vehicle is and how it points, where and how it should, its origin and home."""
 
 from __future__ import annotations
 
@@ -12,47 +12,44 @@ from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import conjugate, rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.streams.units import (
-    NAN,
-    boot_ms,
-    centidegrees,
-    cm_s,
-    deg_e7,
-    int16,
-    int32,
-    mm,
-    saturate,
-    uint16,
-)
+from firmware_sim.mavlink.streams import units
 
-for _function in (
-    local_to_geodetic,
-    boot_ms,
-    centidegrees,
-    cm_s,
-    deg_e7,
-    int16,
-    int32,
-    mm,
-    saturate,
-):
-    register_jitable(_function)  # so that kernels can call them, as Python can
+register_jitable(local_to_geodetic)  # so that kernels can call it, as Python can
 
-_UNKNOWN_QUATERNION = (NAN, NAN, NAN, NAN)
-_NO_ACCELERATION = (NAN, NAN, NAN)
+_NO_ROTATION_OFFSET = (0.0, 0.0, 0.0, 0.0)
+"""PX4 saves bytes: zeros mean the identity (tailsitters alone differ)."""
+
+_UNKNOWN_QUATERNION = (math.nan, math.nan, math.nan, math.nan)
+_NO_ACCELERATION = (math.nan, math.nan, math.nan)
 _NO_APPROACH = (0.0, 0.0, 0.0)
 """HOME_POSITION: there is no special way to land."""
 
-_X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
-_VX_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE
-"""The bits of y and z follow."""
 _ACCELERATION_IGNORE: int = (
     dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
     | dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
     | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
 )
-_YAW_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-_YAW_RATE_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+
+
+def attitude(state: AutopilotState) -> Values:
+    """Euler angles [rad] and body rates [rad/s]."""
+    estimate = state.estimate
+    angles, rates = _euler(estimate.quaternion), estimate.angular_velocity.tolist()
+    return units.boot_ms(estimate.time_us), *angles, *rates
+
+
+def attitude_quaternion(state: AutopilotState) -> Values:
+    """Quaternion w, x, y, z (body FRD -> NED) and body rates [rad/s]."""
+    estimate = state.estimate
+    quaternion, rates = estimate.quaternion.tolist(), estimate.angular_velocity.tolist()
+    return units.boot_ms(estimate.time_us), *quaternion, *rates, *_NO_ROTATION_OFFSET
+
+
+def attitude_target(state: AutopilotState) -> Values:
+    """What the attitude and rate controllers track; collective thrust 0..1."""
+    type_mask = 0
+    quaternion, rates = state.attitude_setpoint.tolist(), state.rate_setpoint.tolist()
+    return units.boot_ms(state.time_us), type_mask, *quaternion, *rates, state.thrust_setpoint
 
 
 def local_position_ned(state: AutopilotState) -> Values | None:
@@ -60,16 +57,13 @@ def local_position_ned(state: AutopilotState) -> Values | None:
     estimate = state.estimate
     if not estimate.healthy:
         return None
-    x, y, z = estimate.position.tolist()
-    vx, vy, vz = estimate.velocity.tolist()
-    return boot_ms(estimate.time_us), x, y, z, vx, vy, vz
+    return units.boot_ms(estimate.time_us), *estimate.position.tolist(), *estimate.velocity.tolist()
 
 
 def global_position_int(state: AutopilotState) -> Values | None:
     """Position on the globe, height above home, NED velocity; nothing without an origin."""
     estimate, origin, home = state.estimate, state.origin, state.home
-    x, y, z = estimate.position.tolist()
-    if origin is None or not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
+    if origin is None or not all(map(math.isfinite, estimate.position.tolist())):
         return None
     return _on_globe(
         estimate.time_us,
@@ -95,7 +89,7 @@ def odometry(state: AutopilotState) -> Values:
         *_in_body(estimate.quaternion, estimate.velocity),
         *estimate.angular_velocity.tolist(),
         *_covariance(x, y, z, roll, pitch, yaw),
-        *_covariance(vx, vy, vz, NAN, NAN, NAN),
+        *_covariance(vx, vy, vz, math.nan, math.nan, math.nan),
         reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT,
         100 if estimate.healthy else 0,
@@ -105,11 +99,11 @@ def odometry(state: AutopilotState) -> Values:
 def altitude(state: AutopilotState) -> Values:
     """All altitudes [m]; there is no rangefinder, so terrain is unknown."""
     down = float(state.estimate.position[2])
-    altitude_terrain = bottom_clearance = NAN
+    altitude_terrain = bottom_clearance = math.nan
     return (
         state.time_us,
         atmosphere.altitude_m(state.pressure_hpa),
-        NAN if state.origin is None else state.origin.altitude_m - down,
+        math.nan if state.origin is None else state.origin.altitude_m - down,
         -down,
         _height_above_home(state),
         altitude_terrain,
@@ -126,8 +120,8 @@ def vfr_hud(state: AutopilotState) -> Values:
     return (
         airspeed,
         math.hypot(north, east),
-        int16(heading) % 360,
-        uint16(100.0 * state.thrust_setpoint if armed else 0.0, unknown=0),
+        units.int16(heading) % 360,
+        units.uint16(100.0 * state.thrust_setpoint if armed else 0.0, unknown=0),
         atmosphere.altitude_m(state.pressure_hpa)
         if state.origin is None
         else state.origin.altitude_m - float(state.estimate.position[2]),
@@ -140,7 +134,7 @@ def position_target_local_ned(state: AutopilotState) -> Values:
     setpoint = state.setpoint
     position, velocity = setpoint.position, setpoint.velocity
     return (
-        boot_ms(state.time_us),
+        units.boot_ms(state.time_us),
         dialect.MAV_FRAME_LOCAL_NED,
         _ignored(position, velocity, setpoint.yaw, setpoint.yaw_rate),
         *position.tolist(),
@@ -156,35 +150,41 @@ def home_position(state: AutopilotState) -> Values | None:
     home, origin = state.home, state.origin
     if home is None:
         return None
-    local = [NAN, NAN, NAN] if origin is None else geodetic_to_local(home, origin).tolist()
-    return (
-        deg_e7(home.latitude_deg),
-        deg_e7(home.longitude_deg),
-        mm(home.altitude_m),
-        *local,
-        *_UNKNOWN_QUATERNION,
-        *_NO_APPROACH,
-        state.time_us,
+    local = (
+        [math.nan, math.nan, math.nan]
+        if origin is None
+        else geodetic_to_local(home, origin).tolist()
     )
+    return *_wire(home), *local, *_UNKNOWN_QUATERNION, *_NO_APPROACH, state.time_us
 
 
 def gps_global_origin(state: AutopilotState) -> Values | None:
     """The point of the globe where local NED is zero; nothing before it is set."""
-    origin = state.origin
-    if origin is None:
-        return None
+    return None if state.origin is None else (*_wire(state.origin), state.time_us)
+
+
+def _wire(place: Geodetic) -> Values:
+    """Return latitude, longitude [degE7] and altitude [mm]."""
     return (
-        deg_e7(origin.latitude_deg),
-        deg_e7(origin.longitude_deg),
-        mm(origin.altitude_m),
-        state.time_us,
+        units.deg_e7(place.latitude_deg),
+        units.deg_e7(place.longitude_deg),
+        units.mm(place.altitude_m),
     )
 
 
 def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:
     """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else NaN."""
-    n = NAN
+    n = math.nan
     return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
+
+
+@kernel
+def _euler(quaternion: Vector) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw [rad] of a quaternion (4,), as `frames.quat_to_euler`."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    return roll, pitch, yaw_of((w, x, y, z))
 
 
 @kernel
@@ -202,15 +202,15 @@ def _on_globe(
     origin = Geodetic(latitude_deg, longitude_deg, altitude_m)
     here = local_to_geodetic(position, origin)
     return (
-        boot_ms(time_us),
-        deg_e7(here.latitude_deg),
-        deg_e7(here.longitude_deg),
-        mm(here.altitude_m),
-        mm(here.altitude_m - home_altitude_m),
-        cm_s(velocity[0]),
-        cm_s(velocity[1]),
-        cm_s(velocity[2]),
-        centidegrees(yaw_of((q[0], q[1], q[2], q[3]))),
+        units.boot_ms(time_us),
+        units.deg_e7(here.latitude_deg),
+        units.deg_e7(here.longitude_deg),
+        units.mm(here.altitude_m),
+        units.mm(here.altitude_m - home_altitude_m),
+        units.cm_s(velocity[0]),
+        units.cm_s(velocity[1]),
+        units.cm_s(velocity[2]),
+        units.centidegrees(yaw_of((q[0], q[1], q[2], q[3]))),
     )
 
 
@@ -218,15 +218,15 @@ def _on_globe(
 def _ignored(position: Vector, velocity: Vector, yaw: float, yaw_rate: float) -> int:
     """Return the POSITION_TARGET_TYPEMASK of a setpoint: what is not commanded."""
     mask = _ACCELERATION_IGNORE
-    for i in range(3):
+    for i in range(3):  # the bits of y and z follow that of x
         if not math.isfinite(position[i]):
-            mask |= _X_IGNORE << i
+            mask |= dialect.POSITION_TARGET_TYPEMASK_X_IGNORE << i
         if not math.isfinite(velocity[i]):
-            mask |= _VX_IGNORE << i
+            mask |= dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE << i
     if not math.isfinite(yaw):
-        mask |= _YAW_IGNORE
+        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
     if not math.isfinite(yaw_rate):
-        mask |= _YAW_RATE_IGNORE
+        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
     return mask
 
 

@@ -1,7 +1,4 @@
-"""Starts SITL firmware for each flight, or waits for one that the user starts.
-
-What differs between PX4 and ArduPilot is in `px4.program` and `ardupilot.program`.
-"""
+"""Starts external firmware for each flight, or waits for what the user starts or plugs in."""
 
 from __future__ import annotations
 
@@ -10,50 +7,57 @@ from pathlib import Path
 
 from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import Bridge, no_process
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
-from firmware_sim.external.process.working_folders import WorkingFolders
+from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 
 
-class SitlLauncher:
-    """Starts a program for each flight, or waits for the user's. A `boot_sequence.Launcher`."""
+class Launcher:
+    """One kind of firmware, flight after flight: its bridge, and its process where it is ours."""
 
     def __init__(
         self,
         airframe: Airframe,
         bridge: Callable[[], Bridge],
-        program: Callable[[Path], StartCommand] | None,
-        folders: WorkingFolders,
-        *,
         timeout_s: float,
-        reboots: bool,
+        *,
+        reboots: bool = True,
+        program: Callable[[Path], StartCommand] | None = None,
+        folders: WorkingFolders | None = None,
     ) -> None:
         """Take what is started, and its simulator interface.
 
         Args:
             airframe: What it must be configured to.
             bridge: Opens the simulator interface for one flight.
+            timeout_s: Longest wait for it to connect [wall s].
+            reboots: Whether it comes up again when told to reboot; otherwise it can only be told
+                to shut down.
             program: Called with an empty working folder, which it may write files to; returns the
                 command that starts the program there. None = the user starts it.
             folders: Its working folders and log.
-            timeout_s: Longest wait for it to connect [wall s].
-            reboots: Whether it comes up again when told to reboot.
         """
         self.airframe = airframe
         self.may_set = program is not None
+        """Whether its parameters may be changed: it was started here, for this flight alone."""
         self.reboots = reboots
-        self._bridge = bridge
-        self._program = program
-        self._folders = folders
+        self._open_bridge = bridge
+        self._program, self._folders = program, folders
         self._timeout_s = timeout_s
+        self._bridge: Bridge | None = None
         self._child: FirmwareProcess | None = None
 
     def launch(self) -> Bridge:
-        """Start it, or wait for the user's; see `boot_sequence.Launcher`."""
+        """Start it, or wait for it, and return the bridge, connected.
+
+        Raises:
+            UsageError: A port or device cannot be opened.
+            FirmwareMissingError: It cannot be started, or never connects.
+            FirmwareLostError: It died while it started.
+        """
         self.stop()
         alive = no_process
-        bridge = self._bridge()
+        self._bridge = bridge = self._open_bridge()
         try:
-            if self._program is not None:
+            if self._program is not None and self._folders is not None:
                 folder = self._folders.fresh()
                 self._child = FirmwareProcess(
                     self.airframe.firmware, self._program(folder), folder, self._folders.log
@@ -61,18 +65,20 @@ class SitlLauncher:
                 alive = self._child.check
             bridge.wait_connected(self._timeout_s, alive)
         except BaseException:
-            bridge.close()
             self.stop()
             raise
         return bridge
 
     def stop(self) -> None:
-        """End what was started."""
+        """Release the bridge and end what was started; harmless when nothing was."""
+        if self._bridge is not None:
+            self._bridge.close()
         child, self._child = self._child, None
         if child is not None:
             child.stop()
 
     def close(self) -> None:
-        """End it for good, and remove its temporary folder."""
+        """End it for good: nothing temporary is left."""
         self.stop()
-        self._folders.close()
+        if self._folders is not None:
+            self._folders.close()

@@ -1,0 +1,134 @@
+"""Decisions, rewards and the curriculum: what the environments put into Gymnasium's two APIs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.curriculum import CurriculumState
+from airl_mav.envs.delay import bounded
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.rewards import rewards
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
+from airl_mav.policy.layouts import ObservationSpec, boxes
+
+FIRST_TRAINING_SEED = 1_000_000
+"""Episodes that draw their own seed draw it from here on: those below are for evaluation."""
+
+LAST_TRAINING_SEED = 2**31
+
+UNBOUNDED = 1e6
+"""Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
+
+
+class Decided(NamedTuple):
+    """What a decision of n vehicles came to; arrays (n,)."""
+
+    flights: Flights
+    """At its end."""
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    """Ran out of time."""
+
+
+class Decisions:
+    """The flights of n vehicles, decision by decision; a base of the environments."""
+
+    def __init__(self, spec: EnvironmentSpec | None, knobs: Mapping[str, Any], n: int) -> None:
+        """Take the specification, or its fields. Raises UsageError as `spec_of`, `Navigation`."""
+        self.environment = bounded(spec_of(spec, knobs))
+        self.navigation = Navigation(self.environment, n)
+        self.curriculum: CurriculumState | None = None
+        if self.environment.curriculum is not None:
+            zones = len(self.navigation.arena_spec.zones_m)
+            self.curriculum = CurriculumState(self.environment.curriculum, zones)
+        self._zone: int | None = None
+        """Curriculum zone that `reset` was asked for."""
+        self._before: Flights | None = None
+        """The flights at the present decision; None before the first reset."""
+
+    def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
+        """Begin episodes in the zone asked for, else that of the curriculum, else the whole."""
+        zone = self._zone
+        if zone is None and self.curriculum is not None:
+            zone = self.curriculum.zone
+        self.navigation.begin(slots, seeds, zone)
+        self._before = self.navigation.flights()
+        return self._before
+
+    def _decide(self, actions: NDArray[Any]) -> Decided:
+        """Fly one decision of every vehicle. Raises ResetNeeded before the first reset."""
+        before, spec = self._before, self.environment
+        if before is None:
+            raise gym.error.ResetNeeded("step() before reset()")
+        self.navigation.fly(commands(spec.action_spec, actions))
+        now = self._before = self.navigation.flights()
+        truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
+        terminated = (now.verdict != Verdict.FLYING) & ~truncated
+        if self.curriculum is not None:
+            for i in np.flatnonzero(terminated | truncated):
+                success = bool(now.verdict[i] == Verdict.SUCCESS)
+                self.curriculum.record(int(self.navigation.zones[i]), success=success)
+        reward = rewards(spec.reward, before, now, spec.episode.hold_s)
+        return Decided(now, reward, terminated, truncated)
+
+    def _quality(self, flights: Flights) -> dict[str, NDArray[Any]]:
+        """Return `info` of every flight: its seed, zone and quality so far."""
+        return {
+            "seed": self.navigation.seeds.copy(),
+            "zone": self.navigation.zones.copy(),
+            "flight_time_s": flights.time_s.copy(),
+            "distance_m": flights.distance_m.copy(),
+            "energy_j": flights.energy_j.copy(),
+            "goal_distance_m": flights.goal_distance_m.copy(),
+        }
+
+
+def outcome(flights: Flights, i: int) -> dict[str, Any]:
+    """Return what `info` has in addition for a flight that has ended."""
+    verdict = Verdict(int(flights.verdict[i]))
+    return {"success": verdict == Verdict.SUCCESS, "outcome": verdict.name.lower()}
+
+
+def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:
+    """Return the Dict space of a layout."""
+    arrays: dict[str, gym.Space[Any]] = {
+        key: gym.spaces.Box(
+            max(box.low, -UNBOUNDED), min(box.high, UNBOUNDED), box.shape, box.dtype
+        )
+        for key, box in boxes(spec).items()
+    }
+    return gym.spaces.Dict(arrays)
+
+
+def action_space(spec: ActionSpec) -> gym.Space[Any]:
+    """Return Discrete(25), or Box(-1, 1, (2,)) of the continuous set."""
+    number = discrete_actions(spec)
+    if number is not None:
+        return gym.spaces.Discrete(number)
+    return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def zone_option(options: Mapping[str, Any] | None) -> int | None:
+    """Return the zone that `reset` is asked for. Raises UsageError for anything else."""
+    options = options or {}
+    if unknown := [key for key in options if key != "zone"]:
+        raise UsageError(f"options: {', '.join(map(str, unknown))}; accepted: zone")
+    zone = options.get("zone")
+    if zone is not None and (isinstance(zone, bool) or not isinstance(zone, int | np.integer)):
+        raise UsageError(f"options: zone = {zone!r}: accepted: a whole number")
+    return None if zone is None else int(zone)
+
+
+def draw_seeds(rng: np.random.Generator, n: int) -> list[int]:
+    """Return the seeds of n episodes of training."""
+    drawn: list[int] = rng.integers(FIRST_TRAINING_SEED, LAST_TRAINING_SEED, n).tolist()
+    return drawn
