@@ -110,7 +110,7 @@ opened = Counter()
 def note(event, arguments):
     if event == "open" and isinstance(arguments[0], (str, Path)):
         path = Path(arguments[0])
-        if path.suffix in (".toml", ".json", ".onnx") and "profiles" in path.parts:
+        if path.suffix in (".toml", ".json", ".onnx") and "profiles" in path.parts[:-2]:
             opened["/".join(path.parts[-2:])] += 1
 
 sys.addaudithook(note)
