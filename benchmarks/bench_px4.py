@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from firmware_sim.external.process.firmware_process import FirmwareProcess, StartCommand
+from firmware_sim.external.process import FirmwareProcess, StartCommand
 from rich.console import Console
 from rich.table import Table
 

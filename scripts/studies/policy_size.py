@@ -43,7 +43,7 @@ from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map
 from airl_mav.report.table import TOO_FEW_CELL, Column, TableView, markdown_table, print_table
 from airl_mav.report.theme import PAPER, new_figure, render_png
-from airl_mav.sweep.document import count, t2_ms
+from airl_mav.sweep.tables import count, t2_ms
 
 SCHEMA = 1
 DEFAULT = Path(__file__).with_suffix(".toml")
