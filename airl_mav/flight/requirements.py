@@ -1,0 +1,204 @@
+"""What a policy has to reach, and whether its flights show that it does.
+
+A requirement is decided on the 95 % interval of its figure, never on the figure alone: it is met
+where the whole interval fulfils it, not met where none of it does, and undecided between.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from airl_mav.core.errors import FieldError
+from airl_mav.flight.paired import PairedComparison
+from airl_mav.flight.sequential import MOST_FLIGHTS, Decision
+from airl_mav.flight.statistics import Aggregate, Estimate, wilson
+
+
+class Measure(NamedTuple):
+    """A figure that can be required."""
+
+    title: str
+    unit: str
+    per_unit: float
+    """The unit in what the figures are kept in: 0.01 for percent, 1000 for kJ."""
+    attribute: str
+    """Of `Aggregate` and of `PairedComparison`."""
+    gap_unit: str = "%"
+
+
+MEASURES: dict[str, Measure] = {
+    "success": Measure("success rate", "%", 0.01, "success_rate", "points"),
+    "flight_time": Measure("flight time", "s", 1.0, "flight_time_s"),
+    "distance": Measure("distance", "m", 1.0, "distance_m"),
+    "energy": Measure("energy", "kJ", 1e3, "energy_j"),
+    "total_energy": Measure("energy with computer", "kJ", 1e3, "total_energy_j"),
+}
+"""By the word that a requirement names them by."""
+
+ACCEPTED = (
+    f"MEASURE [gap] >= or <= NUMBER [UNIT], with MEASURE one of {', '.join(MEASURES)}: as"
+    " 'success >= 95 %' or 'flight_time gap <= 10 %'"
+)
+
+_REQUIREMENT = re.compile(
+    r"\s*(?P<measure>[a-z_]+)(?P<gap>\s+gap)?\s*(?P<sense>>=|<=)\s*"
+    r"(?P<limit>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-zA-Z]+)?\s*",
+)
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A bound on a figure of a run, or on its difference from a reference."""
+
+    measure: str
+    """Key of `MEASURES`."""
+    gap: bool
+    """Whether the difference from the reference is bounded, and not the figure itself."""
+    sense: Literal[">=", "<="]
+    limit: float
+    """In `unit`."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the limit; a gap is in percent, that of a rate in percentage points."""
+        measure = MEASURES[self.measure]
+        return measure.gap_unit if self.gap else measure.unit
+
+    def __str__(self) -> str:
+        """Return the requirement as it is written."""
+        gap = " gap" if self.gap else ""
+        return f"{self.measure}{gap} {self.sense} {self.limit:g} {self.unit}"
+
+    def fulfilled_by(self, value: float) -> bool:
+        """Return whether a value, in `unit`, keeps within the bound."""
+        return value >= self.limit if self.sense == ">=" else value <= self.limit
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A requirement, and what the flights say of it."""
+
+    requirement: Requirement
+    decision: Decision
+    estimate: Estimate
+    """The figure in the requirement's unit."""
+    more_flights: int | None = None
+    """How many more would decide it if the figure stayed; None where decided, or out of reach."""
+
+    def sentence(self) -> str:
+        """Return the finding as one line."""
+        estimate, unit = self.estimate, self.requirement.unit
+        if estimate.value is None:
+            return f"{self.decision.value}: {self.requirement} (no flight to judge it by)"
+        seen = f"{estimate.value:.1f} {unit}"
+        if estimate.low is not None and estimate.high is not None:
+            seen += f" [{estimate.low:.1f}, {estimate.high:.1f}]"
+        line = f"{self.decision.value}: {self.requirement} ({seen}, n = {estimate.n:,}"
+        if self.decision is Decision.UNDECIDED:
+            line += (
+                f"; about {self.more_flights:,} more flights would tell"
+                if self.more_flights is not None
+                else "; no number of flights in reach would tell"
+            )
+        return line + ")"
+
+
+def parse_requirement(text: str) -> Requirement:
+    """Read a requirement: `success >= 95 %`, `flight_time gap <= 10 %`.
+
+    Raises:
+        FieldError: It is none.
+    """
+    found = _REQUIREMENT.fullmatch(text)
+    if found is None or found["measure"] not in MEASURES:
+        raise FieldError("require", text, ACCEPTED)
+    try:
+        limit = float(found["limit"])
+    except ValueError:
+        raise FieldError("require", text, ACCEPTED) from None
+    sense: Literal[">=", "<="] = ">=" if found["sense"] == ">=" else "<="
+    requirement = Requirement(found["measure"], found["gap"] is not None, sense, limit)
+    if found["unit"] not in (None, requirement.unit):
+        raise FieldError("require", text, f"the unit {requirement.unit}")
+    if requirement.measure == "success" and not requirement.gap and not 0.0 < limit <= 100.0:
+        raise FieldError("require", text, "a success rate above 0 % and up to 100 %")
+    return requirement
+
+
+def find(requirement: Requirement, quality: Aggregate, against: PairedComparison | None) -> Finding:
+    """Judge a requirement by the flights of a run.
+
+    Args:
+        requirement: What is asked.
+        quality: Figures of the run.
+        against: The run against its reference on the same seeds; None: there is none.
+
+    Raises:
+        FieldError: A gap is required, and there is no reference.
+    """
+    measure = MEASURES[requirement.measure]
+    if requirement.gap:
+        if against is None:
+            raise FieldError(
+                "require", str(requirement), "a gap only where a reference is flown: airl gap"
+            )
+        # Both in percent, or in percentage points.
+        estimate: Estimate = getattr(against, measure.attribute).difference
+    else:
+        estimate = getattr(quality, measure.attribute).scaled(1.0 / measure.per_unit)
+    decision = decide(requirement, estimate)
+    more = None
+    if decision is Decision.UNDECIDED:
+        rate = requirement.measure == "success" and not requirement.gap
+        more = _more_flights(requirement, estimate, wilson_percent if rate else None)
+    return Finding(requirement, decision, estimate, more)
+
+
+def decide(requirement: Requirement, estimate: Estimate) -> Decision:
+    """Return what an estimate, in the requirement's unit, says of it."""
+    if estimate.low is None or estimate.high is None:
+        return Decision.UNDECIDED
+    kept = {requirement.fulfilled_by(end) for end in (estimate.low, estimate.high)}
+    if len(kept) == 2:
+        return Decision.UNDECIDED
+    return Decision.MET if kept == {True} else Decision.NOT_MET
+
+
+def wilson_percent(rate: float, n: int) -> Estimate:
+    """Return the estimate that n flights of a success rate [%] would give."""
+    return wilson(round(0.01 * rate * n), n).scaled(100.0)
+
+
+def _more_flights(
+    requirement: Requirement,
+    estimate: Estimate,
+    project: Callable[[float, int], Estimate] | None,
+) -> int | None:
+    """Return how many more flights of the same figure would decide; None: out of reach.
+
+    Args:
+        requirement: What is asked.
+        estimate: What is known.
+        project: Gives the estimate of n flights of a figure; None: its interval shrinks with the
+            root of n.
+    """
+    value, low, high = estimate.value, estimate.low, estimate.high
+    if value is None:
+        return None
+    if project is None:
+        away = abs(value - requirement.limit)
+        if low is None or high is None or away == 0.0:
+            return None
+        half = value - low if value > requirement.limit else high - value
+        needed = math.ceil(estimate.n * (half / away) ** 2)
+        return needed - estimate.n if needed <= MOST_FLIGHTS else None
+    n = max(1, estimate.n)
+    while decide(requirement, project(value, n)) is Decision.UNDECIDED:
+        n = math.ceil(1.02 * n) + 1
+        if n > MOST_FLIGHTS:
+            return None
+    return n - estimate.n

@@ -1,0 +1,145 @@
+"""Requirements: what is read, and when flights show that they are met."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from airl_mav.core.errors import FieldError
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import NO_ESTIMATE, Agreement, Change, PairedComparison
+from airl_mav.flight.requirements import (
+    MEASURES,
+    Requirement,
+    find,
+    parse_requirement,
+)
+from airl_mav.flight.sequential import Decision
+from airl_mav.flight.statistics import Aggregate, Estimate, wilson
+
+QUALITY = Aggregate(
+    success_rate=wilson(87, 100),
+    flight_time_s=Estimate(8.0, 7.5, 8.5, 87),
+    distance_m=Estimate(26.0, 25.0, 27.0, 87),
+    energy_j=Estimate(3400.0, 3300.0, 3500.0, 87),
+    computer_energy_j=NO_ESTIMATE,
+    total_energy_j=Estimate(3400.0, 3300.0, 3500.0, 87),
+    mean_speed_m_s=NO_ESTIMATE,
+    outcomes=dict.fromkeys(Outcome, 0),
+)
+UNKNOWN = Change(None, None, NO_ESTIMATE)
+AGAINST = PairedComparison(
+    agreement=Agreement(85, 10, 2, 3),
+    success_rate=Change(0.95, 0.87, Estimate(-8.0, -12.0, -4.0, 100)),
+    flight_time_s=Change(5.5, 8.0, Estimate(44.6, 41.3, 49.8, 85)),
+    distance_m=UNKNOWN,
+    energy_j=UNKNOWN,
+    computer_energy_j=UNKNOWN,
+    total_energy_j=UNKNOWN,
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "requirement"),
+    [
+        ("success >= 95 %", Requirement("success", False, ">=", 95.0)),
+        ("success>=95", Requirement("success", False, ">=", 95.0)),
+        (" flight_time gap <= 10 % ", Requirement("flight_time", True, "<=", 10.0)),
+        ("success gap >= -1 points", Requirement("success", True, ">=", -1.0)),
+        ("energy <= 3.5 kJ", Requirement("energy", False, "<=", 3.5)),
+        ("flight_time <= 1e1 s", Requirement("flight_time", False, "<=", 10.0)),
+    ],
+)
+def test_what_is_read(text: str, requirement: Requirement) -> None:
+    assert parse_requirement(text) == requirement
+    assert parse_requirement(str(requirement)) == requirement
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ("", "MEASURE"),
+        ("success > 95 %", "MEASURE"),
+        ("speed >= 5", "MEASURE"),
+        ("success >= 1.2.3", "MEASURE"),
+        ("success >= 0 %", "above 0 %"),
+        ("success >= 101 %", "up to 100 %"),
+        ("flight_time <= 10 %", "the unit s"),
+        ("success gap >= -1 %", "the unit points"),
+    ],
+)
+def test_what_is_refused(text: str, hint: str) -> None:
+    with pytest.raises(FieldError, match="require") as refused:
+        parse_requirement(text)
+    assert hint in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "decision"),
+    [
+        # Wilson's interval of 87 in 100: 79.0 to 92.2 %.
+        ("success >= 95 %", Decision.NOT_MET),
+        ("success >= 93 %", Decision.NOT_MET),
+        ("success >= 90 %", Decision.UNDECIDED),
+        ("success >= 80 %", Decision.UNDECIDED),
+        ("success >= 75 %", Decision.MET),
+        ("success <= 95 %", Decision.MET),
+        ("flight_time <= 8.5 s", Decision.MET),
+        ("flight_time <= 8.4 s", Decision.UNDECIDED),
+        ("flight_time <= 7.4 s", Decision.NOT_MET),
+        ("energy <= 3.6 kJ", Decision.MET),
+        ("flight_time gap <= 10 %", Decision.NOT_MET),
+        ("flight_time gap <= 50 %", Decision.MET),
+        ("success gap >= -10 points", Decision.UNDECIDED),
+        ("distance gap <= 10 %", Decision.UNDECIDED),
+    ],
+)
+def test_it_is_decided_on_the_interval(text: str, decision: Decision) -> None:
+    finding = find(parse_requirement(text), QUALITY, AGAINST)
+    assert finding.decision is decision
+    assert finding.sentence().startswith(decision.value)
+
+
+@pytest.mark.parametrize("rate", [0.90, 0.93, 0.97, 1.0])
+def test_so_many_more_flights_of_that_rate_decide(rate: float) -> None:
+    requirement = parse_requirement("success >= 95 %")
+    quality = replace(QUALITY, success_rate=wilson(round(40 * rate), 40))
+    finding = find(requirement, quality, None)
+    assert finding.decision is Decision.UNDECIDED
+    assert finding.more_flights is not None
+    n = 40 + finding.more_flights
+    value = round(40 * rate) / 40
+    later = replace(QUALITY, success_rate=wilson(round(value * n), n))
+    assert find(requirement, later, None).decision is not Decision.UNDECIDED
+
+
+def test_means_need_as_many_as_shrinks_their_interval() -> None:
+    finding = find(parse_requirement("flight_time <= 8.25 s"), QUALITY, None)
+    # Half as wide an interval needs four times the 87 flights.
+    assert finding.more_flights == pytest.approx(3 * 87, abs=1)
+
+
+def test_at_the_threshold_no_number_would_tell() -> None:
+    quality = replace(QUALITY, success_rate=wilson(95, 100))
+    finding = find(parse_requirement("success >= 95 %"), quality, None)
+    assert (finding.decision, finding.more_flights) == (Decision.UNDECIDED, None)
+    assert "no number of flights in reach" in finding.sentence()
+
+
+def test_nothing_flown_decides_nothing() -> None:
+    quality = replace(QUALITY, success_rate=NO_ESTIMATE)
+    finding = find(parse_requirement("success >= 95 %"), quality, None)
+    assert finding.decision is Decision.UNDECIDED
+    assert "no flight" in finding.sentence()
+
+
+def test_a_gap_needs_a_reference() -> None:
+    with pytest.raises(FieldError, match="airl gap"):
+        find(parse_requirement("flight_time gap <= 10 %"), QUALITY, None)
+
+
+def test_every_measure_is_a_figure_of_runs_and_of_pairs() -> None:
+    for word, measure in MEASURES.items():
+        assert isinstance(getattr(QUALITY, measure.attribute), Estimate), word
+        assert isinstance(getattr(AGAINST, measure.attribute), Change), word
