@@ -15,6 +15,15 @@ EXIT_BROKEN = 1
 EXIT_USAGE = 2
 """The input cannot be used."""
 
+EXIT_NOT_MET = 3
+"""All was flown, and a requirement is not met."""
+
+EXIT_INVALID = 4
+"""All was flown, but flights stayed invalid: the host could not keep up. There is no verdict."""
+
+EXIT_UNDECIDED = 5
+"""All was flown, and it was too little to tell whether a requirement is met."""
+
 EXIT_INTERRUPTED = 130
 """Ctrl-C (128 + SIGINT)."""
 

@@ -1,0 +1,234 @@
+"""The verdict: the first line of every output, and what a CI job reads of it.
+
+It says what flew, on what, and how many goals it reached; then, of each requirement, whether the
+flights meet it, do not meet it, or are too few to tell. Written as `verdict.json`, JUnit XML and a
+badge.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pydantic import TypeAdapter
+
+from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
+from airl_mav.core.files import read_typed, replace_file, write_json
+from airl_mav.flight.paired import PairedComparison
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.requirements import Finding, Requirement, find
+from airl_mav.flight.sequential import Decision
+from airl_mav.flight.setup import Setup
+from airl_mav.flight.statistics import Aggregate, Estimate
+from airl_mav.report.document import environment
+
+SCHEMA = 1
+"""Version of `verdict.json`; docs/run-folder.md describes it."""
+
+VERDICT_FILE = "verdict.json"
+
+Status = Literal["invalid", "not met", "undecided", "met", "nothing required"]
+
+EXIT_CODES: dict[Status, int] = {
+    "invalid": EXIT_INVALID,
+    "not met": EXIT_NOT_MET,
+    "undecided": EXIT_UNDECIDED,
+    "met": 0,
+    "nothing required": 0,
+}
+
+BADGE_COLOURS: dict[Status, str] = {
+    "invalid": "#68707a",
+    "not met": "#c0261c",
+    "undecided": "#a86400",
+    "met": "#1b8a3f",
+    "nothing required": "#2f7fc4",
+}
+
+
+@dataclass(frozen=True)
+class OverallVerdict:
+    """What a run, or a comparison, has come to."""
+
+    sentence: str
+    """What flew, on what, and what came of it, with intervals."""
+    short: str
+    """The same in few words, for a badge."""
+    invalid: tuple[str, ...] = ()
+    """Flights that stayed invalid, one line each: no verdict can be built on them."""
+    findings: tuple[Finding, ...] = ()
+    schema: int = SCHEMA
+
+    @property
+    def status(self) -> Status:
+        """What it comes to: the worst of all findings."""
+        decisions = {finding.decision for finding in self.findings}
+        if self.invalid:
+            return "invalid"
+        if Decision.NOT_MET in decisions:
+            return "not met"
+        if Decision.UNDECIDED in decisions:
+            return "undecided"
+        return "met" if decisions else "nothing required"
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of a command that has flown all of it."""
+        return EXIT_CODES[self.status]
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """All that is to be said, the most important first."""
+        return (
+            *(f"INVALID: {line}" for line in self.invalid),
+            self.sentence,
+            *(finding.sentence() for finding in self.findings),
+        )
+
+
+def judge_run(
+    setup: Setup,
+    quality: Aggregate,
+    episodes: Sequence[EpisodeRecord],
+    requirements: Sequence[Requirement] = (),
+    against: PairedComparison | None = None,
+    reference: str = "",
+) -> OverallVerdict:
+    """Return the verdict of a run.
+
+    Args:
+        setup: What was flown on what.
+        quality: Its figures.
+        episodes: Its flights.
+        requirements: What is asked of it.
+        against: The run against a reference on the same seeds; None: there is none.
+        reference: What the reference is called.
+
+    Raises:
+        FieldError: A requirement asks for a gap, and there is no reference.
+    """
+    computer = Path(setup.computer.name).stem
+    rate = quality.success_rate
+    reached = "no flight was finished"
+    if rate.value is not None:
+        reached = (
+            f"{round(rate.value * rate.n):,} of {rate.n:,} goals reached,"
+            f" {_percent(rate.scaled(100.0))}"
+        )
+    sentence = (
+        f"{setup.policy.name} on {computer} in {Path(setup.arena.name).stem}, level {setup.level}:"
+        f" {reached}"
+    )
+    if against is not None:
+        sentence += _gap_words(against, reference)
+    share = "no flight" if rate.value is None else f"{100.0 * rate.value:.1f} %"
+    return OverallVerdict(
+        sentence=f"{sentence}.",
+        short=f"{share} on {computer}",
+        invalid=tuple(
+            f"flight {episode.index:03d}, seed {episode.seed}: {'; '.join(episode.invalid)}"
+            for episode in episodes
+            if episode.invalid
+        ),
+        findings=tuple(find(requirement, quality, against) for requirement in requirements),
+    )
+
+
+def _gap_words(against: PairedComparison, reference: str) -> str:
+    """Return how a run differs from its reference."""
+    rate, time = against.success_rate.difference, against.flight_time_s.difference
+    told = []
+    if rate.value is not None:
+        word = "fewer" if rate.value < 0.0 else "more"
+        told.append(f"{abs(rate.value):.1f} points {word}{_interval(rate)}")
+    if time.value is not None:
+        word = "less" if time.value < 0.0 else "more"
+        told.append(f"{abs(time.value):.1f} % {word} flight time{_interval(time)}")
+    return f"; {' and '.join(told)} than on {reference}" if told else ""
+
+
+def _percent(estimate: Estimate) -> str:
+    value = f"{estimate.value:.1f} %"
+    if estimate.low is None or estimate.high is None:
+        return value
+    return f"{value} [{estimate.low:.1f}, {estimate.high:.1f}]"
+
+
+def _interval(difference: Estimate) -> str:
+    if difference.low is None or difference.high is None:
+        return ""
+    return f" [{difference.low:+.1f}, {difference.high:+.1f}]"
+
+
+# --- files
+
+
+_VERDICT: TypeAdapter[OverallVerdict] = TypeAdapter(OverallVerdict)
+
+
+def save_verdict(verdict: OverallVerdict, folder: Path) -> None:
+    """Write `verdict.json`, whole or not at all; status and exit code stand in it as well."""
+    data = _VERDICT.dump_python(verdict, mode="json")
+    extra = {"status": verdict.status, "exit_code": verdict.exit_code}
+    write_json(folder / VERDICT_FILE, {**data, **extra})
+
+
+def load_verdict(folder: Path) -> OverallVerdict:
+    """Read the verdict of a folder. Raises UsageError."""
+    return read_typed(folder / VERDICT_FILE, _VERDICT, SCHEMA, "verdict")
+
+
+def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
+    """Write a verdict as JUnit XML: the validity of the flights and each requirement is a case.
+
+    Args:
+        verdict: The verdict.
+        path: Where to.
+        suite: Name of the suite: the command.
+    """
+    cases = len(verdict.findings) + 1
+    failures = sum(finding.decision is not Decision.MET for finding in verdict.findings)
+    counts = {"tests": str(cases), "failures": str(failures), "errors": str(int(verdict.status == "invalid"))}
+    root = ET.Element("testsuites", counts)
+    part = ET.SubElement(root, "testsuite", {"name": suite, **counts})
+    valid = ET.SubElement(part, "testcase", {"classname": suite, "name": "valid flights"})
+    if verdict.invalid:
+        problem = ET.SubElement(valid, "error", {"type": "invalid", "message": verdict.invalid[0]})
+        problem.text = "\n".join(verdict.invalid)
+    for finding in verdict.findings:
+        case = ET.SubElement(
+            part, "testcase", {"classname": suite, "name": str(finding.requirement)}
+        )
+        if finding.decision is not Decision.MET:
+            kind = "not met" if finding.decision is Decision.NOT_MET else "undecided"
+            failure = ET.SubElement(
+                case, "failure", {"type": kind, "message": finding.sentence()}
+            )
+            failure.text = verdict.sentence
+    ET.SubElement(part, "system-out").text = "\n".join(verdict.lines)
+    ET.indent(root)
+    replace_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
+
+
+GLYPH_PX = 6.6
+"""Mean width of a character of Verdana at 11 px; `textLength` makes the text fit exactly."""
+
+
+def write_badge(verdict: OverallVerdict, path: Path) -> None:
+    """Write a badge (SVG): the short verdict in the colour of its status."""
+    left, right = "rehearsal", verdict.short
+    if verdict.status != "nothing required":
+        right = f"{right}: {verdict.status}"
+    widths = [math.ceil(GLYPH_PX * len(text)) + 10 for text in (left, right)]
+    svg = environment().get_template("badge.svg.j2").render(
+        left=left,
+        right=right,
+        left_px=widths[0],
+        right_px=widths[1],
+        colour=BADGE_COLOURS[verdict.status],
+    )
+    replace_file(path, svg.encode())
