@@ -49,6 +49,9 @@ class EpisodeRecord:
     """None when navigation never began."""
     notes: tuple[str, ...] = ()
     """What else happened: failsafes, watchdog trips."""
+    invalid: tuple[str, ...] = ()
+    """Why the flight is no test of the policy (`flight.validity`): the host disturbed it in every
+    attempt. Empty: it is one."""
     sha256: dict[str, str] | None = None
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA

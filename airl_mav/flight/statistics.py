@@ -49,7 +49,7 @@ class Aggregate:
     """A run in figures. Times, distances and energies are means over the successful episodes."""
 
     success_rate: Estimate
-    """Fraction, 0 to 1, over all episodes that were not aborted."""
+    """Fraction, 0 to 1, over all valid episodes: an aborted one did not reach its goal."""
     flight_time_s: Estimate
     distance_m: Estimate
     energy_j: Estimate
@@ -113,13 +113,14 @@ def median_of(values: ArrayLike) -> Estimate:
 
 
 def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
-    """Work out a run's figures. An aborted episode was no test of the policy: it counts nowhere."""
+    """Work out a run's figures, over its valid episodes."""
     outcomes = dict.fromkeys(Outcome, 0)
     for episode in episodes:
         outcomes[episode.outcome] += 1
-    good = successful(episodes)
+    flown = [episode for episode in episodes if not episode.invalid]
+    good = successful(flown)
     return Aggregate(
-        success_rate=wilson(outcomes[Outcome.SUCCESS], len(episodes) - outcomes[Outcome.ABORTED]),
+        success_rate=wilson(sum(e.outcome is Outcome.SUCCESS for e in flown), len(flown)),
         outcomes=outcomes,
         **{
             name: bootstrap_mean([getattr(quality, name) for quality in good])

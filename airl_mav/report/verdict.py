@@ -192,7 +192,11 @@ def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
     """
     cases = len(verdict.findings) + 1
     failures = sum(finding.decision is not Decision.MET for finding in verdict.findings)
-    counts = {"tests": str(cases), "failures": str(failures), "errors": str(int(verdict.status == "invalid"))}
+    counts = {
+        "tests": str(cases),
+        "failures": str(failures),
+        "errors": str(int(verdict.status == "invalid")),
+    }
     root = ET.Element("testsuites", counts)
     part = ET.SubElement(root, "testsuite", {"name": suite, **counts})
     valid = ET.SubElement(part, "testcase", {"classname": suite, "name": "valid flights"})
@@ -205,9 +209,7 @@ def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
         )
         if finding.decision is not Decision.MET:
             kind = "not met" if finding.decision is Decision.NOT_MET else "undecided"
-            failure = ET.SubElement(
-                case, "failure", {"type": kind, "message": finding.sentence()}
-            )
+            failure = ET.SubElement(case, "failure", {"type": kind, "message": finding.sentence()})
             failure.text = verdict.sentence
     ET.SubElement(part, "system-out").text = "\n".join(verdict.lines)
     ET.indent(root)
@@ -224,11 +226,15 @@ def write_badge(verdict: OverallVerdict, path: Path) -> None:
     if verdict.status != "nothing required":
         right = f"{right}: {verdict.status}"
     widths = [math.ceil(GLYPH_PX * len(text)) + 10 for text in (left, right)]
-    svg = environment().get_template("badge.svg.j2").render(
-        left=left,
-        right=right,
-        left_px=widths[0],
-        right_px=widths[1],
-        colour=BADGE_COLOURS[verdict.status],
+    svg = (
+        environment()
+        .get_template("badge.svg.j2")
+        .render(
+            left=left,
+            right=right,
+            left_px=widths[0],
+            right_px=widths[1],
+            colour=BADGE_COLOURS[verdict.status],
+        )
     )
     replace_file(path, svg.encode())
