@@ -87,7 +87,7 @@ def pair_by_seed(
 ) -> tuple[Pair, ...]:
     """Return the flights of the seeds that both runs hold, in the order of the reference.
 
-    An aborted flight was no test of the policy: its seed makes no pair.
+    An invalid flight was no test of the policy: its seed makes no pair.
 
     Raises:
         ValueError: A run holds a seed twice.
@@ -97,7 +97,7 @@ def pair_by_seed(
 
 
 def _by_seed(episodes: Sequence[EpisodeRecord]) -> dict[int, EpisodeRecord]:
-    flown = [episode for episode in episodes if episode.outcome is not Outcome.ABORTED]
+    flown = [episode for episode in episodes if not episode.invalid]
     by_seed = {episode.seed: episode for episode in flown}
     if len(by_seed) != len(flown):
         raise ValueError("a run holds a seed twice")

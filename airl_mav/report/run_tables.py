@@ -168,7 +168,7 @@ def quality_table(summary: RunSummary) -> TableView:
     )
     notes = [
         "Means and medians over the flights that reached the goal; n is their number (for the "
-        "success rate: all flights but aborted ones). Intervals: Wilson for the rate, bootstrap "
+        "success rate: all valid flights). Intervals: Wilson for the rate, bootstrap "
         "for the means, binomial for the medians."
     ]
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.judge import Outcome
 from airl_mav.flight.paired import compare_pairs, percent_change
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
@@ -92,12 +91,12 @@ def load_runs(folder: Path, entries: Iterable[RunEntry]) -> dict[str, LoadedRun]
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the flights that say something of the policy: all but aborted ones."""
-    return [episode for episode in run.episodes if episode.outcome is not Outcome.ABORTED]
+    """Return the flights that say something of the policy: the valid ones."""
+    return [episode for episode in run.episodes if not episode.invalid]
 
 
 def samples_of(run: LoadedRun) -> dict[str, Samples]:
-    """Return the durations of all stages [µs], without those of aborted flights."""
+    """Return the durations of all stages [µs], without those of invalid flights."""
     tests = tests_of(run)
     return pool(stage_samples(run.latency[e.index]) for e in tests if e.index in run.latency)
 

@@ -93,7 +93,7 @@ class ComparedRun:
     """What was flown on what as text, by term."""
     quality: Aggregate
     stages: dict[str, Summary]
-    """Durations of the stages of a decision by stage key [µs]; aborted flights left out."""
+    """Durations of the stages of a decision by stage key [µs]; invalid flights left out."""
     slipped_us: int
     """Simulated time given up because the host could not keep pace [µs]."""
     start: NavigationStart | None

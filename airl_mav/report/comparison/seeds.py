@@ -42,7 +42,7 @@ def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
     """Return the seeds of which not all flights reached the goal, but one did.
 
     Returns:
-        For each its `seed`, and its `outcomes` by run; aborted flights are left out.
+        For each its `seed`, and its `outcomes` by run; invalid flights are left out.
     """
     flights: dict[int, dict[str, EpisodeRecord]] = {}
     for name, run in runs.items():

@@ -56,17 +56,16 @@ class ExaminedFlight:
 def ranked(run: LoadedRun) -> list[EpisodeRecord]:
     """Return all flights, the worst first.
 
-    Those that failed come first, then aborted ones, then those that reached the goal; each by the
-    time they lost, or took where no flight reached the goal.
+    Those that failed come first, then those that reached the goal; each by the time they lost, or
+    took where no flight reached the goal.
     """
     usual = usual_flight(run.episodes)
-    order = {Outcome.SUCCESS: 2, Outcome.ABORTED: 1}
 
-    def key(e: EpisodeRecord) -> tuple[int, float, int]:
+    def key(e: EpisodeRecord) -> tuple[bool, float, int]:
         lost_s = time_lost_s(e, usual)
         if lost_s is None:
             lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
-        return (order.get(e.outcome, 0), -lost_s, e.index)
+        return (e.outcome is Outcome.SUCCESS, -lost_s, e.index)
 
     return sorted(run.episodes, key=key)
 
@@ -149,7 +148,7 @@ def _row(judged: ExaminedFlight) -> tuple[str, ...]:
 
 def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView | None:
     """Return how often each cause made a flight fail; None where fewer than two failed."""
-    failed = [j for j in judged if j.record.outcome not in (Outcome.SUCCESS, Outcome.ABORTED)]
+    failed = [j for j in judged if j.record.outcome is not Outcome.SUCCESS]
     if len(failed) < 2:
         return None
     counts = Counter(j.cause.kind for j in failed)
@@ -171,7 +170,7 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
         Column("of those that failed", "%"),
         Column("which", number=False),
     )
-    all_failed = sum(e.outcome not in (Outcome.SUCCESS, Outcome.ABORTED) for e in run.episodes)
+    all_failed = sum(e.outcome is not Outcome.SUCCESS for e in run.episodes)
     notes: tuple[str, ...] = ()
     if all_failed > len(failed):
         notes = (f"The first {len(failed)} of {all_failed:,} flights that failed.",)
