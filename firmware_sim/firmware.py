@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
@@ -88,6 +90,12 @@ class FlightStack(Protocol):
         """Return the traffic per link name."""
         ...
 
+    def strangers(self) -> Sequence[str]:
+        """Return who has commanded the vehicle in this episode without being companion or ground
+        station, a line each; none where nobody looks into the MAVLink of external firmware.
+        """
+        ...
+
     def close(self) -> None:
         """Release everything."""
         ...
@@ -104,6 +112,7 @@ class BuiltinFlightStack:
         self.send = server.send
         self.log_to = server.log_to
         self.counters = server.counters
+        self.strangers = server.strangers
         self.close = server.close
 
     def boot(self, setup: EpisodeSetup) -> BuiltinAutopilot:
@@ -251,7 +260,8 @@ class Firmware:
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
         if self.simulation is not None:
-            save_arrays(path, self.simulation.arrays())
+            strangers = np.array(self.flight_stack.strangers(), np.str_)
+            save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
             self._close_tlog()
 
     def _close_tlog(self) -> None:

@@ -107,6 +107,10 @@ class ExternalFlightStack:
         self.log_to: Callable[[TlogWriter | None], None] = observer.log_to
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
 
+    def strangers(self) -> tuple[str, ...]:
+        """Return nobody: the firmware has links of its own, into which only it looks."""
+        return ()
+
     def boot(self, setup: EpisodeSetup) -> ExternalFlightController:
         """Start the firmware of an episode, or wait for it; see `Launcher.launch`."""
         del setup  # Each start is a power-up: it knows nothing of the last flight.

@@ -9,6 +9,7 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
+from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, params, peers
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
@@ -53,6 +54,8 @@ class MavlinkServer:
         self._now_us = 0
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        self._senders = Senders()
+        self.strangers = self._senders.strangers
         # The same functions on every link: what two links send in one tick is built once.
         self._builders: dict[str, Builder] = {
             **BUILDERS,
@@ -76,6 +79,7 @@ class MavlinkServer:
                 for _ in range(_DISCARD_CALLS):
                     session.link.ignored += len(session.link.receive())
         self._port = port
+        self._senders.forget()
         self._vibration = VibrationMeter()
         for session in self._sessions:
             session.context = Context(
@@ -172,7 +176,10 @@ class MavlinkServer:
         if session.context is None:
             return False
         session.context.now_us = self._now_us
-        return handle(message, session.context)
+        effective = handle(message, session.context)
+        if effective:
+            self._senders.note(message)
+        return effective
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""

@@ -8,7 +8,7 @@ import pytest
 
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.paired import NO_ESTIMATE, Agreement, Change, PairedComparison
+from airl_mav.flight.paired import Agreement, Change, PairedComparison
 from airl_mav.flight.requirements import (
     MEASURES,
     Requirement,
@@ -16,7 +16,7 @@ from airl_mav.flight.requirements import (
     parse_requirement,
 )
 from airl_mav.flight.sequential import Decision
-from airl_mav.flight.statistics import Aggregate, Estimate, wilson
+from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate, Estimate, wilson
 
 QUALITY = Aggregate(
     success_rate=wilson(87, 100),
