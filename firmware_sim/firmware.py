@@ -91,8 +91,10 @@ class FlightStack(Protocol):
         ...
 
     def strangers(self) -> Sequence[str]:
-        """Return who has commanded the vehicle in this episode without being companion or ground
-        station, a line each; none where nobody looks into the MAVLink of external firmware.
+        """Return a line for each stranger that has commanded the vehicle in this episode.
+
+        That is who is neither a companion nor a ground station by its heartbeat. Nobody where the
+        firmware is external: only it looks into its MAVLink.
         """
         ...
 

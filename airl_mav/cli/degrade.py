@@ -9,6 +9,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.gate import Gate
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.degrade import LATENCIES, declare_degradation
@@ -23,7 +24,7 @@ from airl_mav.scenario.model import (
 )
 
 
-class DegradeOptions(Flights, Lateness, Decisions, Aircraft):
+class DegradeOptions(Gate, Flights, Lateness, Decisions, Aircraft):
     """Fly policies at growing latencies on the same seeds: what every step costs, as curves.
 
     The same --out goes on with what was interrupted.
@@ -62,5 +63,5 @@ def run(options: DegradeOptions, console: Console | None = None) -> int:
     """Fly the latencies and show what they cost; exit status and errors as of `fly_and_show`."""
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     experiment = declare_degradation(scenario, options.latencies, options.policies)
-    code, _ = fly_and_show(experiment, options.out, console or Console())
+    code, _ = fly_and_show(experiment, options.out, console or Console(), options)
     return code

@@ -9,6 +9,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, RENAMED, scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.core.progress import RichProgress
@@ -17,11 +18,12 @@ from airl_mav.experiments.experiment import known_seeds
 from airl_mav.experiments.fly import fly_scenario
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.record import run_sha256
-from airl_mav.report.run_report import show_report
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.run_report import show_report, verdict_of
 from airl_mav.scenario.model import Aircraft, Decisions, Flights, Lateness, LevelName
 
 
-class EvaluateOptions(Flights, Lateness, Decisions, Aircraft):
+class EvaluateOptions(Gate, Flights, Lateness, Decisions, Aircraft):
     """Fly policies through seeded episodes: success, time, distance and energy with intervals.
 
     Several policies or arenas give a table of policies x arenas. The same --out goes on with what
@@ -63,7 +65,8 @@ RENAMED_OPTIONS = RENAMED
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """Evaluate.
 
-    Exit status: 0 all episodes flown, 1 processes or workers were lost, 130 Ctrl-C.
+    Exit status: 0 all episodes flown, 1 processes or workers were lost, 3 to 5 as of the verdict,
+    130 Ctrl-C.
     """
     console = console or Console()
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
@@ -72,22 +75,29 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
         check_plain(cells)
     if len(cells) > 1:
         experiment = matrix(scenario, options.policies, options.arena)
-        code, flown = fly_and_show(experiment, options.out, console)
+        code, flown = fly_and_show(experiment, options.out, console, options)
         for run in flown.cells if options.on_card else ():
             if run.complete:
                 write_on_card(run.cell, run.episodes)
         return code
     (cell,) = cells
+    requirements = requirements_of(options, reference=False)
     with RichProgress(console) as progress:
         for warning in known_seeds(cells):
             progress.note(warning, "yellow")
         run_ = fly_scenario(cell.scenario, options.out, progress)
     if options.on_card and run_.ended == "complete":
         write_on_card(cell, run_.episodes)
+    code = EXIT_CODES[run_.ended]
     if run_.episodes:
-        show_report(run_.path, console)
+        loaded = load(run_.path)
+        verdict = verdict_of(loaded, requirements)
+        show_report(loaded, verdict, console)
+        if run_.ended == "complete":
+            leave(options, verdict, "airl evaluate")
+            code = verdict.exit_code
     else:
         console.print(f"no episode was finished; {run_.path}", soft_wrap=True)
     if run_.ended == "complete" and (sha256 := run_sha256(run_.episodes)) is not None:
         console.print(f"sha256 of the flights  {sha256}", soft_wrap=True, highlight=False)
-    return EXIT_CODES[run_.ended]
+    return code

@@ -8,6 +8,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.gate import Gate
 from airl_mav.cli.options import scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.gap import (
@@ -27,7 +28,7 @@ from airl_mav.scenario.model import (
 )
 
 
-class GapOptions(Flights, Lateness, Decisions, Aircraft):
+class GapOptions(Gate, Flights, Lateness, Decisions, Aircraft):
     """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
 
     The policy on a workstation and on the onboard computer; a policy that was trained as late as
@@ -97,5 +98,5 @@ def run(options: GapOptions, console: Console | None = None) -> int:
         reference_workload=options.reference_workload,
         arenas=options.arena,
     )
-    code, _ = fly_and_show(experiment, options.out, console or Console())
+    code, _ = fly_and_show(experiment, options.out, console or Console(), options)
     return code

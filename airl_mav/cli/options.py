@@ -39,6 +39,9 @@ Options = TypeVar("Options", bound=BaseModel)
 POSITIONAL = "positional"
 """Marks a field whose values come without an option's name."""
 
+REPEATED = "repeated"
+"""Marks a field whose option may be given several times, a value each."""
+
 PREFIXED = ("wind",)
 """Tables whose options carry the table's name; those of the others are unique by themselves."""
 
@@ -173,6 +176,8 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
                 tyro.conf.Positional,
                 tyro.conf.arg(help=_help(field), metavar=_metavar(name, kind)),
             ]
+        if REPEATED in field.metadata:
+            marks.append(tyro.conf.UseAppendAction)
         default = dataclasses.field(default=_default(field, held.get(name)))
         fields.append((name, Annotated[(kind, *marks)], default))
     made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)

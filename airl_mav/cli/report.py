@@ -12,11 +12,11 @@ from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
-from airl_mav.rehearsal.run_folder import RUN_FILE
+from airl_mav.rehearsal.run_folder import RUN_FILE, load
 from airl_mav.report.comparison.model import comparison_file, kind_of
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
-from airl_mav.report.run_report import show_report
+from airl_mav.report.run_report import show_report, verdict_of
 
 
 class ReportOptions(ProfileModel):
@@ -65,7 +65,8 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         if value:
             raise FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
-        show_report(first, console)
+        loaded = load(first)
+        show_report(loaded, verdict_of(loaded), console)
     else:
         show_comparison(*rebuild_comparison(first), first, console)
     return 0

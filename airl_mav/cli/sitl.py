@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import RENAMED, run_command, scenario_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
@@ -17,8 +20,11 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.external.programs import how_to_start
 
+if TYPE_CHECKING:
+    from airl_mav.flight.requirements import Requirement
 
-class SitlOptions(Scenario):
+
+class SitlOptions(Gate, Scenario):
     """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
 
     A first word that ends in .toml is a scenario file, whose values the options override; a run
@@ -28,7 +34,7 @@ class SitlOptions(Scenario):
         airl-sitl --vehicle quad
         airl-sitl --computer ras-pi-4 --workload template-5x32 --episodes 10
         airl-sitl --level lockstep --policy dynamic-obstacles --arena crowded
-        airl-sitl rehearsal.toml --latency 150ms
+        airl-sitl rehearsal.toml --latency 150ms --require "success >= 90 %"
     """
 
     out: Path | None = Field(
@@ -45,27 +51,37 @@ RENAMED_OPTIONS = {**RENAMED, "--lockstep": ("--level", "lockstep")}
 def run(options: SitlOptions, console: Console | None = None) -> int:
     """Fly what is left of the episodes and write the report.
 
-    Exit status: 0 all episodes flown, 1 an episode was lost too often, 130 Ctrl-C.
+    Exit status: 0 all episodes flown, 1 an episode was lost too often, 3 to 5 as of the verdict,
+    130 Ctrl-C.
     """
     console = console or Console()
+    requirements = requirements_of(options, reference=False)
     scenario = resolve(scenario_of(options))
     with RichProgress(console) as progress:
         flown = fly_live(
             scenario, options.out, progress, announce=partial(_announce, scenario, console)
         )
-    conclude(flown, console)
-    return EXIT_CODES[flown.ended]
+    judged = conclude(flown, options, requirements, console)
+    return EXIT_CODES[flown.ended] or judged
 
 
-def conclude(flown: FlownRun, console: Console) -> None:
-    """Print the tables and write the report of what was flown."""
+def conclude(
+    flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], console: Console
+) -> int:
+    """Print the tables and write the report of what was flown; return the verdict's exit status."""
     if not flown.episodes:
         _say(console, f"no episode was finished; logs in {flown.path}")
-        return
+        return 0
     # Imported here: the figures take seconds to load, which no flight has to wait for.
-    from airl_mav.report.run_report import show_report
+    from airl_mav.rehearsal.run_folder import load
+    from airl_mav.report.run_report import show_report, verdict_of
 
-    show_report(flown.path, console)
+    run = load(flown.path)
+    verdict = verdict_of(run, requirements)
+    show_report(run, verdict, console)
+    if flown.ended == "complete":
+        leave(gate, verdict, "airl-sitl")
+    return verdict.exit_code
 
 
 def _announce(scenario: ResolvedScenario, console: Console) -> None:

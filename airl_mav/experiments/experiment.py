@@ -20,6 +20,7 @@ from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
+from airl_mav.flight.requirements import Requirement
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
@@ -84,8 +85,13 @@ class ExperimentRun:
         """The run of each cell, by its name."""
         return {flown.cell.name: Run(flown.path) for flown in self.cells}
 
-    def compare(self) -> tuple[Comparison, dict[str, LoadedRun], Path]:
+    def compare(
+        self, requirements: Sequence[Requirement] | None = None
+    ) -> tuple[Comparison, dict[str, LoadedRun], Path]:
         """Work the comparison out and write its files.
+
+        Args:
+            requirements: What is asked of the runs; None: what was last asked of this folder.
 
         Returns:
             The comparison, its runs by name, and the path of its page.
@@ -99,7 +105,8 @@ class ExperimentRun:
             for flown in self.cells
         ]
         comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
-        return comparison, loaded, write_comparison(comparison, loaded, self.path)
+        page = write_comparison(comparison, loaded, self.path, requirements)
+        return comparison, loaded, page
 
 
 @dataclass(frozen=True)

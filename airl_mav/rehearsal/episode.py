@@ -1,9 +1,9 @@
-"""One episode of a rehearsal: what is planned, what is known of it, how it is saved."""
+"""One episode of a rehearsal: what is planned, what is known of it, what is kept of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.validity import host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode, RunFolder
+from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, LINK_LOST
@@ -66,21 +67,16 @@ class Episode:
         return 0 if self.state is None else self.state.slipped_us - self.loaded.slipped_us
 
 
-def save_episode(
-    episode: Episode,
-    scenario: ResolvedScenario,
-    folder: RunFolder,
-    record_path: Path,
-    decisions_path: Path,
-) -> EpisodeRecord:
-    """Join what both processes left of an episode and save it in the run folder.
+def join_episode(
+    episode: Episode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
+) -> FlownEpisode:
+    """Join what both processes left of an episode.
 
     Args:
         episode: The episode, judged.
         scenario: What was flown.
-        folder: The run.
-        record_path: The firmware's arrays; removed afterwards.
-        decisions_path: The companion's decision log; may be missing; removed afterwards.
+        record_path: The firmware's arrays.
+        decisions_path: The companion's decision log; may be missing.
     """
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
@@ -91,10 +87,17 @@ def save_episode(
             _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
         )
     record = _record(episode, scenario, trajectory, arrays["tick/slips_us"])
-    folder.save_episodes([FlownEpisode(record, trajectory, latency)])
-    record_path.unlink()
-    decisions_path.unlink(missing_ok=True)
-    return record
+    figures = host_figures(
+        flight_us=record.ended_us - record.started_us,
+        slipped_us=record.slipped_us,
+        wall_s=record.wall_s,
+        speed=scenario.speed,
+        lateness_us=latency[TICK_LATENESS],
+        decisions=latency,
+        frame_period_us=scenario.vehicle.camera.period_us,
+    )
+    faults = host_faults(figures, arrays["commands/strangers"].tolist())
+    return FlownEpisode(replace(record, invalid=faults), trajectory, latency)
 
 
 def _record(

@@ -1,12 +1,14 @@
 """A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
 
 An episode is saved when it has been flown whole. One that lost a process on the way is flown again
-by two new ones, from its seed: nothing of the lost one enters the records but a note.
+by two new ones, from its seed, and so is one that the host disturbed: nothing of them enters the
+records but a note. What is still invalid after the last attempt is saved as such.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
@@ -25,10 +27,10 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
-from airl_mav.rehearsal.episode import Episode, save_episode
+from airl_mav.rehearsal.episode import Episode, join_episode
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, ProcessPair
 from airl_mav.rehearsal.progress import Observer
-from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, RunFolder
+from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.external.programs import load_timeout_s
@@ -89,13 +91,14 @@ class Rehearsal:
                 self._fly_surely(index, seed)
 
     def _fly_surely(self, index: int, seed: int) -> None:
-        """Fly an episode; when it is lost, again with two new processes."""
+        """Fly an episode and save it; when it is lost or invalid, fly it again."""
         flight = f"flight {index:03d}, seed {seed}"
         notes: list[str] = []
         while True:
             try:
-                self._fly(index, seed, notes)
+                flown = self._fly(index, seed, notes)
             except LostError as error:
+                # The next attempt is made by two new processes.
                 self._dismiss()
                 notes.append(f"flown again: {error.what}")
                 if len(notes) == MAX_ATTEMPTS:
@@ -103,8 +106,15 @@ class Rehearsal:
                         f"{flight}: lost {MAX_ATTEMPTS} times; at last {error}"
                     ) from None
                 self._observer.lost(f"{flight} begins again: {error}")
-            else:
-                return
+                continue
+            faults = "; ".join(flown.record.invalid)
+            if not faults or len(notes) + 1 == MAX_ATTEMPTS:
+                break
+            notes.append(f"flown again: invalid: {faults}")
+            self._observer.lost(f"{flight} is invalid and begins again: {faults}")
+        self._folder.save_episodes([flown])
+        self._clear(index)
+        self._observer.finished(flown.record)
 
     def _present(self) -> ProcessPair:
         """Return the two processes; started when there are none."""
@@ -124,13 +134,20 @@ class Rehearsal:
 
     # --- one episode
 
-    def _fly(self, index: int, seed: int, notes: Sequence[str]) -> None:
-        """Fly an episode and save it. Raises LostError when it is none."""
-        pair, scenario, folder = self._present(), self._scenario, self._folder
-        record_path = folder.path / f".episode-{index:03d}.npz"
-        decisions_path = folder.path / f".decisions-{index:03d}.npz"
-        for path in (record_path, decisions_path):
+    def _left_by(self, index: int) -> tuple[Path, Path]:
+        """Return where firmware and companion leave what they know of an episode."""
+        folder = self._folder.path
+        return folder / f".episode-{index:03d}.npz", folder / f".decisions-{index:03d}.npz"
+
+    def _clear(self, index: int) -> None:
+        for path in self._left_by(index):
             path.unlink(missing_ok=True)
+
+    def _fly(self, index: int, seed: int, notes: Sequence[str]) -> FlownEpisode:
+        """Fly an episode. Raises LostError when it is none."""
+        pair, scenario, folder = self._present(), self._scenario, self._folder
+        record_path, decisions_path = self._left_by(index)
+        self._clear(index)
         pair.send(
             FIRMWARE,
             LoadEpisode(
@@ -169,9 +186,7 @@ class Rehearsal:
             raise LostError(f"firmware and companion lost each other ({reason})")
         pair.send(FIRMWARE, FinishEpisode())
         pair.wait_for(Saved, self._look)
-        self._observer.finished(
-            save_episode(episode, scenario, folder, record_path, decisions_path)
-        )
+        return join_episode(episode, scenario, record_path, decisions_path)
 
     def _follow(self, pair: ProcessPair, episode: Episode, event: Event) -> bool:
         """Take one event of a flight; True when it is over."""

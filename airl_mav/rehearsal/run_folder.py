@@ -28,6 +28,7 @@ from airl_mav.core.files import (
     read_groups,
     read_lines,
     read_typed,
+    replace_file,
     write_json,
 )
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
@@ -182,6 +183,16 @@ class RunFolder:
         """Return the path of an episode's raw MAVLink log."""
         return self.path / f"flight-{index:03d}.tlog"
 
+    def forget(self, indices: Collection[int]) -> None:
+        """Take the lines of episodes back; arrays without a line are no episode's."""
+        path = self.path / EPISODES_FILE
+        kept = [
+            line
+            for line in path.read_bytes().splitlines(keepends=True)
+            if json.loads(line)["index"] not in indices
+        ]
+        replace_file(path, b"".join(kept))
+
     def sweep(self) -> None:
         """Remove what processes left behind for an episode that was never finished.
 
@@ -231,7 +242,8 @@ def open_folder(
 ) -> tuple[RunFolder, tuple[EpisodeRecord, ...]]:
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
 
-    A run with the first ones of the seeds is the same run, and is added to.
+    A run with the first ones of the seeds is the same run, and is added to. Invalid episodes, which
+    the host disturbed, are taken out of it: they are not there.
 
     Args:
         out: The folder; None makes a new one.
@@ -266,7 +278,9 @@ def open_folder(
     if grows or not (out / SCENARIO_FILE).exists():
         # The file is missing where the process was killed as it wrote the folder's first files.
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
-    return folder, run.episodes
+    if disturbed := {episode.index for episode in run.episodes if episode.invalid}:
+        folder.forget(disturbed)
+    return folder, tuple(episode for episode in run.episodes if not episode.invalid)
 
 
 def another_config(

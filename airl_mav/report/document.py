@@ -216,8 +216,17 @@ def markdown(document: Document) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
+def print_verdict(lines: Sequence[str], console: Console) -> None:
+    """Print what came out, before all else."""
+    for line in lines:
+        console.print(Text(line, style="bold"))
+
+
 def print_document(document: Document, console: Console, page: Path) -> None:
-    """Print facts, tables and answers, and where the page lies."""
+    """Print answers, facts and tables, and where the page lies."""
+    if document.answers:
+        print_verdict(((document.lead,) if document.lead else ()) + document.answers, console)
+        console.print()
     print_facts(document.facts, console)
     shown = [section for section in document.sections if section.in_terminal]
     several = sum(section.level == 2 for section in shown) > 1
@@ -237,11 +246,5 @@ def print_document(document: Document, console: Console, page: Path) -> None:
             console.print()
             for sentence in section.sentences:
                 console.print(Text(sentence))
-    if document.answers:
-        console.print()
-        if document.lead:
-            console.print(Text(document.lead, style="bold"))
-        for answer in document.answers:
-            console.print(Text(answer, style="" if document.lead else "bold"))
     console.print()
     console.print(Text.assemble((f"{document.name}  ", "dim"), str(page)), soft_wrap=True)

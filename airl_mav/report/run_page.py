@@ -53,6 +53,7 @@ from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import Picture, montage
 from airl_mav.report.timeline import OUTLIER_NOTE, slowest_table, timeline_figure, timeline_of
+from airl_mav.report.verdict import OverallVerdict
 
 MAX_PICTURED = 12
 """Flights with pictures: the worst."""
@@ -78,6 +79,7 @@ def build_page(
     out: Path | None = None,
     *,
     vehicle: VehicleProfile | None = None,
+    verdict: OverallVerdict | None = None,
 ) -> Path:
     """Write `report.html` and the PNG files, each one whole or not at all.
 
@@ -86,6 +88,7 @@ def build_page(
         arenas: The arena of each episode, by episode index; a flight without one is drawn without.
         out: Folder to write into; None is the run's own.
         vehicle: What flew; without it the energy has fewer parts, and the causes say less.
+        verdict: Heads the page.
 
     Returns:
         The path of the page.
@@ -124,6 +127,8 @@ def build_page(
                 for outcome, count in summary.quality.outcomes.items()
                 if count
             ],
+            verdict=() if verdict is None else verdict.lines,
+            status="" if verdict is None else verdict.status,
             headlines=_headlines(run, summary),
             origin=run.info.setup.injection.origin,
             setup=setup_rows(run),

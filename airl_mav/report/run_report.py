@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
+from airl_mav.flight.requirements import Requirement
+from airl_mav.flight.statistics import aggregate
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import arenas_of, vehicle_of
+from airl_mav.report.document import print_verdict
 from airl_mav.report.forensics.worst import EXAMINED, ranked
 from airl_mav.report.run_page import build_page, pictured
 from airl_mav.report.run_summary import summarize_run
@@ -20,17 +24,32 @@ from airl_mav.report.run_tables import (
     setup_rows,
 )
 from airl_mav.report.table import count_outcomes, print_facts, print_table
+from airl_mav.report.verdict import OverallVerdict, judge_run, requirements_of, save_verdict
 
 MAX_LISTED = 25
 """Flights with a line of their own in the terminal."""
 
 
-def write_report(run: LoadedRun | Path, out: Path | None = None) -> Path:
-    """Write a run's `report.html` and the PNG files, each whole or not at all. Nothing is printed.
+def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
+    """Return the verdict of a run. `requirements` that are None are those of its `verdict.json`.
+
+    Raises:
+        FieldError: A requirement asks for a gap: a single run has no reference.
+    """
+    if requirements is None:
+        requirements = requirements_of(run.path)
+    return judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
+
+
+def write_report(
+    run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
+) -> Path:
+    """Write a run's `report.html`, `verdict.json` and the PNG files. Nothing is printed.
 
     Args:
         run: The run, or its folder.
         out: Folder to write into; None: the run's own.
+        verdict: Heads the page; None: as of `verdict_of`.
 
     Returns:
         The path of the page.
@@ -43,17 +62,28 @@ def write_report(run: LoadedRun | Path, out: Path | None = None) -> Path:
         run = load(run)
     vehicle = vehicle_of(run.info)
     arenas = arenas_of([*ranked(run)[:EXAMINED], *pictured(run)], vehicle)
-    return build_page(run, arenas, out, vehicle=vehicle)
+    verdict = verdict or verdict_of(run)
+    page = build_page(run, arenas, out, vehicle=vehicle, verdict=verdict)
+    save_verdict(verdict, page.parent)
+    return page
 
 
-def print_report(run: LoadedRun, console: Console, page: Path | None = None) -> None:
-    """Print what was flown, the tables, and where the page lies.
+def print_report(
+    run: LoadedRun,
+    console: Console,
+    page: Path | None = None,
+    verdict: OverallVerdict | None = None,
+) -> None:
+    """Print the verdict, what was flown, the tables, and where the page lies.
 
     Args:
         run: The run.
         console: Where to.
         page: Path of the HTML page, if there is one.
+        verdict: None: as of `verdict_of`.
     """
+    print_verdict((verdict or verdict_of(run)).lines, console)
+    console.print()
     summary = summarize_run(run)
     flights = count_outcomes([episode.outcome for episode in run.episodes])
     print_facts([*setup_rows(run), ("flights", flights)], console)
@@ -68,15 +98,11 @@ def print_report(run: LoadedRun, console: Console, page: Path | None = None) -> 
         console.print(Text.assemble(("report  ", "dim"), str(page)), soft_wrap=True)
 
 
-def show_report(path: Path, console: Console) -> LoadedRun:
-    """Write the report of a run folder, where a flight was finished, and print it.
-
-    Returns:
-        The run.
+def show_report(run: LoadedRun, verdict: OverallVerdict, console: Console) -> None:
+    """Write the report of a run, where a flight was finished, and print it.
 
     Raises:
         UsageError: See `write_report`.
     """
-    run = load(path)
-    print_report(run, console, write_report(run) if run.episodes else None)
-    return run
+    page = write_report(run, verdict=verdict) if run.episodes else None
+    print_report(run, console, page, verdict)

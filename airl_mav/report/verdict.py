@@ -54,8 +54,8 @@ BADGE_COLOURS: dict[Status, str] = {
 class OverallVerdict:
     """What a run, or a comparison, has come to."""
 
-    sentence: str
-    """What flew, on what, and what came of it, with intervals."""
+    sentences: tuple[str, ...]
+    """What flew, on what, and what came of it, with intervals: one for a run."""
     short: str
     """The same in few words, for a badge."""
     invalid: tuple[str, ...] = ()
@@ -85,9 +85,19 @@ class OverallVerdict:
         """All that is to be said, the most important first."""
         return (
             *(f"INVALID: {line}" for line in self.invalid),
-            self.sentence,
+            *self.sentences,
             *(finding.sentence() for finding in self.findings),
         )
+
+
+def join_verdicts(parts: Sequence[OverallVerdict], short: str) -> OverallVerdict:
+    """Return the verdict of several runs, each of which has to meet what is required."""
+    return OverallVerdict(
+        sentences=tuple(sentence for part in parts for sentence in part.sentences),
+        short=short if len(parts) != 1 else parts[0].short,
+        invalid=tuple(line for part in parts for line in part.invalid),
+        findings=tuple(finding for part in parts for finding in part.findings),
+    )
 
 
 def judge_run(
@@ -127,14 +137,19 @@ def judge_run(
         sentence += _gap_words(against, reference)
     share = "no flight" if rate.value is None else f"{100.0 * rate.value:.1f} %"
     return OverallVerdict(
-        sentence=f"{sentence}.",
+        sentences=(f"{sentence}.",),
         short=f"{share} on {computer}",
-        invalid=tuple(
-            f"flight {episode.index:03d}, seed {episode.seed}: {'; '.join(episode.invalid)}"
-            for episode in episodes
-            if episode.invalid
-        ),
+        invalid=invalid_flights(episodes),
         findings=tuple(find(requirement, quality, against) for requirement in requirements),
+    )
+
+
+def invalid_flights(episodes: Sequence[EpisodeRecord]) -> tuple[str, ...]:
+    """Return a line for each flight that is no test of its policy."""
+    return tuple(
+        f"flight {episode.index:03d}, seed {episode.seed}: {'; '.join(episode.invalid)}"
+        for episode in episodes
+        if episode.invalid
     )
 
 
@@ -182,6 +197,13 @@ def load_verdict(folder: Path) -> OverallVerdict:
     return read_typed(folder / VERDICT_FILE, _VERDICT, SCHEMA, "verdict")
 
 
+def requirements_of(folder: Path) -> tuple[Requirement, ...]:
+    """Return what was last required of a folder; nothing where it has no verdict."""
+    if not (folder / VERDICT_FILE).exists():
+        return ()
+    return tuple(dict.fromkeys(f.requirement for f in load_verdict(folder).findings))
+
+
 def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
     """Write a verdict as JUnit XML: the validity of the flights and each requirement is a case.
 
@@ -210,7 +232,7 @@ def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
         if finding.decision is not Decision.MET:
             kind = "not met" if finding.decision is Decision.NOT_MET else "undecided"
             failure = ET.SubElement(case, "failure", {"type": kind, "message": finding.sentence()})
-            failure.text = verdict.sentence
+            failure.text = "\n".join(verdict.sentences)
     ET.SubElement(part, "system-out").text = "\n".join(verdict.lines)
     ET.indent(root)
     replace_file(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))

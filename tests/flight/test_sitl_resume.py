@@ -98,8 +98,9 @@ def fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fly:
     """`airl-sitl --out run`: exit status and output, without a report."""
     shown: list[Path] = []
 
-    def conclude(flown: FlownRun, _: Console) -> None:
+    def conclude(flown: FlownRun, *_: object) -> int:
         shown.append(flown.path)
+        return 0
 
     monkeypatch.setattr(sitl, "conclude", conclude)
     arena = str(write_arena(tmp_path))

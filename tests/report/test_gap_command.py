@@ -619,7 +619,8 @@ def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
     gap, runs = build_comparison(whole[0], "gap", {}, entries)
     assert gap.contrasts == ()
     assert gap.answers == ()
-    document = show.comparison_to_document(gap, runs, whole[0])
+    verdict = show.judge_comparison(gap, runs)
+    document = show.comparison_to_document(gap, runs, whole[0], verdict)
     assert "Hardware gap" not in [section.title for section in document.sections]
 
 

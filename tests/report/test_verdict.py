@@ -98,10 +98,10 @@ def test_a_reference_is_told_of() -> None:
         compare_pairs(reference, target),
         "workstation",
     )
-    assert "13.0 points fewer [" in verdict.sentence
+    assert "13.0 points fewer [" in verdict.sentences[0]
     # 2 s of a mean of 8.03 s.
-    assert "24.9 % more flight time [" in verdict.sentence
-    assert verdict.sentence.endswith("than on workstation.")
+    assert "24.9 % more flight time [" in verdict.sentences[0]
+    assert verdict.sentences[0].endswith("than on workstation.")
     assert verdict.status == "not met"
 
 
@@ -129,7 +129,7 @@ def test_invalid_flights_come_first_and_leave_no_verdict() -> None:
 
 def test_an_abort_is_a_failure_and_drops_out_of_nothing() -> None:
     flown = [flight(0), flight(1, Outcome.ABORTED)]
-    assert "1 of 2 goals reached" in judge_run(SETUP, aggregate(flown), flown).sentence
+    assert "1 of 2 goals reached" in judge_run(SETUP, aggregate(flown), flown).sentences[0]
 
 
 def test_it_is_read_back_as_it_was_written(tmp_path: Path) -> None:

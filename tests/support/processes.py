@@ -27,7 +27,7 @@ OFFBOARD, HOLD, POSITION, LAND = 6 << 16, 3 << 24 | 4 << 16, 3 << 16, 6 << 24 | 
 
 NO_REPORT = """
 from airl_mav.cli import sitl
-sitl.conclude = lambda *_: None
+sitl.conclude = lambda *_: 0
 """
 """Before airl-sitl: pictures take longer than flights."""
 

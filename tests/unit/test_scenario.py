@@ -315,7 +315,7 @@ def test_contradictions_in_a_file_name_it(
 def test_the_scenario_of_a_run_flies_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sitl, "conclude", lambda *_: None)
+    monkeypatch.setattr(sitl, "conclude", lambda *_: 0)
     out, console = [tmp_path / "first", tmp_path / "again"], Console(quiet=True)
     words = ("--level", "lockstep", "--episodes", "1", "--seed", "11", "--time-limit-s", "5")
     assert sitl.run(options(*words, "--latency", "80ms", "--out", str(out[0])), console) == 0

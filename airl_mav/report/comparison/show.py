@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError
+from airl_mav.flight.requirements import Requirement, find
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, runs
 from airl_mav.report.comparison.build import load_runs
 from airl_mav.report.comparison.model import (
     KIND_NAMES,
+    ComparedRun,
     Comparison,
     Kind,
     RunEntry,
@@ -22,6 +25,15 @@ from airl_mav.report.comparison.model import (
     save_comparison,
 )
 from airl_mav.report.document import Document, print_document, write_document
+from airl_mav.report.verdict import (
+    OverallVerdict,
+    invalid_flights,
+    join_verdicts,
+    judge_run,
+    load_verdict,
+    requirements_of,
+    save_verdict,
+)
 
 Runs = Mapping[str, LoadedRun]
 
@@ -72,13 +84,72 @@ def rebuild_comparison(folder: Path) -> tuple[Comparison, dict[str, LoadedRun]]:
     return build_comparison(folder, kind, *load_entries(folder, kind))
 
 
-def write_comparison(comparison: Comparison, loaded: Runs, folder: Path) -> Path:
-    """Write `<kind>.json`, `.html`, `.md` and the PNG files, each whole or not at all.
+def judge_comparison(
+    comparison: Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
+) -> OverallVerdict:
+    """Return the verdict of a comparison.
+
+    A hardware gap is judged by the run that would be deployed: the mitigated policy on the onboard
+    computer, where one flies, or else the policy itself. Every run of another comparison has to
+    meet what is required of it; a gap is required of those that have a reference.
+
+    Args:
+        comparison: The comparison.
+        loaded: Its runs by name.
+        requirements: What is asked.
+
+    Raises:
+        FieldError: A gap is required, and no run has a reference.
+    """
+    against = {c.entry.target: c for c in reversed(comparison.contrasts)}
+    if not against and (gaps := [each for each in requirements if each.gap]):
+        find(gaps[0], comparison.runs[0].quality, None)
+    parts = []
+    for run in _judged(comparison):
+        contrast = against.get(run.name)
+        reference = "" if contrast is None else comparison.run(contrast.entry.reference).label
+        parts.append(
+            judge_run(
+                run.setup,
+                run.quality,
+                loaded[run.name].episodes,
+                [each for each in requirements if contrast is not None or not each.gap],
+                None if contrast is None else contrast.paired,
+                reference,
+            )
+        )
+    verdict = join_verdicts(parts, f"{len(parts)} runs")
+    # Whoever is compared must be valid as well.
+    invalid = {name: invalid_flights(run.episodes) for name, run in loaded.items()}
+    lines = tuple(f"{name}, {line}" for name, flights in invalid.items() for line in flights)
+    return replace(verdict, sentences=comparison.answers or verdict.sentences, invalid=lines)
+
+
+def _judged(comparison: Comparison) -> tuple[ComparedRun, ...]:
+    """Return the runs that have to meet what is required."""
+    if comparison.kind != "gap":
+        return comparison.runs
+    judged = []
+    for group in comparison.groups:
+        roles = {run.entry.role: run for run in comparison.group(group)}
+        deployed = roles.get("mitigated") or roles.get("target")
+        judged += [] if deployed is None else [deployed]
+    return tuple(judged)
+
+
+def write_comparison(
+    comparison: Comparison,
+    loaded: Runs,
+    folder: Path,
+    requirements: Sequence[Requirement] | None = None,
+) -> Path:
+    """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and the PNG files, each whole or not.
 
     Args:
         comparison: What is written.
         loaded: Its runs by name, for the pictures.
         folder: Where to.
+        requirements: What is asked; None: what was last asked of this folder.
 
     Returns:
         The path of the page.
@@ -86,21 +157,30 @@ def write_comparison(comparison: Comparison, loaded: Runs, folder: Path) -> Path
     Raises:
         UsageError: The folder cannot be written.
     """
+    if requirements is None:
+        requirements = requirements_of(folder)
+    verdict = judge_comparison(comparison, loaded, requirements)
     try:
         save_comparison(comparison, folder)
+        save_verdict(verdict, folder)
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}") from None
-    return write_document(comparison_to_document(comparison, loaded, folder), folder)
+    return write_document(comparison_to_document(comparison, loaded, folder, verdict), folder)
 
 
-def comparison_to_document(comparison: Comparison, loaded: Runs, folder: Path) -> Document:
+def comparison_to_document(
+    comparison: Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
+) -> Document:
     """Return everything that a comparison says; nothing is drawn yet."""
-    return _DOCUMENT[comparison.kind](comparison, loaded, folder)
+    document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
+    return replace(document, answers=verdict.lines)
 
 
 def print_comparison(comparison: Comparison, loaded: Runs, console: Console, page: Path) -> None:
-    """Print the tables, the verdict and where the page lies."""
-    print_document(comparison_to_document(comparison, loaded, page.parent), console, page)
+    """Print the verdict, the tables and where the page lies."""
+    folder = page.parent
+    document = comparison_to_document(comparison, loaded, folder, load_verdict(folder))
+    print_document(document, console, page)
 
 
 def show_comparison(comparison: Comparison, loaded: Runs, folder: Path, console: Console) -> Path:
