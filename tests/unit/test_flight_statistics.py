@@ -54,7 +54,9 @@ def episode() -> EpisodeRecord:
     return record
 
 
-def test_only_successes_enter_the_means_and_aborts_enter_nothing(episode: EpisodeRecord) -> None:
+def test_only_successes_enter_the_means_and_invalid_flights_nothing(
+    episode: EpisodeRecord,
+) -> None:
     assert episode.quality is not None
     longer = replace(episode.quality, flight_time_s=episode.quality.flight_time_s + 2.0)
     absurd = replace(episode.quality, flight_time_s=1e6, distance_m=1e6, energy_j=1e9)
@@ -65,15 +67,17 @@ def test_only_successes_enter_the_means_and_aborts_enter_nothing(episode: Episod
             replace(episode, outcome=Outcome.COLLISION, quality=absurd),
             replace(episode, outcome=Outcome.ABORTED, quality=absurd),
             replace(episode, outcome=Outcome.TIMEOUT, quality=None),
+            replace(episode, quality=absurd, invalid=("the host was busy",)),
         ]
     )
-    assert figures.success_rate.value == 0.5
-    assert figures.success_rate.n == 4
+    # The aborted one did not reach its goal.
+    assert figures.success_rate.value == 0.4
+    assert figures.success_rate.n == 5
     assert figures.flight_time_s.value == pytest.approx(episode.quality.flight_time_s + 1.0)
     assert figures.flight_time_s.n == 2
     assert figures.distance_m.value == pytest.approx(episode.quality.distance_m)
     assert figures.outcomes == {
-        Outcome.SUCCESS: 2,
+        Outcome.SUCCESS: 3,
         Outcome.COLLISION: 1,
         Outcome.TIMEOUT: 1,
         Outcome.BATTERY: 0,

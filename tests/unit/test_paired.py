@@ -224,6 +224,8 @@ def flown(flight: EpisodeRecord, seed: int, outcome: Outcome, scale: float = 1.0
         seed=seed,
         index=seed % 3,
         outcome=outcome,
+        # Aborted by the host.
+        invalid=("the host was busy",) if outcome is NOT else (),
         quality=replace(
             quality,
             flight_time_s=10.0 * scale * seed,
@@ -247,11 +249,11 @@ def runs(flight: EpisodeRecord) -> tuple[list[EpisodeRecord], list[EpisodeRecord
     )
 
 
-def test_pairs_are_of_one_seed_and_none_of_them_aborted(
+def test_pairs_are_of_one_seed_and_none_of_them_is_invalid(
     runs: tuple[list[EpisodeRecord], list[EpisodeRecord]],
 ) -> None:
     paired = pair_by_seed(*runs)
-    # 1 and 9 fly once, 7 and 8 were aborted once.
+    # 1 and 9 fly once, 7 and 8 were invalid once.
     assert [(a.seed, b.seed) for a, b in paired] == [(s, s) for s in (2, 3, 4, 5, 6)]
     assert all(a in runs[0] and b in runs[1] for a, b in paired)
 
@@ -291,5 +293,5 @@ def test_a_seed_that_is_there_twice(flight: EpisodeRecord) -> None:
     once = [flown(flight, 1, GOOD)]
     with pytest.raises(ValueError, match="twice"):
         pair_by_seed(once, once * 2)
-    # Aborted, and flown again.
+    # Invalid, and flown again.
     assert len(pair_by_seed(once, [flown(flight, 1, NOT), *once])) == 1
