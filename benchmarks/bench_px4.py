@@ -19,7 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from firmware_sim.external.process import FirmwareProcess, StartCommand
 from rich.console import Console
 from rich.table import Table
 
@@ -28,6 +27,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.commander import Flight
+from firmware_sim.external.process import FirmwareProcess, StartCommand
 from firmware_sim.external.px4.program import (
     API_LOCAL_PORT,
     API_PORT,

@@ -20,6 +20,7 @@ SUBCOMMANDS: dict[str, str] = {
     "firmware": "flight controller, vehicle and camera alone, for any client (airl-firmware)",
     "companion": "what runs on the drone's onboard computer (airl-companion)",
     "evaluate": "fly policies through seeded episodes, with intervals",
+    "verdict": "does a policy hold on an onboard computer: as few flights as that takes",
     "gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
     " mitigation",
     "degrade": "the same policy at growing latencies: where it breaks down",

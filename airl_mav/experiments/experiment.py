@@ -24,7 +24,7 @@ from airl_mav.flight.requirements import Requirement
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
-from airl_mav.report.comparison.show import build_comparison, write_comparison
+from airl_mav.report.comparison.show import build_comparison, judge_comparison, write_comparison
 from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
@@ -105,7 +105,10 @@ class ExperimentRun:
             for flown in self.cells
         ]
         comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
-        page = write_comparison(comparison, loaded, self.path, requirements)
+        verdict = (
+            None if requirements is None else judge_comparison(comparison, loaded, requirements)
+        )
+        page = write_comparison(comparison, loaded, self.path, verdict)
         return comparison, loaded, page
 
 

@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import WallClock
+from airl_mav.core.errors import EXIT_INVALID
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
@@ -68,11 +69,11 @@ def sitl(
     *options: str,
     goal_m: float = FAR_M,
     speed: float = SPEED,
-    report: bool = False,
+    program: Sequence[str] = SITL_WITHOUT_REPORT,
 ) -> Iterator[Running]:
     """airl-sitl in an empty corridor."""
     words = [
-        *(SITL if report else SITL_WITHOUT_REPORT),
+        *program,
         *("--arena", str(write_arena(folder, goal_m))),
         *("--speed", str(speed), "--altitude-m", "1.5", "--out", str(folder / "run")),
         *ports.options(),
@@ -221,7 +222,7 @@ def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> 
 
 def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0, report=True) as run:
+    with sitl(tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0, program=SITL) as run:
         run.find_children("firmware", "companion")
         run.wait_for_text("flight 000")
         ground.wait_flying(0.5, run)
@@ -241,7 +242,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
 
 def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
     """SIGTERM, from a batch system or a service manager, is Ctrl-C."""
-    with sitl(tmp_path, choose_ports(ground.port), report=True) as run:
+    with sitl(tmp_path, choose_ports(ground.port), program=SITL) as run:
         run.find_children("firmware", "companion")
         ground.wait_flying(1.0, run)
         run.process.terminate()
@@ -254,7 +255,7 @@ def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
 
 
 def test_interrupted_start(tmp_path: Path) -> None:
-    with sitl(tmp_path, choose_ports(), report=True) as run:
+    with sitl(tmp_path, choose_ports(), program=SITL) as run:
         run.find_children("firmware", "companion")
         run.interrupt()
         assert run.wait(40.0) == 130
@@ -556,13 +557,28 @@ def test_link_lost_one_way_does_not_fly_on(tmp_path: Path, ground: Ground) -> No
     assert HOLD in modes(read_tlog(tmp_path / "flight.tlog"))[-2:]
 
 
+ONCE = (
+    "-c",
+    """
+from airl_mav.cli import entry
+from airl_mav.rehearsal import rehearsal
+rehearsal.MAX_ATTEMPTS = 1
+entry.sitl()
+""",
+)
+"""airl-sitl that flies nothing again."""
+
+
 def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground: Ground) -> None:
-    """1 s: long for the simulation, short for MAVSDK's heartbeats and the watchdog."""
+    """1 s: long for the simulation, short for MAVSDK's heartbeats and the watchdog.
+
+    The flight is invalid, and the run says so first; it would be flown again, were it not for ONCE.
+    """
     stopped_s = 1.0
     ports = choose_ports(ground.port)
     # The watchdog counts simulated time: a busy host would let it be first now and then.
     patient = ("--decision-timeout-s", "6", "--leave-after-s", "6")
-    with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0, report=True) as run:
+    with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0, program=ONCE) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
         before = ground.track[-1][0]
@@ -575,11 +591,14 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
         # a moment behind when it was stopped.)
         assert frozen - before < 0.5e3 * SPEED * stopped_s
         assert next(t for t, _, _ in list(ground.track) if t > frozen) - frozen < 1000
-        assert run.wait() == 0
+        assert run.wait() == EXIT_INVALID
         run.no_child_left()
     done = load(tmp_path / "run")
     (episode,) = done.episodes
     assert episode.outcome == "success"
+    assert any("of its simulated time was given up" in fault for fault in episode.invalid)
+    said = [line for line in run.text().splitlines() if line.startswith("INVALID")]
+    assert said[0].startswith("INVALID: flight 000")
     slipped_s = episode.slipped_us / 1e6
     assert slipped_s > 0.9 * SPEED * stopped_s
     assert "simulated time given up" in run.text()

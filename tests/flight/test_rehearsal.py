@@ -39,10 +39,11 @@ from airl_mav.rehearsal.channel import (
 from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
-from airl_mav.rehearsal.run_folder import RunFolder, load
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load, open_folder
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
+from tests.support.run_demo import demo_arena, demo_episode
 
 GOAL = (10.0, 0.0)
 WATTS = 2.0
@@ -89,6 +90,7 @@ class Stage:
         self.on_abort: Callable[[Abort], list[Item]] = lambda _: [ended("stopped")]
         self.saves = True
         self.slips: list[tuple[int, int]] = []
+        self.strangers: list[str] = []
         """When the firmware has given up time, and how much [µs]."""
         self.starts: list[list[Item]] = []
         """What is said at each start; both are ready when nothing is left of it."""
@@ -149,7 +151,7 @@ class FakeChild:
         elif isinstance(request, Abort):
             stage.put(*stage.on_abort(request))
         elif isinstance(request, FinishEpisode) and stage.saves:
-            write_record(self.record, stage.slips)
+            write_record(self.record, stage.slips, stage.strangers)
             stage.put((FIRMWARE, Saved(path=str(self.record))))
 
     def stop(self) -> None:
@@ -163,7 +165,7 @@ class FakeChild:
         return "last words"
 
 
-def write_record(path: Path, slips: Sequence[tuple[int, int]]) -> None:
+def write_record(path: Path, slips: Sequence[tuple[int, int]], strangers: Sequence[str]) -> None:
     """What the firmware leaves of an episode: 100 s at 10 m/s to the north."""
     n = 5001
     time_us = START_US + np.arange(n, dtype=np.int64) * 20_000
@@ -181,6 +183,7 @@ def write_record(path: Path, slips: Sequence[tuple[int, int]]) -> None:
         "estimate/time_us": np.zeros(0, np.int64),
         "tick/lateness_us": np.zeros(3, np.int64),
         "tick/slips_us": np.array(slips, np.int64).reshape(-1, 2),
+        "commands/strangers": np.array(strangers, np.str_),
     }
     np.savez(path, **arrays)
 
@@ -338,7 +341,11 @@ def test_success_then_crash_is_called_off_without_landing(play: Callable[..., Ru
     assert run.stage.requests(COMPANION, Abort) == [Abort(land=False)]
 
 
-def test_time_given_up_is_taken_off_the_companions_clock(play: Callable[..., Run]) -> None:
+def test_time_given_up_is_taken_off_the_companions_clock(
+    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So much of it that the flight is invalid: no other attempt is made.
+    monkeypatch.setattr(rehearsal, "MAX_ATTEMPTS", 1)
     run = play(
         [
             at(0.5),
@@ -356,6 +363,72 @@ def test_time_given_up_is_taken_off_the_companions_clock(play: Callable[..., Run
     (record,) = run.fly()
     assert record.navigation_us == START_US + 2_000_000
     assert record.slipped_us == 3_500_000
+    assert record.invalid == ("28.0 % of its simulated time was given up (limit 1 %)",)
+
+
+DISTURBED: Script = [
+    at(0.5),
+    phase("navigating", 2.0),
+    at(2.5, 1.0),
+    at(9.0, 8.0, slipped_us=1_000_000),
+    ended(),
+]
+FAULT = "10.0 % of its simulated time was given up (limit 1 %)"
+
+
+def test_a_flight_that_the_host_disturbed_is_flown_again(play: Callable[..., Run]) -> None:
+    run = play(DISTURBED, FLOWN)
+    (record,) = run.fly(episodes=1)
+    assert (record.outcome, record.invalid, record.slipped_us) == ("success", (), 0)
+    assert record.notes == (f"flown again: invalid: {FAULT}",)
+    assert run.observer.losses == [f"flight 000, seed 5 is invalid and begins again: {FAULT}"]
+    # The same processes: nothing is wrong with them.
+    assert len(run.stage.all) == 2
+    assert [r.seed for r in run.stage.requests(COMPANION, Fly)] == [5, 5]
+    assert len(load(run.folder.path).episodes) == 1
+    assert not list(run.folder.path.glob(".*"))
+
+
+def test_what_stays_invalid_is_kept_with_its_reasons(play: Callable[..., Run]) -> None:
+    run = play(DISTURBED, DISTURBED, DISTURBED, FLOWN)
+    first, second = run.fly(episodes=2)
+    assert first.invalid == (FAULT,)
+    assert first.notes == (f"flown again: invalid: {FAULT}",) * 2
+    assert second.invalid == ()
+    held = load(run.folder.path).episodes
+    assert [episode.invalid for episode in held] == [(FAULT,), ()]
+
+
+def test_a_stranger_who_commands_makes_a_flight_invalid(
+    play: Callable[..., Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rehearsal, "MAX_ATTEMPTS", 1)
+    run = play(FLOWN)
+    run.stage.strangers = ["system 7 component 1, COMMAND_LONG (3 times)"]
+    (record,) = run.fly()
+    assert record.invalid == (
+        "commanded by a stranger: system 7 component 1, COMMAND_LONG (3 times)",
+    )
+
+
+def test_a_run_with_invalid_flights_goes_on_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are taken out of the run before they are flown again: a kill leaves no half of one."""
+    scenario = asked(episodes=2)
+    out = tmp_path / "run"
+    folder, done = open_folder(out, "test", scenario)
+    assert done == ()
+    record, path, latency = demo_episode(0, demo_arena(1))
+    disturbed = replace(record, invalid=(FAULT,))
+    folder.save_episodes([FlownEpisode(disturbed, path, latency)])
+    folder.save_episodes([FlownEpisode(replace(record, index=1), path, latency)])
+    _, done = open_folder(out, "test", scenario)
+    assert [episode.index for episode in done] == [1]
+    assert [episode.index for episode in load(out).episodes] == [1]
+    folder.save_episodes([FlownEpisode(record, path, latency)])
+    _, done = open_folder(out, "test", scenario)
+    assert [episode.index for episode in done] == [0, 1]
 
 
 def test_decisions_are_joined_with_the_setpoints(play: Callable[..., Run]) -> None:

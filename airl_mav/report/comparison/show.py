@@ -141,7 +141,7 @@ def write_comparison(
     comparison: Comparison,
     loaded: Runs,
     folder: Path,
-    requirements: Sequence[Requirement] | None = None,
+    verdict: OverallVerdict | None = None,
 ) -> Path:
     """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and the PNG files, each whole or not.
 
@@ -149,7 +149,7 @@ def write_comparison(
         comparison: What is written.
         loaded: Its runs by name, for the pictures.
         folder: Where to.
-        requirements: What is asked; None: what was last asked of this folder.
+        verdict: Heads the page; None: it is judged by what was last asked of this folder.
 
     Returns:
         The path of the page.
@@ -157,9 +157,7 @@ def write_comparison(
     Raises:
         UsageError: The folder cannot be written.
     """
-    if requirements is None:
-        requirements = requirements_of(folder)
-    verdict = judge_comparison(comparison, loaded, requirements)
+    verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
     try:
         save_comparison(comparison, folder)
         save_verdict(verdict, folder)
