@@ -96,8 +96,10 @@ def join_episode(
         decisions=latency,
         frame_period_us=scenario.vehicle.camera.period_us,
     )
-    faults = host_faults(figures, arrays["commands/strangers"].tolist())
-    return FlownEpisode(replace(record, invalid=faults), trajectory, latency)
+    if scenario.scenario.validity:
+        strangers = arrays["commands/strangers"].tolist()
+        record = replace(record, invalid=host_faults(figures, strangers))
+    return FlownEpisode(record, trajectory, latency)
 
 
 def _record(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -26,6 +27,8 @@ from airl_mav.report.run_tables import (
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import OverallVerdict, judge_run, requirements_of, save_verdict
 
+UNCHECKED = "Whether the host kept pace was not checked: every flight counts."
+
 MAX_LISTED = 25
 """Flights with a line of their own in the terminal."""
 
@@ -38,7 +41,10 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     """
     if requirements is None:
         requirements = requirements_of(run.path)
-    return judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
+    verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
+    if run.info.config.get("validity", True):
+        return verdict
+    return replace(verdict, sentences=(*verdict.sentences, UNCHECKED))
 
 
 def write_report(

@@ -344,6 +344,11 @@ class Flights(Workers):
         le=1000,
         default=None,
     )
+    validity: bool = Field(
+        default=True,
+        description="level sitl: fly again what the host disturbed, as it is no test of the policy;"
+        " without, every flight counts, and the report says so",
+    )
     slots: Annotated[int, FREE] = quantity(
         "level gym: flights at a time; decides the pace, not the results",
         "1",

@@ -17,12 +17,12 @@ ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
 
 
 class Senders:
-    """Notes commands of systems whose heartbeat calls them neither companion nor ground station."""
+    """Notes who commands, and whose heartbeat calls them a companion or a ground station."""
 
     def __init__(self) -> None:
         self._announced: set[tuple[int, int]] = set()
         """System and component ids; they hold for as long as the links are open."""
-        self._strangers: Counter[tuple[int, int, str]] = Counter()
+        self._commands: Counter[tuple[int, int, str]] = Counter()
 
     def note(self, message: WireMessage) -> None:
         """Take a message that was for this vehicle and did something."""
@@ -30,16 +30,20 @@ class Senders:
         if kind == "HEARTBEAT":
             if message.type in ANNOUNCED:
                 self._announced.add(sender(message))
-        elif kind in COMMANDS and sender(message) not in self._announced:
-            self._strangers[(*sender(message), kind)] += 1
+        elif kind in COMMANDS:
+            self._commands[(*sender(message), kind)] += 1
 
     def strangers(self) -> tuple[str, ...]:
-        """Return a line for each stranger and kind of message since the last `forget`."""
+        """Return a line for each stranger and kind of message since the last `forget`.
+
+        A stranger has not announced itself by now: MAVSDK commands before its first heartbeat.
+        """
         return tuple(
             f"system {system} component {component}, {kind} ({count} times)"
-            for (system, component, kind), count in sorted(self._strangers.items())
+            for (system, component, kind), count in sorted(self._commands.items())
+            if (system, component) not in self._announced
         )
 
     def forget(self) -> None:
         """Begin anew: another episode."""
-        self._strangers.clear()
+        self._commands.clear()

@@ -102,7 +102,7 @@ class Campaign:
         return [
             *("--policy", "greedy", "--arena", str(self.arena), "--altitude-m", "1.5"),
             *("--episodes", str(self.episodes), "--seed", str(SEED), "--speed", str(SPEED)),
-            *("--out", str(self.out), *ports.options()),
+            *("--out", str(self.out), "--no-validity", *ports.options()),
         ]
 
     @contextmanager

@@ -178,6 +178,7 @@ def test_level_sitl_flies_in_a_ladder(tmp_path: Path) -> None:
         "episodes": 2,
         "sitl_episodes": 1,
         "speed": 4.0,
+        "no_validity": True,
         "levels": ("gym", "sitl"),
         "out": tmp_path / "ladder",
     }
