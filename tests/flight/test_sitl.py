@@ -78,7 +78,7 @@ def test_folder_is_complete_and_nothing_else(done: Done) -> None:
     flights = [f"flight-{i:03d}" for i in range(EPISODES)]
     assert names == {
         *("run.json", "scenario.toml", "episodes.jsonl", "latency.npz", "trajectories.npz"),
-        *("report.html", "firmware.log", "companion.log"),
+        *("report.html", "verdict.json", "firmware.log", "companion.log"),
         *("latency.png", "latency-timeline.png", "energy.png"),
         *(f"{flight}{end}" for flight in flights for end in (".tlog", "-map.png", "-time.png")),
     }
