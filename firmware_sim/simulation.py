@@ -34,7 +34,9 @@ class EpisodeSetup:
     seed: int
     """Of sensors and wind."""
     aircraft: Aircraft = field(default_factory=Aircraft)
-    """What was asked of it: wind, estimator."""
+    """What was asked of it: wind, estimator, charge of the battery."""
+    computer_w: float = 0.0
+    """What the onboard computer draws from the pack [W]."""
 
 
 def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
@@ -81,6 +83,7 @@ class Simulation:
             start_us=start_us,
             aircraft=setup.aircraft,
             rate_hz=self.autopilot.rate_hz,
+            computer_w=setup.computer_w,
         )
         self.autopilot.use_truth(self.plant.truth)
         self._camera: DepthCamera | None = None

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_setpoint
 from airl_mav.control.gains import Gains
 from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
-from airl_mav.control.mixer import Motors, mix
+from airl_mav.control.mixer import PITCH, ROLL, Motors, mix
 from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import velocity_control, velocity_setpoint
 from airl_mav.core.constants import GRAVITY_M_S2
@@ -87,6 +87,23 @@ def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
     """Set the vertical integral to what it settles at in a hover at a collective `command` 0..1."""
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     memory[_VEL_INT + 2] = (gains.hover_thrust - command) * GRAVITY_M_S2 / gains.hover_thrust
+
+
+def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
+    """Set the integrals of roll and pitch to what they settle at with these commands in a hover.
+
+    Args:
+        memory: Of one vehicle (MEMORY_SIZE,), updated.
+        motors: Commands 0..1; equal ones need no torque.
+        gains: Hold the limits of the integrals, and how torque becomes commands.
+    """
+    axes = (
+        (ROLL, gains.mix_roll, gains.rate_int_max_roll),
+        (PITCH, gains.mix_pitch, gains.rate_int_max_pitch),
+    )
+    for i, (direction, mixed, most) in enumerate(axes):
+        torque = math.fsum(d * m for d, m in zip(direction, motors, strict=True)) / (4.0 * mixed)
+        memory[_RATE_INT + i] = min(max(torque, -most), most)
 
 
 @kernel

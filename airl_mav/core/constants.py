@@ -29,6 +29,10 @@ EARTH_RADIUS_M: Final = 6_371_000.0
 ZERO_CELSIUS_K: Final = 273.15
 """0 °C [K]."""
 
+C_PER_MAH: Final = 3.6
+"""Coulombs in a milliampere-hour."""
+
+G_PER_KG: Final = 1_000
 MS_PER_S: Final = 1_000
 US_PER_MS: Final = 1_000
 US_PER_S: Final = 1_000_000

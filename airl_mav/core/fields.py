@@ -165,34 +165,65 @@ def field_error(error: ValidationError, model: type[BaseModel] | None = None) ->
         listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
         hint = f"; did you mean {near[0]!r}?" if near else f"; fields: {listed}" if names else ""
         return FieldError(field, problem=f"unknown field{hint}{tail}")
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        context = first.get("ctx", {})
+        name = f"{field}.{str(context['discriminator']).strip(chr(39))}"
+        if "expected_tags" not in context:
+            return FieldError(name, problem=f"missing{tail}")
+        return FieldError(name, context["tag"], f"{context['expected_tags']}{tail}")
     if kind == "value_error":
         return FieldError(field, problem=first["msg"].removeprefix("Value error, ") + tail)
     accepted = " or ".join(dict.fromkeys(_accepted(finding, model) for finding in same))
     return FieldError(field, first["input"], accepted + tail)
 
 
+_BRANCH = ""
+"""In place of the part of a location that names no field."""
+
+
 def _steps(
     model: type[BaseModel] | None, path: tuple[int | str, ...]
 ) -> Iterator[tuple[int | str, FieldInfo | None, type[BaseModel] | None]]:
-    """Yield each part of a location, the field that it names, and the model that this leads to."""
+    """Yield each part of a location, the field that it names, and the model that this leads to.
+
+    The part that says which model of a union it is (`_choices`) is yielded as `_BRANCH`.
+    """
     here = model
+    choices: dict[str, type[BaseModel]] = {}
     for part in path:
+        if str(part) in choices:
+            here, choices = choices[str(part)], {}
+            yield _BRANCH, None, here
+            continue
         field = here.model_fields.get(str(part)) if here else None
         if field is not None:
-            here = _model_in(field.annotation)
+            here, choices = _model_in(field.annotation), _choices(field)
         yield part, field, here
 
 
 def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
-    """Return the dotted path of a location, without the branches of unions of plain values."""
+    """Return the dotted path of a location, without the branches of unions."""
     parts, plain = [], False
     for part, field, here in _steps(model, path):
         if plain and not isinstance(part, int):
             continue
-        parts.append(str(part))
+        if part != _BRANCH:
+            parts.append(str(part))
         if field is not None:
             plain = here is None and get_origin(field.annotation) in (Union, UnionType)
     return ".".join(parts)
+
+
+def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
+    """Return the models that a field chooses from by the value of one of theirs; mostly none."""
+    name = field.discriminator
+    if not isinstance(name, str):
+        return {}
+    return {
+        str(value): model
+        for model in get_args(field.annotation)
+        for value in get_args(model.model_fields[name].annotation)
+    }
 
 
 def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:

@@ -13,14 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.cascade import new_memory, trim_for_hover
+from airl_mav.control.cascade import new_memory, trim_against_torque, trim_for_hover
 from airl_mav.control.gains import Gains
-from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.envs.contact import NOTHING
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.power import Coefficients, coefficients
-from airl_mav.vehicle.rotor import command_for
+from airl_mav.vehicle.power import PowerModel
+from airl_mav.vehicle.rotor import N_ROTORS, command_for, hover_speeds
 
 
 class Verdict(IntEnum):
@@ -51,12 +50,13 @@ class Fleet(NamedTuple):
     quaternion: NDArray[np.float64]  # (n, 4) body -> NED
     omega: NDArray[np.float64]  # (n, 3) FRD [rad/s]
     rotor: NDArray[np.float64]  # (n, 4) speeds, fraction of full
+    felt: NDArray[np.float64]  # (n, 3) acceleration NED as the power model takes it [m/s²]
     memory: NDArray[np.float64]  # (n, MEMORY_SIZE) of the cascade
     setpoint: NDArray[np.float64]  # (n, 4) forward, right, down [m/s], yaw rate [rad/s]
     velocity_ned: NDArray[np.float64]  # (n, 3) the setpoint as PX4 holds it
     repeat_us: NDArray[np.int64]  # (n,) time of the next repeat
     distance: NDArray[np.float64]  # (n,) flown since the start [m]
-    energy: NDArray[np.float64]  # (n,) drawn since the start [J]
+    energy: NDArray[np.float64]  # (n,) of the vehicle since the start, its computer apart [J]
     battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
     touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, WALL, or NOTHING
     verdict: NDArray[np.int64]  # (n,) Verdict
@@ -79,30 +79,34 @@ class Vehicle(NamedTuple):
     airframe: Airframe
     """Nominal: what `hover` gives a vehicle that is not given its own."""
     gains: Gains
-    power: Coefficients
+    power: PowerModel
     pack: Pack
-    payload_g: float
+    computer_w: float
+    """Of the onboard computer, from the pack [W]."""
     radius: float
     """Of the collision disc [m]."""
     half_height: float
 
 
-def vehicle_of(profile: VehicleProfile, parameter: Callable[[str], float]) -> Vehicle:
+def vehicle_of(
+    profile: VehicleProfile, parameter: Callable[[str], float], computer_w: float = 0.0
+) -> Vehicle:
     """Return the constants of a vehicle profile.
 
     Args:
         profile: The vehicle.
         parameter: Lookup of PX4-named parameters: the flight controller's, so that both fly alike.
+        computer_w: What the onboard computer draws from the pack [W].
     """
     b = profile.battery
     return Vehicle(
         airframe=Airframe.from_profile(profile),
         gains=Gains.from_parameters(parameter),
-        power=coefficients(profile.power),
+        power=PowerModel.from_profile(profile),
         pack=Pack(
             b.cells * b.cell_empty_v, b.cells * b.cell_full_v, b.resistance_ohm, b.capacity_mah
         ),
-        payload_g=profile.power.payload_g,
+        computer_w=computer_w,
         radius=0.5 * profile.body.width_m,
         half_height=0.5 * profile.body.height_m,
     )
@@ -119,6 +123,7 @@ def new_fleet(n: int) -> Fleet:
         quaternion=quaternion,
         omega=np.zeros((n, 3)),
         rotor=np.zeros((n, 4)),
+        felt=np.zeros((n, 3)),
         memory=new_memory(n),
         setpoint=np.zeros((n, 4)),
         velocity_ned=np.zeros((n, 3)),
@@ -133,11 +138,14 @@ def new_fleet(n: int) -> Fleet:
 
 
 def hover(
-    fleet: Fleet, i: int, altitude_m: float, vehicle: Vehicle, airframe: Airframe | None = None
+    fleet: Fleet,
+    i: int,
+    altitude_m: float,
+    vehicle: Vehicle,
+    airframe: Airframe | None = None,
+    battery: float = 1.0,
 ) -> None:
     """Put vehicle i into a hover above the origin, heading north, all counters at zero.
-
-    Its battery is full.
 
     Args:
         fleet: Where vehicle i is.
@@ -145,6 +153,7 @@ def hover(
         altitude_m: Height above the floor [m].
         vehicle: What all vehicles share.
         airframe: This vehicle's own; None = the nominal one.
+        battery: State of charge at the start, 1 full to 0 empty.
     """
     for array in fleet:
         array[i] = 0
@@ -152,9 +161,11 @@ def hover(
     fleet.airframe[i] = a
     fleet.position[i, 2] = -altitude_m
     fleet.quaternion[i, 0] = 1.0
-    share = a.mass * GRAVITY_M_S2 / (4.0 * a.thrust_max)
-    fleet.rotor[i] = math.sqrt(share)
-    trim_for_hover(fleet.memory[i], command_for(share, a.thrust_curve), vehicle.gains)
-    fleet.battery[i] = 1.0
+    speeds = hover_speeds(a)
+    fleet.rotor[i] = speeds
+    c0, c1, c2, c3 = (command_for(speed * speed, a.thrust_curve) for speed in speeds)
+    trim_for_hover(fleet.memory[i], math.fsum((c0, c1, c2, c3)) / N_ROTORS, vehicle.gains)
+    trim_against_torque(fleet.memory[i], (c0, c1, c2, c3), vehicle.gains)
+    fleet.battery[i] = battery
     fleet.touched[i] = NOTHING
     fleet.verdict[i] = Verdict.FLYING

@@ -21,7 +21,7 @@ from airl_mav.envs.contact import NOTHING, clearance, touches
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.power import power_w
+from airl_mav.vehicle.power import felt, felt_share, flight_power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
 from airl_mav.vehicle.rotor import lag, settle, wrench
@@ -107,13 +107,14 @@ def _fly(
     )
     w = (fleet.omega[i, 0], fleet.omega[i, 1], fleet.omega[i, 2])
     s0, s1, s2, s3 = fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3]
+    acceleration = (fleet.felt[i, 0], fleet.felt[i, 1], fleet.felt[i, 2])
     time_us = fleet.time_us[i]
     memory = fleet.memory[i]
     distance, energy = fleet.distance[i], fleet.energy[i]
     obstacles_move = TICK_S * arenas.tour_speed[i]
     room = 0.0
     calm = (0.0, 0.0, 0.0)
-    left = lag(airframe, TICK_S)
+    left, kept = lag(airframe, TICK_S), felt_share(vehicle.power, TICK_S)
     for _ in range(ticks):
         if time_us >= fleet.repeat_us[i]:
             c, s = heading_of(q)
@@ -135,17 +136,16 @@ def _fly(
         force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
         k = airframe.drag_angular
         damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
+        # Of the state in which this tick's forces act, as the drag; and so it is worked out beside
+        # the step, not after it, which is a tenth of the twin's speed.
+        power = flight_power_w(thrust, v, q, calm, acceleration, airframe, vehicle.power)
         before, moved_from = v, p
         p, v, q, w = step(p, v, q, w, force, damped, airframe, TICK_S)
-        accel = (
-            (v[0] - before[0]) / TICK_S,
-            (v[1] - before[1]) / TICK_S,
-            (v[2] - before[2]) / TICK_S,
-        )
-        power = power_w(v, accel, calm, vehicle.payload_g, vehicle.power)
+        acceleration = felt(acceleration, before, v, kept, TICK_S, vehicle.power)
         energy += TICK_S * power
         rest_v = open_circuit(battery, pack.empty_v, pack.full_v)
-        current = power / terminal_voltage(rest_v, pack.resistance_ohm, power)
+        load = power + vehicle.computer_w
+        current = load / terminal_voltage(rest_v, pack.resistance_ohm, load)
         battery = drain(battery, current, pack.capacity_mah, TICK_S)
         moved = math.sqrt(
             (p[0] - moved_from[0]) ** 2 + (p[1] - moved_from[1]) ** 2 + (p[2] - moved_from[2]) ** 2
@@ -174,6 +174,7 @@ def _fly(
         fleet.position[i, axis] = p[axis]
         fleet.velocity[i, axis] = v[axis]
         fleet.omega[i, axis] = w[axis]
+        fleet.felt[i, axis] = acceleration[axis]
     for axis in range(4):
         fleet.quaternion[i, axis] = q[axis]
     fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3] = s0, s1, s2, s3

@@ -77,6 +77,8 @@ class Navigation(Stateful):
         latency_draw: int = 0,
         arena_seed: int | None = None,
         trace: Trace | None = None,
+        computer_w: float = 0.0,
+        battery_charge: float = 1.0,
     ) -> None:
         """Load the profiles.
 
@@ -89,6 +91,8 @@ class Navigation(Stateful):
             latency_draw: Another number gives other draws of the same latency.
             arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
             trace: Records the flights; None records nothing, and changes nothing.
+            computer_w: What the onboard computer draws from the pack [W].
+            battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
 
         Raises:
             UsageError: A profile cannot be used, or the camera does not serve the layout.
@@ -114,7 +118,8 @@ class Navigation(Stateful):
         self._arena_seed = arena_seed
         self._trace = trace
         parameters = parameter_values(self.vehicle.autopilot_parameters())
-        self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__)
+        self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__, computer_w)
+        self._charge = battery_charge
         rules = spec.episode
         self._rules = Rules(rules.goal_radius_m, round(rules.time_limit_s * US_PER_S))
         self._hold_us = round(rules.hold_s * US_PER_S)
@@ -171,7 +176,8 @@ class Navigation(Stateful):
         airframe = draw_airframe(
             self._vehicle.airframe, randomisation, stream(seed, Stream.AIRFRAME)
         )
-        hover(self._fleet, i, self.spec.episode.altitude_m, self._vehicle, airframe)
+        altitude_m = self.spec.episode.altitude_m
+        hover(self._fleet, i, altitude_m, self._vehicle, airframe, self._charge)
         if self._trace is not None:
             self._trace.begin(i, self._fleet)
         self._decision[i] = 0

@@ -111,6 +111,8 @@ class GymFlier:
                 latency_draw=scenario.scenario.latency_seed,
                 arena_seed=scenario.scenario.arena_seed,
                 trace=trace,
+                computer_w=scenario.computer.onboard_watts,
+                battery_charge=scenario.scenario.battery_charge,
             )
             for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=stop):
                 yield self._episode(navigation, trace, slot, flown, index_of[flown.seed])
@@ -143,7 +145,13 @@ class GymFlier:
             wall_s=None,
             slipped_us=0,
             battery_remaining=float(flights.battery[slot]),
-            quality=measure_quality(trajectory, 0, ended_us, self.scenario.computer.watts),
+            quality=measure_quality(
+                trajectory,
+                0,
+                ended_us,
+                self.scenario.computer.onboard_watts,
+                self.scenario.pack_j,
+            ),
         )
         return FlownEpisode(record, trajectory, trace.latency(slot))
 

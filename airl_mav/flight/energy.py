@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.profiles.vehicle import Power
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.vehicle.airframe import Airframe, airframe_of
+from airl_mav.vehicle.power import PowerModel, level_power_w, power_model_of
 
 
 @dataclass(frozen=True)
@@ -17,12 +22,12 @@ class EnergySplit:
 
     time_s: float
     hover_j: float
-    """Staying up: the power model's constant and its payload term."""
+    """Staying up: a hover at the mass of this flight."""
     motion_j: float
-    """What the speed adds, horizontal and vertical. Below 0 where moving saves power: a rotor in
-    forward flight needs less than one in a hover."""
+    """What steady level flight in calm air at the flight's speed takes more than a hover. Below 0
+    where moving saves power: a rotor in forward flight needs less than one in a hover."""
     manoeuvre_j: float
-    """All the rest: accelerating and braking, the wind, and what keeps the power above 0."""
+    """All the rest: accelerating and braking, climbing and sinking, the wind."""
     computer_j: float
 
     @property
@@ -32,19 +37,19 @@ class EnergySplit:
 
 
 def split_energy(
-    path: Trajectory, start_us: int, end_us: int, power: Power, computer_watts: float
+    path: Trajectory, start_us: int, end_us: int, vehicle: VehicleProfile, computer_watts: float
 ) -> EnergySplit:
-    """Split the energy between two simulated times after the terms of the vehicle's power model.
+    """Split the energy between two simulated times by the vehicle's power model.
 
     The recording holds the whole power, integrated at every tick, and the speed at 50 Hz. So the
-    constant terms are exact, those of the speed are integrated over the samples (trapezoid), and
-    those of the acceleration are what is left: a 50 Hz recording cannot give them by itself.
+    hover is exact, what the horizontal speed adds is integrated over the samples (trapezoid), and
+    the manoeuvres are what is left: a 50 Hz recording cannot give them by itself.
 
     Args:
         path: The flight.
         start_us: Start [µs].
         end_us: End [µs].
-        power: The vehicle's power model.
+        vehicle: The vehicle as loaded.
         computer_watts: Power of the onboard computer [W].
     """
     part = path.between(start_us, end_us)
@@ -53,14 +58,30 @@ def split_energy(
         return EnergySplit(time_s, 0.0, 0.0, 0.0, computer_watts * time_s)
     steps_s = np.diff(part.time_us) / US_PER_S
     airframe_j = float(np.sum(part.power_w[1:] * steps_s))
-    hover_w = power.b9_hover + power.b7_payload * power.payload_g
+    speeds = np.hypot(part.velocity[:, 0], part.velocity[:, 1])
+    level_w = level_powers_w(vehicle, np.append(speeds, 0.0))
+    hover_w = float(level_w[-1])
     hover_j = hover_w * float(steps_s.sum())
-    level = np.hypot(part.velocity[:, 0], part.velocity[:, 1])
-    moving_w = power.b1_vxy * level + power.b4_vz * np.abs(part.velocity[:, 2])
+    moving_w = level_w[:-1] - hover_w
     motion_j = float(np.sum(0.5 * (moving_w[1:] + moving_w[:-1]) * steps_s))
     return EnergySplit(
         time_s, hover_j, motion_j, airframe_j - hover_j - motion_j, computer_watts * time_s
     )
+
+
+def level_powers_w(vehicle: VehicleProfile, speeds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the powers (n,) of steady level flight in calm air at speeds (n,) [m/s]; 0: hover."""
+    airframe = np.array(Airframe.from_profile(vehicle))
+    return _level_powers(speeds, airframe, np.array(PowerModel.from_profile(vehicle)))
+
+
+@kernel
+def _level_powers(speeds: Vector, airframe: Vector, model: Vector) -> NDArray[np.float64]:
+    a, m = airframe_of(airframe), power_model_of(model)
+    powers = np.empty(len(speeds))
+    for i in range(len(speeds)):
+        powers[i] = level_power_w(speeds[i], a, m)
+    return powers
 
 
 def add_up(splits: list[EnergySplit]) -> EnergySplit:

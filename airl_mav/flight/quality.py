@@ -31,10 +31,17 @@ class Quality:
     energy_j: float
     """Electrical energy of the vehicle, without its computer [J]."""
     computer_energy_j: float
-    """Energy of the onboard computer: its watts times the flight time [J]."""
+    """Energy of the onboard computer: its watts times the flight time; 0 on the ground [J]."""
     mean_speed_m_s: float
     max_speed_m_s: float
     takeoff: Leg
+    endurance_s: float | None = None
+    """How long the pack as charged at the start lasts at the mean power of this flight, with its
+    computer [s]; None where no power flowed, and in older records."""
+    range_m: float | None = None
+    """How far that is at the flight's mean speed [m]."""
+    missions_per_charge: float | None = None
+    """How many such flights that is."""
 
     @property
     def total_energy_j(self) -> float:
@@ -54,7 +61,11 @@ def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
 
 
 def measure_quality(
-    trajectory: Trajectory, navigation_us: int, ended_us: int, computer_watts: float
+    trajectory: Trajectory,
+    navigation_us: int,
+    ended_us: int,
+    computer_watts: float,
+    pack_j: float | None = None,
 ) -> Quality:
     """Measure an episode.
 
@@ -62,7 +73,8 @@ def measure_quality(
         trajectory: The whole episode, take-off included.
         navigation_us: Start of navigation, simulated time [µs].
         ended_us: Time of the verdict, simulated [µs].
-        computer_watts: Power of the onboard computer [W].
+        computer_watts: What the computer draws from the pack [W].
+        pack_j: What the pack holds at the start (`Battery.energy_j`) [J]; None: not known.
 
     Raises:
         ValueError: The end comes before the start.
@@ -72,12 +84,18 @@ def measure_quality(
     leg = measure_leg(trajectory, navigation_us, ended_us)
     speed = trajectory.between(navigation_us, ended_us).speed()
     began_us = min(int(trajectory.time_us[0]), navigation_us) if len(trajectory) else navigation_us
+    computer_j = computer_watts * leg.time_s
+    spent_j = leg.energy_j + computer_j
+    missions = None if pack_j is None or spent_j <= 0.0 else pack_j / spent_j
     return Quality(
         flight_time_s=leg.time_s,
         distance_m=leg.distance_m,
         energy_j=leg.energy_j,
-        computer_energy_j=computer_watts * leg.time_s,
+        computer_energy_j=computer_j,
         mean_speed_m_s=leg.distance_m / leg.time_s if leg.time_s else 0.0,
         max_speed_m_s=float(speed.max()) if speed.size else 0.0,
         takeoff=measure_leg(trajectory, began_us, navigation_us),
+        endurance_s=None if missions is None else missions * leg.time_s,
+        range_m=None if missions is None else missions * leg.distance_m,
+        missions_per_charge=missions,
     )

@@ -30,7 +30,7 @@ class Setup:
     policy: Part
     computer: Part
     computer_watts: float
-    """Power of the onboard computer [W]."""
+    """What the computer draws from the aircraft's pack [W]; 0 of one that stays on the ground."""
     injection: Injection
     """The decision latency t2: measured, injected or estimated."""
     speed: float | None
@@ -39,3 +39,5 @@ class Setup:
     """What the vehicle does between commands: `persist`, `hover-after 60 ms`."""
     firmware: str = BUILT_IN
     """What flew: the built-in autopilot, or the name of real firmware."""
+    computer_on_ground: bool = False
+    """The computer is ground equipment: the aircraft carries and feeds none."""

@@ -40,6 +40,12 @@ class Estimate:
 MEANS = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_energy_j")
 """Measures of a flight's quality whose means two runs are compared by."""
 
+PACK_MEASURES = ("endurance_s", "range_m", "missions_per_charge")
+"""Measures that older runs were recorded without."""
+
+AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES)
+"""Measures of a flight's quality that have a mean and a median."""
+
 NO_ESTIMATE = Estimate(None, None, None, 0)
 """Nothing to work a figure out from."""
 
@@ -59,6 +65,10 @@ class Aggregate:
     mean_speed_m_s: Estimate
     outcomes: dict[Outcome, int]
     """Number of episodes by outcome, aborted ones included."""
+    endurance_s: Estimate = NO_ESTIMATE
+    """None of these three in runs that were recorded without."""
+    range_m: Estimate = NO_ESTIMATE
+    missions_per_charge: Estimate = NO_ESTIMATE
 
 
 def wilson(successes: int, n: int) -> Estimate:
@@ -122,13 +132,15 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     return Aggregate(
         success_rate=wilson(sum(e.outcome is Outcome.SUCCESS for e in flown), len(flown)),
         outcomes=outcomes,
-        **{
-            name: bootstrap_mean([getattr(quality, name) for quality in good])
-            for name in (*MEANS, "mean_speed_m_s")
-        },
+        **{name: bootstrap_mean(known(good, name)) for name in AVERAGED},
     )
 
 
 def successful(episodes: Sequence[EpisodeRecord]) -> list[Quality]:
     """Return the quality of the flights that reached the goal."""
     return [e.quality for e in episodes if e.outcome is Outcome.SUCCESS and e.quality is not None]
+
+
+def known(good: Sequence[Quality], name: str) -> list[float]:
+    """Return a measure of the flights that have it."""
+    return [value for quality in good if (value := getattr(quality, name)) is not None]

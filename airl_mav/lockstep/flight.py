@@ -107,7 +107,13 @@ class _Flight:
 
     def fly(self, tlog: Path | None) -> FlownEpisode:
         resolved = self._resolved
-        setup = EpisodeSetup(resolved.vehicle, self._arena, self._seed, resolved.scenario)
+        setup = EpisodeSetup(
+            resolved.vehicle,
+            self._arena,
+            self._seed,
+            resolved.scenario,
+            resolved.computer.onboard_watts,
+        )
         with Stage(
             transport_us=TRANSPORT_US, digest=self._digest, speed=resolved.speed
         ) as self._stage:

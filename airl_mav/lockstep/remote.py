@@ -23,6 +23,7 @@ from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.stand_alone import Listener, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
+from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
@@ -151,7 +152,8 @@ def fly_vehicle_in_lockstep(
     """
     listener = listener or Listener()
     check_vehicle(asked)
-    vehicle, ports = load_vehicle(asked.vehicle), asked.ports
+    vehicle = loaded(load_vehicle(asked.vehicle), None, asked.payload)
+    ports = asked.ports
     with (
         closing(
             UdpEndpoint(

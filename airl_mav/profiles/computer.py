@@ -13,6 +13,7 @@ import numpy as np
 import tomli_w
 from pydantic import Field, model_validator
 
+from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
@@ -112,11 +113,32 @@ class ComputerProfile(ProfileModel):
     description: str = Field(description="one line for people")
     cpu: str = Field(description="processor")
     watts: float = quantity("electrical power while flying", "W", ge=0, le=10_000)
+    mass_g: float = quantity(
+        "mass as flown, with cooling and case; carried in the middle of the rotors",
+        "g",
+        ge=0,
+        le=100_000,
+        default=0.0,
+    )
+    ground_equipment: bool = Field(
+        default=False,
+        description="it stays on the ground: neither its mass nor its watts are the aircraft's",
+    )
     price_usd: float = quantity("price", "USD", ge=0, le=1_000_000)
     source: str = Field(description="where the numbers come from")
     workloads: dict[str, Workload] = Field(
         default_factory=dict, description="what it was timed with, by name"
     )
+
+    @property
+    def onboard_watts(self) -> float:
+        """What the computer draws from the aircraft's pack [W]."""
+        return 0.0 if self.ground_equipment else self.watts
+
+    @property
+    def onboard_mass_kg(self) -> float:
+        """What the computer adds to the aircraft's mass [kg]."""
+        return 0.0 if self.ground_equipment else self.mass_g / G_PER_KG
 
 
 def load_computer(name: str) -> ComputerProfile:

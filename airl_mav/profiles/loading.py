@@ -90,6 +90,8 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if len(above) > MOST_BASES:
         raise UsageError(f"{above[0]}: base: accepted: at most {MOST_BASES} below each other")
     data = read_toml(path)
+    if kind == "vehicles":
+        _name_power_model(data, path)
     base = data.pop("base", None)
     if base is None:
         return data
@@ -119,8 +121,26 @@ def read_toml(path: Path) -> dict[str, Any]:
     return found
 
 
+def _name_power_model(data: dict[str, Any], path: Path) -> None:
+    """Say of a nine-coefficient table `power` that it is one: before 0.3 there was no other.
+
+    Raises:
+        UsageError: It has a payload, which is no part of the power model any more.
+    """
+    power = data.get("power")
+    if not isinstance(power, dict) or "b1_vxy" not in power or "model" in power:
+        return
+    power["model"] = "regression"
+    if power.pop("payload_g", 0.0):
+        raise UsageError(
+            f"{path}: power.payload_g: accepted: body.payload_kg, a part of mass_kg, in its place"
+        )
+
+
 def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return one table put over another, table by table."""
+    """Return one table put over another, table by table; one of another `model` replaces it."""
+    if above.get("model", below.get("model")) != below.get("model"):
+        return above
     merged = dict(below)
     for key, value in above.items():
         under = merged.get(key)

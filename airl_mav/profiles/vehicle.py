@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, Strict, model_validator
 
-from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
@@ -22,7 +22,23 @@ class Body(ProfileModel):
     inertia_zz_kg_m2: float = quantity("inertia about the down axis", "kg m²", gt=1e-6, le=100)
     width_m: float = quantity("width across the propellers, for clearances", "m", gt=0.02, le=10)
     height_m: float = quantity("height of the collision body", "m", gt=0.01, le=5)
+    com_forward_m: float = quantity(
+        "centre of mass ahead of the middle of the rotors", "m", ge=-5, le=5, default=0.0
+    )
+    com_right_m: float = quantity(
+        "centre of mass to the right of the middle of the rotors", "m", ge=-5, le=5, default=0.0
+    )
+    payload_kg: float = quantity(
+        "how much of the take-off mass is carried: what a regression's payload term counts",
+        "kg",
+        ge=0,
+        le=100,
+        default=0.0,
+    )
 
+
+THRUST_MARGIN = 0.3
+"""Share of the weight that the rotors must give beyond it: less leaves nothing to steer with."""
 
 Corner = Literal["front right", "rear left", "front left", "rear right"]
 """Where a motor sits. Front right and rear left turn counter-clockwise seen from above."""
@@ -87,13 +103,48 @@ class Battery(ProfileModel):
     cell_empty_v: float = quantity("open-circuit voltage of an empty cell", "V", gt=2.5, le=4)
     resistance_ohm: float = quantity("internal resistance of the pack", "ohm", ge=0, le=1)
 
+    def energy_j(self, charge: float) -> float:
+        """Return what a pack at a state of charge 0..1 holds [J].
 
-class Power(ProfileModel):
+        Charge times the mean open-circuit voltage on the way to empty. Its own resistance takes a
+        part of it: the current times the resistance over the voltage, 1 to 2 % for a quad in hover.
+        """
+        mean_v = self.cell_empty_v + 0.5 * charge * (self.cell_full_v - self.cell_empty_v)
+        return charge * self.capacity_mah * C_PER_MAH * self.cells * mean_v
+
+
+class Momentum(ProfileModel):
+    """Power by momentum theory, from the rotor's own data; `vehicle.power` has the formula."""
+
+    model: Literal["momentum"] = Field(description="momentum theory")
+    propeller_diameter_m: float = quantity("diameter of a propeller", "m", gt=0.01, le=5)
+    figure_of_merit: float = quantity(
+        "ideal over shaft power in a hover: 0.35 below 60 mm, 0.48 at 5 inch, 0.65 at 10 inch",
+        "1",
+        ge=0.2,
+        le=0.85,
+    )
+    drive_efficiency: float = quantity(
+        "shaft over electrical power: motor and ESC", "1", ge=0.1, le=1
+    )
+    avionics_w: float = quantity(
+        "flight controller, sensors and radio, without the onboard computer", "W", ge=0, le=1000
+    )
+
+
+class Regression(ProfileModel):
     """Nine-coefficient power model of the paper (eq. 1; Tseng et al., arXiv 1703.10049), SI units.
 
     P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m + b8 vxy.w + b9
+
+    It is of the aircraft that it was fitted to: neither mass nor rotors of another change it. The
+    bandwidth of the accelerations that Tseng et al. fitted is not published.
     """
 
+    model: Literal["regression"] = Field(description="nine coefficients")
+    bandwidth_hz: float = quantity(
+        "first-order low-pass of the accelerations; assumed", "Hz", gt=0, le=100, default=1.0
+    )
     b1_vxy: float = quantity("horizontal speed", "W/(m/s)", ge=-1000, le=1000)
     b2_axy: float = quantity("horizontal acceleration", "W/(m/s²)", ge=-1000, le=1000)
     b3_vxy_axy: float = quantity("product of the two", "W/(m²/s³)", ge=-1000, le=1000)
@@ -103,7 +154,6 @@ class Power(ProfileModel):
     b7_payload: float = quantity("payload", "W/g", ge=-100, le=100)
     b8_wind: float = quantity("ground velocity . wind", "W/(m²/s²)", ge=-1000, le=1000)
     b9_hover: float = quantity("hover", "W", ge=0, le=100_000)
-    payload_g: float = quantity("payload m of the seventh term", "g", ge=0, le=100_000, default=0.0)
 
 
 class Camera(ProfileModel):
@@ -239,7 +289,7 @@ class VehicleProfile(ProfileModel):
     rotor: Rotor
     drag: Drag
     battery: Battery
-    power: Power
+    power: Momentum | Regression = Field(discriminator="model", description="power model")
     camera: Camera
     sensors: Sensors
     estimation: Estimation | None = Field(
@@ -254,19 +304,23 @@ class VehicleProfile(ProfileModel):
 
     @model_validator(mode="after")
     def _hovers(self) -> VehicleProfile:
-        needed_n = self.body.mass_kg * GRAVITY_M_S2
-        if self.thrust_n <= needed_n:
-            raise FieldError(
-                "body.mass_kg",
-                self.body.mass_kg,
-                problem=f"cannot hover: needs {needed_n:.2f} newton, has {self.thrust_n:.2f} "
-                f"({len(CORNERS)} x rotor.thrust_max_n {self.rotor.thrust_max_n:g})",
-            )
+        if (problem := self.too_heavy(self.body.mass_kg)) is not None:
+            raise FieldError("body.mass_kg", self.body.mass_kg, problem=problem)
         return self
+
+    def too_heavy(self, mass_kg: float) -> str | None:
+        """Return why the rotors do not carry a mass with a margin to fly with; None: they do."""
+        needed_n = (1.0 + THRUST_MARGIN) * mass_kg * GRAVITY_M_S2
+        if self.thrust_n >= needed_n:
+            return None
+        return (
+            f"cannot hover: needs {needed_n:.2f} newton with {100 * THRUST_MARGIN:g} % margin, has "
+            f"{self.thrust_n:.2f} ({len(CORNERS)} x rotor.thrust_max_n {self.rotor.thrust_max_n:g})"
+        )
 
     @property
     def thrust_n(self) -> float:
-        """Greatest thrust of all rotors [N]: more than the weight."""
+        """Greatest thrust of all rotors [N]: more than the weight, by `THRUST_MARGIN`."""
         return len(CORNERS) * self.rotor.thrust_max_n
 
     def autopilot_parameters(self) -> dict[str, float]:

@@ -148,7 +148,11 @@ def judged_record(
     quality = None
     if navigation_us is not None and verdict.time_us >= navigation_us:
         quality = measure_quality(
-            trajectory, navigation_us, verdict.time_us, scenario.computer.watts
+            trajectory,
+            navigation_us,
+            verdict.time_us,
+            scenario.computer.onboard_watts,
+            scenario.pack_j,
         )
     return EpisodeRecord(
         seed=seed,

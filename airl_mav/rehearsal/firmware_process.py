@@ -146,7 +146,8 @@ class Service:
     def _load(self, request: LoadEpisode) -> None:
         scenario = self._scenario
         arena = scenario.arena_of(request.seed)
-        episode = EpisodeSetup(scenario.vehicle, arena, request.seed, scenario.scenario)
+        computer_w = scenario.computer.onboard_watts
+        episode = EpisodeSetup(scenario.vehicle, arena, request.seed, scenario.scenario, computer_w)
         tlog = Path(request.tlog) if request.tlog else None
         self._crash = CrashDetector()
         loaded = self._firmware.load(episode, tlog, unix_us())

@@ -12,6 +12,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
+from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.external.programs import how_to_start
@@ -51,7 +52,7 @@ def fly_vehicle(
     """
     listener = listener or Listener()
     check_vehicle(asked)
-    vehicle = load_vehicle(asked.vehicle)
+    vehicle = loaded(load_vehicle(asked.vehicle), None, asked.payload)
     firmware = build_firmware(
         asked,
         vehicle,

@@ -15,7 +15,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 
 
 def vehicle_of(info: RunInfo) -> VehicleProfile:
-    """Return the vehicle of a run, with the camera that its environment gave it.
+    """Return the vehicle of a run, with what it carried and the camera of its environment.
 
     Raises:
         UsageError: Its profile cannot be found any more.
@@ -24,7 +24,8 @@ def vehicle_of(info: RunInfo) -> VehicleProfile:
     change = info.config.get("environment", {}).get("camera", {})
     given = {name: value for name, value in change.items() if value is not None}
     camera = vehicle.camera.model_copy(update=given)
-    return vehicle.model_copy(update={"camera": camera})
+    body = vehicle.body.model_copy(update=info.config.get("vehicle_body", {}))
+    return vehicle.model_copy(update={"camera": camera, "body": body})
 
 
 def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:

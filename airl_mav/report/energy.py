@@ -12,7 +12,7 @@ from airl_mav.flight.energy import EnergySplit, add_up, split_energy
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.profiles.vehicle import Power
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_tables import failures_first
@@ -51,15 +51,15 @@ class FlightEnergy:
     record: EpisodeRecord
     quality: Quality
     parts: EnergySplit | None
-    """None where the vehicle's power model or the recording is missing."""
+    """None where the vehicle or the recording is missing."""
 
 
-def flight_energies(run: LoadedRun, power: Power | None) -> list[FlightEnergy]:
+def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[FlightEnergy]:
     """Return the energies of all flights that navigated, in the order flown.
 
     Args:
         run: The run.
-        power: The vehicle's power model; None leaves the airframe's energy whole.
+        vehicle: What flew, as loaded; None leaves the airframe's energy whole.
     """
     watts = run.info.setup.computer_watts
     flights = []
@@ -69,8 +69,8 @@ def flight_energies(run: LoadedRun, power: Power | None) -> list[FlightEnergy]:
         path = run.trajectories.get(e.index)
         parts = (
             None
-            if path is None or power is None or len(path) < 2
-            else split_energy(path, e.navigation_us, e.ended_us, power, watts)
+            if path is None or vehicle is None or len(path) < 2
+            else split_energy(path, e.navigation_us, e.ended_us, vehicle, watts)
         )
         flights.append(FlightEnergy(e, e.quality, parts))
     return flights
@@ -98,9 +98,9 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
         split = add_up(splits)
         lines += [(f"– {title}", getattr(split, name)) for name, title in AIRFRAME.items()]
         notes.append(
-            "The airframe's parts follow the terms of its power model (Krishnan et al. 2021, eq. "
-            "1). Hovering: staying up, with the payload. Speed: what moving adds; below 0 where it "
-            "saves. Manoeuvres: what is left, of accelerating, braking and wind."
+            "The airframe's parts follow its power model. Hovering: staying up, with the payload. "
+            "Speed: what steady level flight at that speed adds; below 0 where it saves. "
+            "Manoeuvres: what is left, of accelerating, braking, climbing and wind."
         )
     lines.append(("computer", computer))
     rows = tuple(

@@ -15,6 +15,8 @@ FEW_FLIGHTS = 10
 MANY_FLIGHTS = 100
 """From here on rates have a decimal."""
 
+S_PER_MIN = 60.0
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -28,8 +30,11 @@ class Measure:
         "computer_energy_j",
         "total_energy_j",
         "mean_speed_m_s",
+        "endurance_s",
+        "range_m",
+        "missions_per_charge",
     ]
-    """Its field in an `Aggregate`; but for the speed, also in a `PairedComparison`."""
+    """Its field in an `Aggregate`; of the first six, also in a `PairedComparison`."""
     title: str
     unit: str
     scale: float
@@ -51,7 +56,7 @@ class Measure:
         """Return a value in the shown unit."""
         if value is None:
             return NONE
-        return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}"
+        return f"{self.scale * value:,.{self.digits}f}{f' {self.unit}' if unit else ''}".rstrip()
 
     def with_interval(self, quality: Aggregate) -> str:
         """Return the measure of a run in the shown unit, its 95 % interval in brackets."""
@@ -65,6 +70,12 @@ ENERGY = Measure("energy_j", "energy, vehicle", "kJ", 1e-3, 2)
 COMPUTER_ENERGY = Measure("computer_energy_j", "energy, computer", "kJ", 1e-3, 2)
 MEAN_SPEED = Measure("mean_speed_m_s", "mean speed", "m/s", 1.0, 2)
 TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
+ENDURANCE = Measure("endurance_s", "endurance", "min", 1.0 / S_PER_MIN, 1)
+RANGE = Measure("range_m", "range", "km", 1e-3, 2)
+MISSIONS = Measure("missions_per_charge", "missions per charge", "", 1.0, 1)
+
+PACK = (ENDURANCE, RANGE, MISSIONS)
+"""Runs that were recorded without have none of these."""
 
 MEASURES = (SUCCESS_RATE, FLIGHT_TIME, DISTANCE, ENERGY)
 ALL_MEASURES = (*MEASURES, COMPUTER_ENERGY, TOTAL_ENERGY)

@@ -103,7 +103,7 @@ def build_page(
         replace_file(folder / "latency.png", montage(latency_pictures, SHEET_COLUMNS))
     decisions = timeline_of(run)
     timeline = timeline_figure(decisions, measured) if measured and len(decisions) else None
-    energies = flight_energies(run, None if vehicle is None else vehicle.power)
+    energies = flight_energies(run, vehicle)
     energy = energy_figure(energies) if energies else None
     overview = overview_picture(run, arenas) if needs_overview(run) else None
     judged = examine_worst(run, arenas, vehicle)

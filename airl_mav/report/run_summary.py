@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.flight.statistics import MEANS, Aggregate, Estimate, aggregate, median_of, successful
+from airl_mav.flight.statistics import (
+    AVERAGED,
+    Aggregate,
+    Estimate,
+    aggregate,
+    known,
+    median_of,
+    successful,
+)
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,
@@ -58,10 +66,7 @@ def summarize_run(run: LoadedRun) -> RunSummary:
         stages=stages,
         samples=samples,
         quality=aggregate(run.episodes),
-        medians={
-            name: median_of([getattr(quality, name) for quality in good])
-            for name in (*MEANS, "mean_speed_m_s")
-        },
+        medians={name: median_of(known(good, name)) for name in AVERAGED},
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
     )

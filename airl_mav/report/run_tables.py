@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord, run_sha256
-from airl_mav.flight.setup import Part
+from airl_mav.flight.setup import Part, Setup
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stamps import NO_STAMP
@@ -23,6 +23,7 @@ from airl_mav.report.measures import (
     FEW_FLIGHTS,
     FLIGHT_TIME,
     MEAN_SPEED,
+    PACK,
     SUCCESS_RATE,
     Measure,
     rate_digits,
@@ -52,7 +53,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
         ("vehicle", _part(setup.vehicle)),
         ("arena", _part(setup.arena)),
         ("policy", _part(setup.policy)),
-        ("computer", f"{_part(setup.computer)}, {setup.computer_watts:g} W"),
+        ("computer", f"{_part(setup.computer)}, {computer_power(setup)}"),
         ("decision latency t2", latency),
         ("source of t2", injection.source),
         ("assumed of t2", injection.assumed),
@@ -63,6 +64,11 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
         ("sha256 of the flights", run_sha256(run.episodes) or ""),
     ]
     return tuple((term, text) for term, text in rows if text)
+
+
+def computer_power(setup: Setup) -> str:
+    """Return what a computer draws from the aircraft's pack, in words."""
+    return "on the ground" if setup.computer_on_ground else f"{setup.computer_watts:g} W"
 
 
 def _part(part: Part) -> str:
@@ -162,15 +168,22 @@ def quality_table(summary: RunSummary) -> TableView:
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
     computer = replace(COMPUTER_ENERGY, unit="J", scale=1.0, digits=0)
+    measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY, computer, MEAN_SPEED]
+    measures += [measure for measure in PACK if measure.of(q).n]
     rows = tuple(
         _estimate_row(measure, measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE))
-        for measure in (rate, FLIGHT_TIME, DISTANCE, ENERGY, computer, MEAN_SPEED)
+        for measure in measures
     )
     notes = [
         "Means and medians over the flights that reached the goal; n is their number (for the "
         "success rate: all valid flights). Intervals: Wilson for the rate, bootstrap "
         "for the means, binomial for the medians."
     ]
+    if q.endurance_s.n:
+        notes.append(
+            "Endurance, range and missions: the whole charge at the start, at the mean power and "
+            "speed of each flight with its computer, take-off and landing left out."
+        )
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
     return TableView("quality", "Quality of flight", columns, rows, tuple(notes))

@@ -74,6 +74,18 @@ class WindSettings(ProfileModel):
     )
 
 
+class Payload(ProfileModel):
+    """A load that is carried as one point of mass; none by default.
+
+    Where it hangs counts from the middle of the rotors.
+    """
+
+    mass_g: float = quantity("mass of the payload", "g", ge=0, le=100_000, default=0.0)
+    forward_m: float = quantity("ahead of the middle", "m", ge=-2, le=2, default=0.0)
+    right_m: float = quantity("to the right of the middle", "m", ge=-2, le=2, default=0.0)
+    down_m: float = quantity("below the middle", "m", ge=-2, le=2, default=0.0)
+
+
 class WatchdogSettings(ProfileModel):
     """Bounds on the silence of the policy, in simulated time."""
 
@@ -190,6 +202,10 @@ class Aircraft(ProfileModel):
     """What flies, and how it is reached."""
 
     vehicle: VehicleName = DEFAULT_VEHICLE
+    payload: Payload = Field(default_factory=Payload, description="payload")
+    battery_charge: float = quantity(
+        "state of charge of the battery at the start", "1", gt=0, le=1, default=1.0
+    )
     wind: Annotated[WindSettings, NO_TWIN] = Field(default_factory=WindSettings, description="wind")
     estimator: Annotated[EstimatorName, NO_TWIN] = Field(
         default="kernel",
@@ -365,7 +381,8 @@ class Flights(Workers):
 class Scenario(Flights, Lateness, Decisions, Aircraft):
     """All that a rehearsal can be asked for.
 
-    The fields are flat, but for the tables `wind`, `watchdog`, `real` and `ports`. What is left at
+    The fields are flat, but for the tables `payload`, `wind`, `watchdog`, `real`
+    and `ports`. What is left at
     None is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
 
     Raises:

@@ -15,6 +15,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.checks import check_firmware, check_level, check_ports
+from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -34,13 +35,13 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         check_ports(scenario.ports, any_camera=False)
     policy = find_policy(scenario.policy)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
-    vehicle = load_vehicle(scenario.vehicle)
+    computer = load_computer(scenario.computer)
+    vehicle = loaded(load_vehicle(scenario.vehicle), computer, scenario.payload)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )
     arena = load_profile("arenas", scenario.arena, ArenaSpec)
-    computer = load_computer(scenario.computer)
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )

@@ -56,6 +56,7 @@ class ResolvedScenario:
     scenario: Scenario
     """As it was asked for."""
     vehicle: VehicleProfile
+    """With its computer and payload on board."""
     arena: ArenaSpec
     computer: ComputerProfile
     policy: PolicyInfo
@@ -97,6 +98,8 @@ class ResolvedScenario:
             "speed": self.speed,
             "pilot": pilot,
             "watchdog": self.watchdog.model_dump(mode="json"),
+            # With what it carries: the profile alone does not tell.
+            "vehicle_body": self.vehicle.body.model_dump(),
             "policy_sha256": self.policy.sha256,
             "profiles_sha256": {
                 kind: hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
@@ -160,11 +163,17 @@ class ResolvedScenario:
             arena=Part(scenario.arena, self.arena.description),
             policy=Part(self.policy.name, f"{self.policy.description}{without}"),
             computer=Part(scenario.computer, self.computer.description),
-            computer_watts=self.computer.watts,
+            computer_watts=self.computer.onboard_watts,
+            computer_on_ground=self.computer.ground_equipment,
             injection=self.injection,
             speed=self.speed,
             between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
         )
+
+    @property
+    def pack_j(self) -> float:
+        """What the battery holds at the start [J]."""
+        return self.vehicle.battery.energy_j(self.scenario.battery_charge)
 
     @property
     def arena_name(self) -> str:

@@ -25,6 +25,8 @@ class Airframe(NamedTuple):
     drag_linear: float
     drag_quadratic: float
     drag_angular: float
+    com_forward: float
+    com_right: float
 
     @classmethod
     def from_profile(cls, profile: VehicleProfile) -> Airframe:
@@ -44,11 +46,16 @@ class Airframe(NamedTuple):
             drag.linear_n_s_m,
             drag.quadratic_n_s2_m2,
             drag.angular_n_m_s,
+            body.com_forward_m,
+            body.com_right_m,
         )
 
 
 @kernel
 def airframe_of(row: Vector) -> Airframe:
-    """Return the airframe of a row (13,): an array is passed to kernels far faster than a tuple."""
+    """Return the airframe of a row (15,): an array is passed to kernels far faster than a tuple."""
     r = row
-    return Airframe(r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11], r[12])
+    return Airframe(
+        r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7],
+        r[8], r[9], r[10], r[11], r[12], r[13], r[14],
+    )  # fmt: skip

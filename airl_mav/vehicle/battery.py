@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 
+from airl_mav.core.constants import C_PER_MAH
 from airl_mav.core.kernels import kernel
-
-COULOMB_PER_MAH = 3.6
 
 
 @kernel
@@ -28,4 +27,4 @@ def open_circuit(remaining: float, empty_v: float, full_v: float) -> float:
 @kernel
 def drain(remaining: float, current_a: float, capacity_mah: float, dt: float) -> float:
     """Return the state of charge after dt [s] at a current [A], not below 0."""
-    return max(0.0, remaining - current_a * dt / (capacity_mah * COULOMB_PER_MAH))
+    return max(0.0, remaining - current_a * (dt / (capacity_mah * C_PER_MAH)))

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Vec
 
 N_ROTORS = 4
-# Position of each rotor relative to the centre of mass, as signs of the arms (forward, right).
+# Position of each rotor relative to the middle of them, as signs of the arms (forward, right).
 FORWARD_SIGN = (1.0, -1.0, 1.0, -1.0)
 RIGHT_SIGN = (1.0, -1.0, -1.0, 1.0)
 # Reaction torque on the body about the down axis: a rotor turning counter-clockwise pushes the
@@ -62,8 +63,25 @@ def wrench(s0: float, s1: float, s2: float, s3: float, airframe: Airframe) -> tu
     for i in range(N_ROTORS):
         t = airframe.thrust_max * speeds[i] * speeds[i]
         thrust += t
-        # torque = r x F with F = (0, 0, -t) at r = (forward, right, 0)
-        roll -= RIGHT_SIGN[i] * airframe.arm_right * t
-        pitch += FORWARD_SIGN[i] * airframe.arm_forward * t
+        # torque = r x F with F = (0, 0, -t) at r = (forward, right, .) from the centre of mass
+        roll -= (RIGHT_SIGN[i] * airframe.arm_right - airframe.com_right) * t
+        pitch += (FORWARD_SIGN[i] * airframe.arm_forward - airframe.com_forward) * t
         yaw += YAW_SIGN[i] * airframe.torque_per_thrust * t
     return thrust, (roll, pitch, yaw)
+
+
+def hover_speeds(airframe: Airframe) -> tuple[float, float, float, float]:
+    """Return the speed fractions of the rotors in a hover: they carry the weight, without torque.
+
+    A rotor carries the more, the closer to the centre of mass it is.
+    """
+    share = airframe.mass * GRAVITY_M_S2 / (N_ROTORS * airframe.thrust_max)
+    right, forward = (
+        airframe.com_right / airframe.arm_right,
+        airframe.com_forward / airframe.arm_forward,
+    )
+    s0, s1, s2, s3 = (
+        math.sqrt(max(0.0, share * (1.0 + RIGHT_SIGN[i] * right + FORWARD_SIGN[i] * forward)))
+        for i in range(N_ROTORS)
+    )
+    return s0, s1, s2, s3

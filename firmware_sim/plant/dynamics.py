@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.vehicle import Battery, Power
+from airl_mav.profiles.vehicle import Battery
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.power import coefficients, power_w
+from airl_mav.vehicle.power import (
+    felt,
+    felt_share,
+    flight_power_w,
+    power_model_of,
+    standing_power_w,
+)
 from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 from airl_mav.vehicle.rotor import settle, wrench
 from firmware_sim.plant.kinematics import from_bullet, quaternion, rates, velocity
-
-IDLE_POWER_W = 5.0
-"""Flight controller and sensors, motors off [W]."""
 
 Speeds = tuple[float, float, float, float]
 """Of the rotors, as fractions of the speed at full command."""
 
 Supply = tuple[float, float, float, float]
 """Voltage [V], current [A], charge used [mAh], share of it that is left; as `BatterySample`."""
-
-
-def power_row(power: Power) -> tuple[float, ...]:
-    """Return b1..b9 and the payload [g], for `absorb`."""
-    return (*coefficients(power), power.payload_g)
 
 
 def pack_row(battery: Battery) -> tuple[float, ...]:
@@ -51,7 +48,7 @@ def actuate(
         motors: Commands, 0..1.
         row: (16,) the vehicle's motion.
         wind: (3,) NED [m/s].
-        airframe: (13,) as `Airframe`.
+        airframe: (15,) as `Airframe`.
         left: Share of a speed error that a tick leaves (`rotor.lag`).
 
     Returns:
@@ -93,12 +90,14 @@ def absorb(
     wind: Vector,
     speeds: Speeds,
     standing: bool,
+    acceleration: Vec,
     charge: float,
     airframe: Vector,
     power: Vector,
     pack: Vector,
+    computer_w: float,
     tick_s: float,
-) -> tuple[float, Supply, float]:
+) -> tuple[float, Vec, Supply, float]:
     """Read pybullet's state after a tick: the motion, the power used, the charge left.
 
     Args:
@@ -111,14 +110,17 @@ def absorb(
         wind: (3,) NED [m/s].
         speeds: Of the rotors.
         standing: In touch with something.
+        acceleration: As the power model takes it, before the tick (`power.felt`) [m/s²].
         charge: State of charge before the tick, 0..1.
-        airframe: (13,) as `Airframe`.
-        power: (10,) as `power_row`.
+        airframe: (15,) as `Airframe`.
+        power: (17,) as `PowerModel`.
         pack: (4,) as `pack_row`.
+        computer_w: What the onboard computer draws from the pack [W].
         tick_s: Length of the tick [s].
 
     Returns:
-        Power over the tick [W], the battery monitor's reading, the state of charge after it.
+        Power over the tick [W], without the computer's; the acceleration after it; the battery
+        monitor's reading; the state of charge after it.
     """
     accel = (
         (linear[1] - before[3]) / tick_s,
@@ -126,15 +128,16 @@ def absorb(
         (-linear[2] - before[5]) / tick_s,
     )
     from_bullet(at, orientation, linear, angular, accel, row)
-    b = power
-    model = (b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7], b[8])
+    m, a = power_model_of(power), airframe_of(airframe)
+    thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
     if standing:
-        # The model holds in flight only, and an impact is no electrical load. On the ground, rotors
-        # take the induced power of their thrust, P ~ T^1.5 (momentum theory).
-        a = airframe_of(airframe)
-        thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
-        load = IDLE_POWER_W + model[8] * (thrust / (a.mass * GRAVITY_M_S2)) ** 1.5
+        acceleration = (0.0, 0.0, 0.0)
+        used = standing_power_w(thrust, a, m)
     else:
-        load = power_w(velocity(row), accel, (wind[0], wind[1], wind[2]), b[9], model)
-    reading = supply(load, charge, pack)
-    return load, reading, drain(charge, reading[1], pack[3], tick_s)
+        # Of the state in which the tick's forces acted, as the drag.
+        older, air = velocity(before), (wind[0], wind[1], wind[2])
+        used = flight_power_w(thrust, older, quaternion(before), air, acceleration, a, m)
+        kept = felt_share(m, tick_s)
+        acceleration = felt(acceleration, older, velocity(row), kept, tick_s, m)
+    reading = supply(used + computer_w, charge, pack)
+    return used, acceleration, reading, drain(charge, reading[1], pack[3], tick_s)

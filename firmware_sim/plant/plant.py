@@ -13,16 +13,16 @@ from airl_mav.core.frames import Vector
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Aircraft
 from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.power import PowerModel, standing_power_w
+from airl_mav.vehicle.rotation import Vec
 from airl_mav.vehicle.rotor import lag
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.dynamics import (
-    IDLE_POWER_W,
     Speeds,
     absorb,
     actuate,
     pack_row,
-    power_row,
     supply,
 )
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY, WIDTH, from_bullet
@@ -60,6 +60,7 @@ class Plant:
         start_us: int = 0,
         aircraft: Aircraft | None = None,
         rate_hz: int = TICK_HZ,
+        computer_w: float = 0.0,
     ) -> None:
         """Put the vehicle at rest on the floor at the start, facing north.
 
@@ -68,10 +69,12 @@ class Plant:
             arena: Where; None = an endless floor.
             rng: All randomness of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            aircraft: What was asked of it, as the wind; None = the defaults: calm.
+            aircraft: What was asked of it: wind, charge of the battery; None = the defaults.
             rate_hz: Ticks a second.
+            computer_w: What the onboard computer draws from the pack [W].
         """
         tick_s = 1.0 / rate_hz
+        asked = aircraft or Aircraft()
         body = profile.body
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
         self.world = World(arena, 0.5 * diagonal_m, tick_s)
@@ -80,7 +83,7 @@ class Plant:
         airframe = Airframe.from_profile(profile)
         sensor_rng, wind_rng = rng.spawn(2)
         self._sensors = SensorSuite(profile.sensors, sensor_rng, tick_s)
-        self._wind = Wind((aircraft or Aircraft()).wind, wind_rng, tick_s)
+        self._wind = Wind(asked.wind, wind_rng, tick_s)
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
@@ -89,19 +92,23 @@ class Plant:
         self._rate_hz, self._tick_s, self._ticks = rate_hz, tick_s, 0
         # What kernels take, as arrays: names would cost their callers a microsecond each.
         self._airframe = np.array(airframe)
-        self._power = np.array(power_row(profile.power))
+        model = PowerModel.from_profile(profile)
+        self._power = np.array(model)
+        self._computer_w = computer_w
         self._pack = np.array(pack_row(profile.battery))
         self._left = lag(airframe, tick_s)
         self._speeds = STOPPED
-        self.battery_remaining = 1.0
+        self.battery_remaining = asked.battery_charge
         """State of charge, 1 to 0."""
-        self.power_w = IDLE_POWER_W
-        """Electrical power over the newest tick [W]."""
+        self.power_w = standing_power_w(0.0, airframe, model)
+        """Electrical power over the newest tick, without the onboard computer's [W]."""
+        self._felt: Vec = (0.0, 0.0, 0.0)
         self._body = self._build_body(profile)
         self._touching: set[int] = set()
         self.motion = self._read()
         """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
-        self._battery = BatterySample(*supply(self.power_w, self.battery_remaining, self._pack))
+        load_w = self.power_w + computer_w
+        self._battery = BatterySample(*supply(load_w, self.battery_remaining, self._pack))
 
     def begin(self) -> None:
         """Let what moves set out now; contacts so far are forgotten."""
@@ -140,7 +147,7 @@ class Plant:
         at, orientation = pybullet.getBasePositionAndOrientation(body, client)
         linear, angular = pybullet.getBaseVelocity(body, client)
         self.motion = np.empty(WIDTH)
-        self.power_w, reading, self.battery_remaining = absorb(
+        self.power_w, self._felt, reading, self.battery_remaining = absorb(
             at,
             orientation,
             linear,
@@ -150,10 +157,12 @@ class Plant:
             wind,
             speeds,
             bool(self._touching),
+            self._felt,
             self.battery_remaining,
             self._airframe,
             self._power,
             self._pack,
+            self._computer_w,
             self._tick_s,
         )
         self._speeds, self._battery = speeds, BatterySample(*reading)

@@ -252,7 +252,7 @@ FAILSAFES = [
     (companion_dies, "Failsafe activated", None),
     (policy_hangs, "Landing", None),
     (nobody_takes_off, "auto preflight", None),
-    (battery_runs_low, "battery", 90.0),
+    (battery_runs_low, "battery", 40.0),
 ]
 
 

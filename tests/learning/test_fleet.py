@@ -27,6 +27,7 @@ from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.vehicle.power import level_power_w
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet import connect, pybullet
@@ -265,8 +266,8 @@ def test_distance_and_energy_of_a_straight_flight() -> None:
     command(fleet, 0, np.array([4.0, 0.0, 0.0, 0.0]))
     fly(fleet, arenas, 5000)
     assert fleet.distance[0] == pytest.approx(fleet.position[0, 0], abs=0.2)
-    # Steady 4 m/s: b1 v + b9 of the power model, plus the first seconds of acceleration.
-    steady_w = QUAD.power.b9_hover + QUAD.power.b1_vxy * 4.0
+    # Steady 4 m/s, plus the first seconds of acceleration.
+    steady_w = level_power_w(4.0, VEHICLE.airframe, VEHICLE.power)
     assert fleet.energy[0] == pytest.approx(20.0 * steady_w, rel=0.02)
 
 

@@ -249,7 +249,7 @@ def test_tables_have_medians_and_their_intervals(
 
 def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
     run, _ = demo
-    energies = flight_energies(run, load_vehicle("quad").power)
+    energies = flight_energies(run, load_vehicle("quad"))
     view = energy_table(energies)
     kj = {row[0]: float(row[1]) for row in view.rows}
     airframe = sum(e.quality.energy_j for e in run.episodes if e.quality) / 1e3

@@ -40,6 +40,16 @@ def test_the_line_is_plain_json(record: EpisodeRecord) -> None:
     assert data["quality"]["distance_m"] == record.quality.distance_m
 
 
+def test_a_line_of_an_older_run_has_no_endurance(record: EpisodeRecord) -> None:
+    data = json.loads(json.dumps(record.as_data()))
+    for name in ("endurance_s", "range_m", "missions_per_charge"):
+        del data["quality"][name]
+    old = EpisodeRecord.from_data(data, "here")
+    assert old.quality is not None
+    assert old.quality.endurance_s is None
+    assert old.quality.energy_j == data["quality"]["energy_j"]
+
+
 def test_no_nan_is_written(record: EpisodeRecord, tmp_path: Path) -> None:
     path = tmp_path / "episodes.jsonl"
     with pytest.raises(ValueError, match="JSON compliant"):

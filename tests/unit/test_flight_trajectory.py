@@ -42,6 +42,19 @@ def test_a_helix_has_its_closed_form_length_energy_and_speed() -> None:
     assert quality.takeoff.energy_j == pytest.approx(400 * 4 + 5 * 16, rel=1e-9)
 
 
+def test_endurance_is_the_pack_over_the_mean_power_with_the_computer() -> None:
+    quality = measure_quality(helix(20.0), 4_000_000, 18_000_000, 20.0, pack_j=288_288.0)
+    mean_w = (400 * 14 + 5 * (18**2 - 4**2)) / 14 + 20.0
+    speed = np.hypot(1.5, 0.4)
+    assert quality.endurance_s == pytest.approx(288_288.0 / mean_w, rel=1e-9)
+    assert quality.range_m == pytest.approx(288_288.0 / mean_w * speed, rel=1e-5)
+    assert quality.missions_per_charge == pytest.approx(288_288.0 / mean_w / 14.0, rel=1e-9)
+    never = measure_quality(helix(2.0), 1_000_000, 1_000_000, 5.0, pack_j=288_288.0)
+    unknown = measure_quality(helix(20.0), 4_000_000, 18_000_000, 20.0)
+    for each in (never, unknown):
+        assert (each.endurance_s, each.range_m, each.missions_per_charge) == (None, None, None)
+
+
 @given(st.lists(st.integers(0, 10_000_000), min_size=3, max_size=6, unique=True))
 def test_parts_add_up_to_the_whole(cuts: list[int]) -> None:
     flight = helix(10.0)

@@ -1,4 +1,4 @@
-"""Rotors, rigid body, power, battery against closed forms, numpy, scipy's integrator, pybullet."""
+"""Rotors, rigid body, battery against closed forms, numpy, scipy's integrator, pybullet."""
 
 from __future__ import annotations
 
@@ -21,10 +21,9 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.power import power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Quat, Vec
-from airl_mav.vehicle.rotor import lag, settle, steady_speed, wrench
+from airl_mav.vehicle.rotor import hover_speeds, lag, settle, steady_speed, wrench
 
 QUAD = Airframe.from_profile(load_profile("vehicles", "quad", VehicleProfile))
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -272,50 +271,46 @@ def test_free_body_agrees_with_pybullet() -> None:
 
 
 def test_a_row_is_an_airframe_field_by_field() -> None:
-    numbers = np.arange(1.0, 14.0)
+    numbers = np.arange(1.0, 16.0)
     assert airframe_of(numbers) == Airframe(*numbers)
     assert len(Airframe._fields) == len(numbers)
     assert airframe_of(np.array(QUAD)) == QUAD
 
 
-# --- power
-
-# 3DR Solo, arXiv 1703.10049 as quoted by Krishnan et al. 2021, eq. 1.
-SOLO = (-1.526, 3.934, 0.968, 18.125, 96.613, -1.085, 0.220, 1.332, 433.9)
-
-
-def test_the_shipped_quad_has_the_papers_coefficients() -> None:
-    p = load_profile("vehicles", "quad", VehicleProfile).power
-    names = [
-        "b1_vxy",
-        "b2_axy",
-        "b3_vxy_axy",
-        "b4_vz",
-        "b5_az",
-        "b6_vz_az",
-        "b7_payload",
-        "b8_wind",
-        "b9_hover",
-    ]
-    assert tuple(getattr(p, name) for name in names) == SOLO
+@given(st.floats(-0.1, 0.1), st.floats(-0.2, 0.2), st.floats(0.1, 1.0), st.floats(0.1, 1.0))
+def test_an_off_centre_mass_is_a_torque_of_its_weight(
+    forward: float, right: float, front: float, rest: float
+) -> None:
+    """About the middle of the rotors the weight W at r exerts r x W: by it the torques differ."""
+    off = QUAD._replace(com_forward=forward, com_right=right)
+    speeds = (front, rest, rest, front)
+    thrust, torque = wrench(*speeds, off)
+    _, centred = wrench(*speeds, QUAD)
+    wanted = np.array(centred) - np.cross([forward, right, 0.0], [0.0, 0.0, -thrust])
+    np.testing.assert_allclose(torque, wanted, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("v", "a", "wind", "payload", "watts"),
-    [
-        (ZERO, ZERO, ZERO, 0.0, 433.9),
-        ((3.0, 4.0, 0.0), ZERO, ZERO, 0.0, 433.9 - 1.526 * 5),
-        (ZERO, (0.0, 2.0, 0.0), ZERO, 0.0, 433.9 + 3.934 * 2),
-        ((3.0, 4.0, 0.0), (0.0, 2.0, 0.0), ZERO, 0.0, 443.818),  # -7.63 + 7.868 + 9.68
-        (ZERO, ZERO, ZERO, 100.0, 455.9),
-        ((0.0, 0.0, -2.0), ZERO, ZERO, 0.0, 470.15),
-        ((0.0, 0.0, 2.0), (0.0, 0.0, -1.0), ZERO, 0.0, 564.593),  # 36.25 + 96.613 - 2.17
-        ((3.0, 4.0, 0.0), ZERO, (1.0, -2.0, 0.0), 0.0, 419.61),  # v.w = 3 - 8 = -5
-        ((100.0, 0.0, 0.0), ZERO, (-50.0, 0.0, 0.0), 0.0, 0.0),  # never negative
-    ],
-)
-def test_power_by_hand(v: Vec, a: Vec, wind: Vec, payload: float, watts: float) -> None:
-    assert power_w(v, a, wind, payload, SOLO) == pytest.approx(watts, abs=1e-9)
+@given(st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4))
+def test_a_centred_mass_changes_no_bit(speeds: list[float]) -> None:
+    """The sums over the arms alone, in the order of the rotors."""
+    roll = pitch = 0.0
+    for (forward, right, _), speed in zip(POSITIONS, speeds, strict=True):
+        thrust = QUAD.thrust_max * speed * speed
+        roll -= float(right) * thrust
+        pitch += float(forward) * thrust
+    s0, s1, s2, s3 = speeds
+    assert wrench(s0, s1, s2, s3, QUAD)[1][:2] == (roll, pitch)
+
+
+@given(st.floats(-0.9, 0.9), st.floats(-0.9, 0.9))
+def test_hover_speeds_carry_the_weight_without_torque(forward: float, right: float) -> None:
+    share = 0.5 / max(0.5, abs(forward) + abs(right))  # inside the rotors
+    off = QUAD._replace(
+        com_forward=share * forward * QUAD.arm_forward, com_right=share * right * QUAD.arm_right
+    )
+    thrust, torque = wrench(*hover_speeds(off), off)
+    assert thrust == pytest.approx(QUAD.mass * GRAVITY_M_S2, rel=1e-12)
+    np.testing.assert_allclose(torque, 0.0, atol=1e-12)
 
 
 # --- battery

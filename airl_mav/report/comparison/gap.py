@@ -34,6 +34,7 @@ from airl_mav.report.comparison.tables import (
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
 from airl_mav.report.measures import ALL_MEASURES, FLIGHT_TIME, interval_of
+from airl_mav.report.run_tables import computer_power
 from airl_mav.report.table import NONE, Column, TableView, ms
 
 OVERLAID = 100
@@ -319,8 +320,8 @@ def _arena_sections(
         )
         for run in flown
     )
-    watts = {Path(r.setup.computer.name).stem: r.setup.computer_watts for r in flown}
-    told = ", ".join(f"{computer} {value:g} W" for computer, value in watts.items())
+    watts = {Path(r.setup.computer.name).stem: computer_power(r.setup) for r in flown}
+    told = ", ".join(f"{computer} {power}" for computer, power in watts.items())
     by_itself = columns_table(comparison, arena)
     by_key = {contrast.entry.key: contrast for contrast in reversed(contrasts)}
     sections = [
@@ -341,8 +342,7 @@ def _arena_sections(
             facts=legend,
             tables=(by_itself,),
             note=f"Energy: of the vehicle; that of the computer apart ({told}, times the flight "
-            "time), then both. A computer that could not fly along makes a gap of both that nobody "
-            "saves.",
+            "time), then both. A computer on the ground takes nothing from the pack.",
         ),
     ]
     if contrasts:

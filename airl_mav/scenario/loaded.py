@@ -1,0 +1,91 @@
+"""The aircraft as it takes off: the vehicle of the profile with its computer and its payload."""
+
+from __future__ import annotations
+
+from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import validated
+from airl_mav.profiles.computer import ComputerProfile
+from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
+from airl_mav.scenario.model import Payload
+
+
+def loaded(
+    vehicle: VehicleProfile, computer: ComputerProfile | None, payload: Payload
+) -> VehicleProfile:
+    """Return a vehicle with what it carries; with nothing to carry, the vehicle itself.
+
+    Computer and payload are points of mass, the computer in the middle of the rotors. Mass, centre
+    of mass and inertia about it follow (parallel axes). Left out: products of inertia, and how far
+    below the rotors the centre of mass comes to lie, which no force here acts on. Collision body,
+    drag and camera stay where they were against the centre of mass.
+
+    Args:
+        vehicle: As its profile has it.
+        computer: What flies along, unless it is ground equipment; None: no computer.
+        payload: The payload.
+
+    Raises:
+        FieldError: The rotors do not carry it with a margin, or not so far off their middle.
+    """
+    board_kg = 0.0 if computer is None else computer.onboard_mass_kg
+    load_kg = payload.mass_g / G_PER_KG
+    if board_kg + load_kg == 0.0:
+        return vehicle
+    body = vehicle.body
+    mass_kg = body.mass_kg + board_kg + load_kg
+    if (problem := vehicle.too_heavy(mass_kg)) is not None:
+        if load_kg:
+            raise FieldError("payload.mass_g", payload.mass_g, problem=problem)
+        raise FieldError("computer", f"{G_PER_KG * board_kg:g} g", problem=problem)
+    # Mass [kg], and where it is: forward, right, down of the middle of the rotors [m].
+    points = (
+        (body.mass_kg, body.com_forward_m, body.com_right_m, 0.0),
+        (board_kg, 0.0, 0.0, 0.0),
+        (load_kg, payload.forward_m, payload.right_m, payload.down_m),
+    )
+    forward_m, right_m, down_m = (
+        sum(point[0] * point[axis] for point in points) / mass_kg for axis in (1, 2, 3)
+    )
+    _check_balance(vehicle, payload, mass_kg, forward_m, right_m)
+    xx, yy, zz = body.inertia_xx_kg_m2, body.inertia_yy_kg_m2, body.inertia_zz_kg_m2
+    for mass, forward, right, down in points:
+        f2, r2, d2 = (forward - forward_m) ** 2, (right - right_m) ** 2, (down - down_m) ** 2
+        xx += mass * (r2 + d2)
+        yy += mass * (f2 + d2)
+        zz += mass * (f2 + r2)
+    carrying = {
+        "mass_kg": mass_kg,
+        "inertia_xx_kg_m2": xx,
+        "inertia_yy_kg_m2": yy,
+        "inertia_zz_kg_m2": zz,
+        "com_forward_m": forward_m,
+        "com_right_m": right_m,
+        "payload_kg": body.payload_kg + board_kg + load_kg,
+    }
+    return validated(
+        VehicleProfile, {**vehicle.model_dump(), "body": {**body.model_dump(), **carrying}}
+    )
+
+
+def _check_balance(
+    vehicle: VehicleProfile, payload: Payload, mass_kg: float, forward_m: float, right_m: float
+) -> None:
+    """Raise FieldError for a centre of mass that the rotors cannot hover around.
+
+    Without torque a rotor carries a quarter of the weight, more or less by how far the centre of
+    mass has moved towards it, in shares of the arms.
+    """
+    rotor = vehicle.rotor
+    ahead, aside = forward_m / rotor.arm_forward_m, right_m / rotor.arm_right_m
+    lean, quarter_n = abs(ahead) + abs(aside), mass_kg * GRAVITY_M_S2 / len(CORNERS)
+    least_n, most_n = quarter_n * (1.0 - lean), quarter_n * (1.0 + lean)
+    if least_n >= 0.0 and most_n <= rotor.thrust_max_n:
+        return
+    name = "forward_m" if abs(ahead) >= abs(aside) else "right_m"
+    raise FieldError(
+        f"payload.{name}",
+        getattr(payload, name),
+        problem=f"cannot hover: the rotors would have to give {least_n:.2f} to {most_n:.2f} newton "
+        f"each, they have 0 to {rotor.thrust_max_n:g}",
+    )
