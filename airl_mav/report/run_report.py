@@ -25,9 +25,13 @@ from airl_mav.report.run_tables import (
     setup_rows,
 )
 from airl_mav.report.table import count_outcomes, print_facts, print_table
-from airl_mav.report.verdict import OverallVerdict, judge_run, requirements_of, save_verdict
-
-UNCHECKED = "Whether the host kept pace was not checked: every flight counts."
+from airl_mav.report.verdict import (
+    OverallVerdict,
+    judge_run,
+    requirements_of,
+    save_verdict,
+    unchecked,
+)
 
 MAX_LISTED = 25
 """Flights with a line of their own in the terminal."""
@@ -42,9 +46,7 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     if requirements is None:
         requirements = requirements_of(run.path)
     verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
-    if run.info.config.get("validity", True):
-        return verdict
-    return replace(verdict, sentences=(*verdict.sentences, UNCHECKED))
+    return replace(verdict, sentences=verdict.sentences + unchecked([run.info]))
 
 
 def write_report(

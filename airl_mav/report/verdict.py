@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -24,6 +24,7 @@ from airl_mav.flight.requirements import Finding, Requirement, find
 from airl_mav.flight.sequential import Decision
 from airl_mav.flight.setup import Setup
 from airl_mav.flight.statistics import Aggregate, Estimate
+from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.document import environment
 
 SCHEMA = 1
@@ -151,6 +152,13 @@ def invalid_flights(episodes: Sequence[EpisodeRecord]) -> tuple[str, ...]:
         for episode in episodes
         if episode.invalid
     )
+
+
+def unchecked(runs: Iterable[RunInfo]) -> tuple[str, ...]:
+    """Return the sentence that belongs under a verdict on runs of which one counts every flight."""
+    if all(run.config.get("validity", True) for run in runs):
+        return ()
+    return ("Whether the host kept pace was not checked: every flight counts.",)
 
 
 def _gap_words(against: PairedComparison, reference: str) -> str:

@@ -18,7 +18,7 @@ from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.frames import Vector, ned_to_enu, quat_ned_frd_to_enu_flu, quat_wxyz_to_xyzw
 from airl_mav.core.location import HOME
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import Regression, Sensors, VehicleProfile
+from airl_mav.profiles.vehicle import Sensors, VehicleProfile
 from airl_mav.scenario.model import Aircraft, WindSettings
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
@@ -27,6 +27,7 @@ from firmware_sim.plant.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.plant.sensors import Rate, SensorSuite
 from firmware_sim.plant.wind import Wind
+from tests.support.solo import SOLO
 
 G = 9.80665
 QUAD = load_profile("vehicles", "quad", VehicleProfile)
@@ -752,19 +753,6 @@ def test_a_closed_plant_cannot_touch_another_one(make: PlantMaker) -> None:
 DISC_M2 = 4 * math.pi * 0.254**2 / 4
 ROTORS_W = (MASS * G) ** 1.5 / math.sqrt(2 * 1.225 * DISC_M2) / 0.65 / 0.68
 """Of the quad in a hover: 10 inch, figure of merit 0.65, drive 0.68."""
-
-SOLO = Regression(
-    model="regression",
-    b1_vxy=-1.526,
-    b2_axy=3.934,
-    b3_vxy_axy=0.968,
-    b4_vz=18.125,
-    b5_az=96.613,
-    b6_vz_az=-1.085,
-    b7_payload=0.220,
-    b8_wind=1.332,
-    b9_hover=433.9,
-)
 
 
 def test_on_the_floor_power_is_that_of_standing_rotors(make: PlantMaker) -> None:

@@ -11,7 +11,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w, level_power_w
 from tests.support.recording import record_tick
-from tests.unit.test_power import SOLO
+from tests.support.solo import SOLO
 
 QUAD = load_vehicle("quad")
 BODY = QUAD.body.model_copy(update={"payload_kg": 0.2})

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_S
-from airl_mav.profiles.vehicle import Momentum, Regression, VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Momentum, VehicleProfile, load_vehicle
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import (
     PowerModel,
@@ -27,6 +27,7 @@ from airl_mav.vehicle.power import (
     standing_power_w,
 )
 from airl_mav.vehicle.rotation import Quat, Vec
+from tests.support.solo import SOLO
 
 QUAD = load_vehicle("quad")
 AIRFRAME = Airframe.from_profile(QUAD)
@@ -34,20 +35,6 @@ MODEL = PowerModel.from_profile(QUAD)
 G, RHO, KAPPA = 9.80665, 1.225, 1.15
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ZERO = (0.0, 0.0, 0.0)
-
-SOLO = Regression(
-    model="regression",
-    b1_vxy=-1.526,
-    b2_axy=3.934,
-    b3_vxy_axy=0.968,
-    b4_vz=18.125,
-    b5_az=96.613,
-    b6_vz_az=-1.085,
-    b7_payload=0.220,
-    b8_wind=1.332,
-    b9_hover=433.9,
-)
-"""3DR Solo, arXiv 1703.10049 as quoted by Krishnan et al. 2021, eq. 1."""
 
 
 def regression(payload_kg: float = 0.0, bandwidth_hz: float = 1.0) -> PowerModel:

@@ -33,6 +33,7 @@ from airl_mav.report.verdict import (
     load_verdict,
     requirements_of,
     save_verdict,
+    unchecked,
 )
 
 Runs = Mapping[str, LoadedRun]
@@ -122,7 +123,9 @@ def judge_comparison(
     # Whoever is compared must be valid as well.
     invalid = {name: invalid_flights(run.episodes) for name, run in loaded.items()}
     lines = tuple(f"{name}, {line}" for name, flights in invalid.items() for line in flights)
-    return replace(verdict, sentences=comparison.answers or verdict.sentences, invalid=lines)
+    sentences = comparison.answers or verdict.sentences
+    sentences += unchecked([run.info for run in loaded.values()])
+    return replace(verdict, sentences=sentences, invalid=lines)
 
 
 def _judged(comparison: Comparison) -> tuple[ComparedRun, ...]:
