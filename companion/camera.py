@@ -11,7 +11,7 @@ import zmq
 from airl_mav.camera.frame import Frame, FrameError
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.errors import FieldError
-from airl_mav.scenario.model import GREATEST_PORT
+from airl_mav.scenario.aircraft import GREATEST_PORT
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from airl_mav import Scenario, rehearse
 from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.scenario.model import WindSettings
+from airl_mav.scenario.aircraft import WindSettings
 
 calm = rehearse(Scenario(level="lockstep", episodes=4), out="runs/calm")
 windy = rehearse(

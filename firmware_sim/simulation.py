@@ -13,7 +13,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.model import Aircraft
+from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.flight_controller import FlightController

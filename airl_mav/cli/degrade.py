@@ -13,10 +13,10 @@ from airl_mav.cli.gate import Gate
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.degrade import LATENCIES, declare_degradation
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
-    Aircraft,
     Decisions,
     Flights,
     Lateness,

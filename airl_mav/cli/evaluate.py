@@ -20,7 +20,8 @@ from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.record import run_sha256
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_report import show_report, verdict_of
-from airl_mav.scenario.model import Aircraft, Decisions, Flights, Lateness, LevelName
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.scenario.model import Decisions, Flights, Lateness, LevelName
 
 
 class EvaluateOptions(Gate, Flights, Lateness, Decisions, Aircraft):

@@ -17,10 +17,10 @@ from airl_mav.experiments.gap import (
     DEFAULT_REFERENCE,
     declare_gap,
 )
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
-    Aircraft,
     Decisions,
     Flights,
     Lateness,

@@ -14,7 +14,8 @@ from airl_mav.core.fields import quantity
 from airl_mav.experiments.evaluate import training_arena
 from airl_mav.experiments.ladder import LEVELS, declare_ladder
 from airl_mav.policy.registry import find_policy
-from airl_mav.scenario.model import Aircraft, Decisions, Flights, Lateness, LevelName
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.scenario.model import Decisions, Flights, Lateness, LevelName
 
 
 class LadderOptions(Flights, Lateness, Decisions, Aircraft):

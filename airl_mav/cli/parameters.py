@@ -14,7 +14,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario.model import DEFAULT_VEHICLE, VehicleName
+from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
 from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,

@@ -16,10 +16,10 @@ from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
 from airl_mav.report.comparison.show import print_comparison
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
-    Aircraft,
     Decisions,
     Flights,
     Lateness,

@@ -7,7 +7,8 @@ from typing import Any, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import quantity
-from airl_mav.scenario.model import GREATEST_SEED, Inference, Ports
+from airl_mav.scenario.aircraft import Ports
+from airl_mav.scenario.model import GREATEST_SEED, Inference
 from airl_mav.scenario.stand_alone import CompanionAddresses
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"

@@ -31,7 +31,7 @@ from airl_mav.rehearsal.channel import (
     serve,
 )
 from airl_mav.rehearsal.true_state import state_of
-from airl_mav.scenario.model import Aircraft
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.crash_detector import CrashDetector

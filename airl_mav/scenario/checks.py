@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from airl_mav.core.errors import FieldError
-from airl_mav.scenario.model import NO_TWIN, Aircraft, LevelName, Ports, Scenario
+from airl_mav.scenario.aircraft import NO_TWIN, Aircraft, Ports
+from airl_mav.scenario.model import LevelName, Scenario
 
 SITL_SPEEDS = 0.5, 10.0
 """Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats

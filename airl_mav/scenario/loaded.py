@@ -7,7 +7,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.scenario.model import Payload
+from airl_mav.scenario.aircraft import Payload
 
 
 def loaded(

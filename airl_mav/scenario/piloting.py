@@ -18,13 +18,7 @@ from airl_mav.latency.source import select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy
 from airl_mav.profiles.computer import load_computer
-from airl_mav.scenario.model import (
-    Decisions,
-    Lateness,
-    LevelName,
-    PilotSettings,
-    WatchdogSettings,
-)
+from airl_mav.scenario.model import Decisions, Lateness, LevelName, PilotSettings, WatchdogSettings
 
 ACTION_STREAM = 1
 """Second word of the seed of a policy's random actions: not the numbers that draw the latency."""

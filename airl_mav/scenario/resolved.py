@@ -24,8 +24,9 @@ from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import FirmwareName
 from airl_mav.scenario.file import anchored
-from airl_mav.scenario.model import FirmwareName, PilotSettings, Scenario, WatchdogSettings
+from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator, load_asked_policy
 
 ARRIVAL_SHARE = 0.8

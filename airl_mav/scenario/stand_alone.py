@@ -12,12 +12,12 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_firmware, check_ports
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
     GREATEST_SEED,
-    Aircraft,
     ArenaName,
     Decisions,
     Lateness,

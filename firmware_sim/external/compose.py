@@ -11,7 +11,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.model import Aircraft, FirmwareName
+from airl_mav.scenario.aircraft import Aircraft, FirmwareName
 from firmware_sim.external.airframe_check import (
     HITL_OUTPUT,
     SITL_OUTPUT,

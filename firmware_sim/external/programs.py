@@ -8,7 +8,7 @@ from __future__ import annotations
 import shlex
 
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.model import Aircraft, RealFirmware
+from airl_mav.scenario.aircraft import Aircraft, RealFirmware
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.ardupilot.program import find_arducopter
 from firmware_sim.external.px4 import program as px4_program

@@ -11,7 +11,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.model import Aircraft
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Vec

@@ -9,7 +9,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.scenario.model import WindSettings
+from airl_mav.scenario.aircraft import WindSettings
 
 BLOCK = 256
 """Gusts are drawn for so many ticks at once; how many changes no value."""

@@ -19,7 +19,7 @@ from airl_mav.core.frames import Vector, ned_to_enu, quat_ned_frd_to_enu_flu, qu
 from airl_mav.core.location import HOME
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
-from airl_mav.scenario.model import Aircraft, WindSettings
+from airl_mav.scenario.aircraft import Aircraft, WindSettings
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
 from firmware_sim.plant import wind as wind_module

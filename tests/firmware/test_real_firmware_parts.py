@@ -20,8 +20,9 @@ from airl_mav.cli.parameters import run as write_parameters
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
+from airl_mav.scenario.aircraft import Aircraft, RealFirmware
 from airl_mav.scenario.checks import check_firmware
-from airl_mav.scenario.model import Aircraft, LevelName, RealFirmware
+from airl_mav.scenario.model import LevelName
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.external.airframe_check import (

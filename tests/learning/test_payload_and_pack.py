@@ -13,8 +13,8 @@ from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.scenario.aircraft import Aircraft, Payload
 from airl_mav.scenario.loaded import loaded
-from airl_mav.scenario.model import Aircraft, Payload
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w
 from firmware_sim.autopilot.parameter_store import Parameters

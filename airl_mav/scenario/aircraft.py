@@ -1,0 +1,160 @@
+"""The aircraft of a scenario: what flies, what it carries, in which wind, and how it is reached."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from airl_mav.core.fields import ProfileModel, quantity
+
+VehicleName = Annotated[
+    str, Field(description="vehicle profile: a shipped name, or a path to a .toml")
+]
+
+DEFAULT_VEHICLE = "quad"
+"""What is shipped and flies by default."""
+
+GREATEST_PORT = 65_535
+
+EstimatorName = Literal["kernel", "filterpy"]
+FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
+
+FREE = "decides no flight"
+"""Marks a field that may differ when a run is resumed."""
+
+NO_TWIN = "at level lockstep or sitl; the twin has none"
+"""Marks a field that must be left as it is at level gym."""
+
+
+def _port(description: str, default: int) -> Any:
+    return quantity(description, "1", ge=0, le=GREATEST_PORT, default=default)
+
+
+class WindSettings(ProfileModel):
+    """Steady wind and gusts; calm by default."""
+
+    north_m_s: float = quantity("steady wind towards north", "m/s", ge=-50, le=50, default=0.0)
+    east_m_s: float = quantity("steady wind towards east", "m/s", ge=-50, le=50, default=0.0)
+    gust_m_s: float = quantity(
+        "standard deviation of the gusts on each horizontal axis; half of it on the vertical",
+        "m/s",
+        ge=0,
+        le=50,
+        default=0.0,
+    )
+    gust_time_s: float = quantity(
+        "correlation time of the gusts", "s", ge=0.01, le=1000, default=2.0
+    )
+
+
+class Payload(ProfileModel):
+    """A load that is carried as one point of mass; none by default.
+
+    Where it hangs counts from the middle of the rotors.
+    """
+
+    mass_g: float = quantity("mass of the payload", "g", ge=0, le=100_000, default=0.0)
+    forward_m: float = quantity("ahead of the middle", "m", ge=-2, le=2, default=0.0)
+    right_m: float = quantity("to the right of the middle", "m", ge=-2, le=2, default=0.0)
+    down_m: float = quantity("below the middle", "m", ge=-2, le=2, default=0.0)
+
+
+class Ports(ProfileModel):
+    """UDP ports of the MAVLink links, as PX4 SITL uses them, and the camera's TCP port."""
+
+    api_port: int = _port("UDP port of the onboard API, where MAVSDK listens", 14540)
+    api_local_port: int = _port(
+        "UDP port that the flight controller's onboard link binds; 0: any free one", 14580
+    )
+    gcs_port: int = _port("UDP port of the ground station, where QGroundControl listens", 14550)
+    gcs_local_port: int = _port(
+        "UDP port that the flight controller's ground station link binds; 0: any free one", 18570
+    )
+    camera_port: int = _port(
+        "TCP port (ZeroMQ) of the depth camera; 0: any free one, where the client is told of it",
+        5600,
+    )
+
+
+class RealFirmware(ProfileModel):
+    """Real firmware: what to start, or how to reach what the user has started."""
+
+    px4_dir: Path | None = Field(
+        default=None,
+        description="with firmware px4: start this PX4 for every flight; a SITL build, its source"
+        " tree, or an unpacked package",
+    )
+    px4_connect: bool = Field(
+        default=False,
+        description="with firmware px4: wait for a PX4 that you start for every flight",
+    )
+    ardupilot_dir: Path | None = Field(
+        default=None,
+        description="with firmware ardupilot: start this ArduCopter for every flight; a SITL build,"
+        " its source tree, or the program itself",
+    )
+    ardupilot_connect: bool = Field(
+        default=False,
+        description="with firmware ardupilot: wait for an ArduCopter that you start for every"
+        " flight",
+    )
+    instance: int = quantity(
+        "with PX4 or ArduPilot SITL: instance number; moves all of its ports, as -i and -I do",
+        "1",
+        ge=0,
+        le=9,
+        default=0,
+    )
+    serial: str | None = Field(
+        default=None, description="with firmware px4-hitl: serial device of the board: /dev/ttyACM0"
+    )
+    baud: int = quantity(
+        "with serial: bits a second; USB takes no notice of it",
+        "1/s",
+        ge=9_600,
+        le=12_000_000,
+        default=921_600,
+    )
+    firmware_timeout: float = quantity(
+        "longest wait for real firmware to connect, and for each answer before take-off, wall time",
+        "s",
+        ge=1,
+        le=3600,
+        default=60.0,
+    )
+    firmware_dir: Path | None = Field(
+        default=None,
+        description="keep what real firmware leaves (parameters, flight logs) in this folder, one"
+        " folder a flight; by default it is removed",
+    )
+
+
+class Aircraft(ProfileModel):
+    """What flies, and how it is reached."""
+
+    vehicle: VehicleName = DEFAULT_VEHICLE
+    payload: Payload = Field(default_factory=Payload, description="payload")
+    battery_charge: float = quantity(
+        "state of charge of the battery at the start", "1", gt=0, le=1, default=1.0
+    )
+    wind: Annotated[WindSettings, NO_TWIN] = Field(default_factory=WindSettings, description="wind")
+    estimator: Annotated[EstimatorName, NO_TWIN] = Field(
+        default="kernel",
+        description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
+        " some twenty times slower",
+    )
+    firmware: FirmwareName = Field(
+        default="builtin",
+        description="flight controller: the built-in one, or real firmware on this vehicle and its"
+        " sensors; see docs/how-to/real-firmware.md",
+    )
+    real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
+    ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
+
+    @property
+    def companion_port(self) -> int:
+        """The UDP port on which a companion listens for the flight controller."""
+        moved = self.real.instance if self.firmware == "px4" else 0
+        return self.ports.api_port + moved
