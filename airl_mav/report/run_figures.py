@@ -63,8 +63,8 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Pi
 
     Its percentiles are marked on the lower axes.
     """
-    figure = theme.new_figure(4.2, 2.6)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.1, 1.0))
+    margins = theme.Margins(left=0.58, right=0.14, bottom=0.42, top=0.27, between=0.1)
+    figure, (top, bottom) = theme.stacked_axes(2, 4.2, 2.6, margins, height_ratios=(1.1, 1.0))
     values = np.sort(samples) / US_PER_MS
     edges = _bin_edges(values)
     top.hist(values, edges, color=theme.SERIES_SOFT, edgecolor=theme.SERIES, linewidth=0.4)
@@ -241,7 +241,6 @@ def coloured_pieces(
 
 def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture:
     """Draw speed, altitude and power over time, zero where navigation begins."""
-    figure = theme.new_figure(5.2, 4.9)
     zero_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
     keep = np.unique(np.linspace(0, len(trajectory) - 1, TIME_POINTS).astype(int))
     # Power is a mean since the sample before: so it stays when samples are left out.
@@ -250,9 +249,11 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture
     passed_us = trajectory.time_us[keep] - trajectory.time_us[0] + 1
     power = np.diff(energy[keep], prepend=0.0) / np.diff(passed_us, prepend=0)
     t = (trajectory.time_us[keep] - zero_us) / US_PER_S
+    margins = theme.Margins(left=0.62, right=0.12, bottom=0.45, top=0.08, between=0.1)
+    figure, axes = theme.stacked_axes(3, 5.2, 4.9, margins)
     rows: tuple[tuple[Any, str, NDArray[np.float64]], ...] = tuple(
         zip(
-            figure.subplots(3, 1, sharex=True),
+            axes,
             ("speed [m/s]", "altitude [m]", "power [W]"),
             (trajectory.speed()[keep], -trajectory.position[keep, 2], power),
             strict=True,

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import NullFormatter, StrMethodFormatter
+from numpy.typing import NDArray
 from PIL import Image
 
 from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_COLOUR, STATIC_COLOURS
@@ -84,11 +86,52 @@ class Picture:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
 
 
+class Margins(NamedTuple):
+    """Room around the axes of a figure, and between them [inch]."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    between: float
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """Return an empty figure on the theme's background, apart from any global state."""
-    figure = Figure(figsize=(width_in, height_in), facecolor=PAPER, layout="constrained")
+    return _blank(width_in, height_in, "constrained")
+
+
+def _blank(width_in: float, height_in: float, layout: Literal["constrained", "none"]) -> Figure:
+    figure = Figure(figsize=(width_in, height_in), facecolor=PAPER, layout=layout)
     FigureCanvasAgg(figure)
     return figure
+
+
+def stacked_axes(
+    rows: int, width_in: float, height_in: float, margins: Margins, **options: Any
+) -> tuple[Figure, NDArray[np.object_]]:
+    """Return a figure with axes (rows,) one below the other, which share their x axis.
+
+    The margins are given, not worked out from all texts: that would cost as much as drawing.
+
+    Args:
+        rows: Number of axes, >= 1.
+        width_in: Width of the figure [inch].
+        height_in: Height of the figure [inch].
+        margins: Room around and between the axes.
+        options: More for `Figure.subplots`.
+    """
+    figure = _blank(width_in, height_in, "none")
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
+    inner = height_in - margins.bottom - margins.top - (rows - 1) * margins.between
+    figure.subplots_adjust(
+        left=margins.left / width_in,
+        right=1.0 - margins.right / width_in,
+        bottom=margins.bottom / height_in,
+        top=1.0 - margins.top / height_in,
+        hspace=margins.between * rows / inner,
+    )
+    return figure, axes
 
 
 def render(figure: Figure, name: str, alt: str) -> Picture:

@@ -95,8 +95,8 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Pictur
         timeline: The decisions.
         stages: Those that have durations.
     """
-    figure = theme.new_figure(10.6, 0.62 + 1.0 * len(stages))
-    rows = np.atleast_1d(figure.subplots(len(stages), 1, sharex=True))
+    margins = theme.Margins(left=0.62, right=0.12, bottom=0.42, top=0.22, between=0.26)
+    figure, rows = theme.stacked_axes(len(stages), 10.6, 0.62 + 1.0 * len(stages), margins)
     band = _draw_bands(rows, timeline)
     for ax, stage in zip(rows, stages, strict=True):
         _draw_stage(ax, stage, timeline.stages[stage.key])
