@@ -101,7 +101,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return _blank(width_in, height_in, "constrained")
 
 
-def _blank(width_in: float, height_in: float, layout: Literal["constrained", "none"]) -> Figure:
+def _blank(width_in: float, height_in: float, layout: Literal["constrained"] | None) -> Figure:
     figure = Figure(figsize=(width_in, height_in), facecolor=PAPER, layout=layout)
     FigureCanvasAgg(figure)
     return figure
@@ -121,7 +121,7 @@ def stacked_axes(
         margins: Room around and between the axes.
         options: More for `Figure.subplots`.
     """
-    figure = _blank(width_in, height_in, "none")
+    figure = _blank(width_in, height_in, None)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
     inner = height_in - margins.bottom - margins.top - (rows - 1) * margins.between
     figure.subplots_adjust(
