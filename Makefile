@@ -50,8 +50,14 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+.PHONY: kernels
+kernels: $(ALL)
+	$(BIN)/python scripts/compile_kernels.py
+
+# mypy is one thread: the kernels compile beside it.
 .PHONY: test
-test: lint  ## Everything CI checks
+test: $(ALL)  ## Everything CI checks
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: docs

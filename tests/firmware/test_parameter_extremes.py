@@ -90,7 +90,7 @@ def test_all_parameters_at_one_end_in_every_mode(mode: Mode, end: str) -> None:
 
 
 @settings(
-    max_examples=10,
+    max_examples=5,
     deadline=None,
     derandomize=True,
     suppress_health_check=list(HealthCheck),

@@ -200,7 +200,7 @@ def test_whoever_is_killed_whenever_every_seed_is_flown_once(
     tmp_path: Path, chance: random.Random
 ) -> None:
     campaign = Campaign(tmp_path, episodes=3)
-    victims = 2 * ["harness", "companion", "firmware"]
+    victims = ["harness", "companion", "firmware", "harness"]
     chance.shuffle(victims)
     killed: list[str] = []
     held = 0
@@ -236,7 +236,7 @@ def test_whoever_is_killed_whenever_every_seed_is_flown_once(
             break
     assert held == campaign.episodes
     # It may be through before all have had their turn, but not untouched.
-    assert len(killed) >= 3
+    assert len(killed) >= 2
     assert "Traceback" not in told
     campaign.check_whole()
     # Each loss that was lived through is told, and noted with the flight.

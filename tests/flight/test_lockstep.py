@@ -41,7 +41,7 @@ from tests.support import lockstep_kit
 from tests.support.lockstep_kit import BEGINS, SEED, demo_scenario
 
 LONG_MS = 200.0
-RERUNS, STOPPED = 6, 2
+RERUNS, STOPPED = 3, 2
 
 
 @pytest.fixture(scope="module")

@@ -142,23 +142,14 @@ def test_started_again_it_shows_what_it_has_and_trains_nothing(undisturbed: Path
     assert outcome(undisturbed) == before
 
 
-def test_with_workers_killed_it_ends_as_if_nothing_had_happened(
-    tmp_path: Path, undisturbed: Path
-) -> None:
-    with running(sweep(tmp_path, "--workers", "2"), tmp_path) as process:
-        wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
-        os.kill(workers_of(process)[0], signal.SIGKILL)
-        assert process.wait(PATIENCE_S * 2) == 0, process.text()
-        assert "a worker was lost by SIGKILL" in process.text()
-    assert outcome(tmp_path) == outcome(undisturbed)
-
-
 def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
     tmp_path: Path, undisturbed: Path
 ) -> None:
-    words = sweep(tmp_path, "--workers", "1")
+    words = sweep(tmp_path, "--workers", "2")
     with running(words, tmp_path) as process:
         wait_until(lambda: checkpointed(tmp_path), "a checkpoint")
+        os.kill(workers_of(process)[0], signal.SIGKILL)
+        process.wait_for_text("a worker was lost by SIGKILL")
         process.interrupt()
         assert process.wait() == EXIT_INTERRUPTED, process.text()
         assert f"the same command with --out {tmp_path / 'out'} goes on" in process.text()
