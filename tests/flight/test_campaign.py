@@ -298,8 +298,9 @@ def test_another_campaign_is_not_mixed_in(
     [
         ("run.json", "a single run"),
         ("train.json", "a training"),
+        ("gap.json", "a verdict, or a gap of an earlier version"),
         # Begun by a version that wrote no declaration.
-        *((f"{kind}.json", "runs of an earlier version") for kind in ("gap", "ladder", "matrix")),
+        *((f"{kind}.json", "runs of an earlier version") for kind in ("ladder", "matrix")),
     ],
 )
 def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, what: str) -> None:
