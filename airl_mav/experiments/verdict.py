@@ -17,7 +17,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
-from airl_mav.experiments.experiment import entry_of, file_name
+from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
 from airl_mav.experiments.fly import fly_scenario, workers_of
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
 from airl_mav.experiments.live import Ended, FlownRun
@@ -88,6 +88,8 @@ def seek_verdict(
     target, undelayed = cells["target"], cells["reference"]
     out = out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{file_name(declared.name)}"
     check_folder(out, comparison_file(out, declared.kind).name)
+    for warning in known_seeds((target,)):
+        progress.note(warning, "yellow")
     with workers_of(scenario) as executor:
         fly = partial(_fly, out=out, progress=progress, executor=executor)
         for n in _looks(scenario.episodes, _planned(out / target.name)):

@@ -155,6 +155,12 @@ def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str
     assert not (tmp_path / "out").exists()
 
 
+def test_seeds_that_the_policy_has_learned_from_are_told(tmp_path: Path) -> None:
+    code, text = verdict(tmp_path / "out", seed=1_000_000, episodes=20)
+    assert "was trained on seeds from 1000000 on" in text
+    assert code in (0, 3, 5)
+
+
 def test_other_folders_are_left_alone(whole: tuple[Path, str]) -> None:
     with pytest.raises(UsageError, match="holds a single run"):
         verdict(whole[0] / TARGET)
