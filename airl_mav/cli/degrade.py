@@ -8,23 +8,14 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.gate import Gate
 from airl_mav.cli.options import POSITIONAL, scenario_of
-from airl_mav.core.fields import quantity
 from airl_mav.experiments.degrade import LATENCIES, declare_degradation
-from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import (
-    DEFAULT_ARENA,
-    DEFAULT_POLICY,
-    Decisions,
-    Flights,
-    Lateness,
-    LevelName,
-)
+from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY, ArenaName
 
 
-class DegradeOptions(Gate, Flights, Lateness, Decisions, Aircraft):
+class DegradeOptions(Gate, ExperimentOptions):
     """Fly policies at growing latencies on the same seeds: what every step costs, as curves.
 
     The same --out goes on with what was interrupted.
@@ -44,11 +35,8 @@ class DegradeOptions(Gate, Flights, Lateness, Decisions, Aircraft):
         description="sources of t2 as latency takes them, growing; native: none injected; the first"
         " is the reference",
     )
-    arena: str = Field(
-        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
-    )
-    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
-    episodes: int = quantity("episodes at each latency", "1", ge=1, le=100_000, default=300)
+    arena: ArenaName = DEFAULT_ARENA
+    episodes: int = episodes("episodes at each latency", 300)
     out: Path | None = Field(
         default=None,
         description="folder of the curve: a run folder for each latency, degradation.json and"

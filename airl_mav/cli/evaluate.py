@@ -8,10 +8,9 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, RENAMED, scenario_of
-from airl_mav.core.fields import quantity
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
 from airl_mav.experiments.experiment import known_seeds
@@ -20,11 +19,9 @@ from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.flight.record import run_sha256
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_report import show_report, verdict_of
-from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import Decisions, Flights, Lateness, LevelName
 
 
-class EvaluateOptions(Gate, Flights, Lateness, Decisions, Aircraft):
+class EvaluateOptions(Gate, ExperimentOptions):
     """Fly policies through seeded episodes: success, time, distance and energy with intervals.
 
     Several policies or arenas give a table of policies x arenas. The same --out goes on with what
@@ -45,8 +42,7 @@ class EvaluateOptions(Gate, Flights, Lateness, Decisions, Aircraft):
         description="arena profiles: shipped names, or paths to .toml files; by default those that"
         " the policies were trained in, or static-obstacles",
     )
-    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
-    episodes: int = quantity("number of episodes in each arena", "1", ge=1, le=100_000, default=100)
+    episodes: int = episodes("number of episodes in each arena", 100)
     on_card: bool = Field(
         default=False,
         description="write the results onto the policies' cards, in place of earlier ones of the"

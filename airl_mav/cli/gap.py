@@ -7,28 +7,13 @@ from pathlib import Path
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import fly_and_show
-from airl_mav.cli.gate import Gate
+from airl_mav.cli.experiments import OnboardOptions, episodes, fly_and_show
 from airl_mav.cli.options import scenario_of
-from airl_mav.core.fields import quantity
-from airl_mav.experiments.gap import (
-    DEFAULT_COMPUTER,
-    DEFAULT_MITIGATED,
-    DEFAULT_REFERENCE,
-    declare_gap,
-)
-from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import (
-    DEFAULT_ARENA,
-    DEFAULT_POLICY,
-    Decisions,
-    Flights,
-    Lateness,
-    LevelName,
-)
+from airl_mav.experiments.gap import DEFAULT_MITIGATED, declare_gap
+from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY
 
 
-class GapOptions(Gate, Flights, Lateness, Decisions, Aircraft):
+class GapOptions(OnboardOptions):
     """Measure the hardware gap: what a policy loses on an onboard computer, and with mitigation.
 
     The policy on a workstation and on the onboard computer; a policy that was trained as late as
@@ -52,33 +37,12 @@ class GapOptions(Gate, Flights, Lateness, Decisions, Aircraft):
         description="policy that was trained as late as the computer decides: a name, or a path;"
         " none: fly the gap without mitigation only",
     )
-    computer: str = Field(
-        default=DEFAULT_COMPUTER,
-        description="onboard computer: a shipped profile, or a path to a .toml",
-    )
-    reference: str = Field(
-        default=DEFAULT_REFERENCE,
-        description="computer that the gap is measured from: a shipped profile, or a path",
-    )
-    reference_workload: str | None = Field(
-        default=None,
-        description="workload of the reference; by default the target's if the reference has it,"
-        " otherwise what was measured there for the very policy, or else 1 ms (gym, lockstep), or"
-        " what this machine takes (sitl)",
-    )
     arena: tuple[str, ...] = Field(
         default=(DEFAULT_ARENA,),
         min_length=1,
         description="arena profiles: shipped names, or paths; of several, each gets its tables",
     )
-    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
-    episodes: int = quantity(
-        "episodes of each policy on each computer in each arena",
-        "1",
-        ge=1,
-        le=100_000,
-        default=1000,
-    )
+    episodes: int = episodes("episodes of each policy on each computer in each arena", 1000)
     out: Path | None = Field(
         default=None,
         description="folder of the gap: a run folder for each policy on each computer, gap.json,"

@@ -8,17 +8,16 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.experiments import fly_and_show
+from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.evaluate import training_arena
 from airl_mav.experiments.ladder import LEVELS, declare_ladder
 from airl_mav.policy.registry import find_policy
-from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import Decisions, Flights, Lateness, LevelName
+from airl_mav.scenario.model import LevelName
 
 
-class LadderOptions(Flights, Lateness, Decisions, Aircraft):
+class LadderOptions(ExperimentOptions):
     """Fly the same policy and seeds at several levels of fidelity, and say what differs.
 
     Success, flight time, distance and energy side by side, with the differences from the first
@@ -37,7 +36,7 @@ class LadderOptions(Flights, Lateness, Decisions, Aircraft):
         default=None,
         description="arena profile; by default that which the policy was trained in",
     )
-    episodes: int = quantity("episodes at each level", "1", ge=1, le=100_000, default=100)
+    episodes: int = episodes("episodes at each level", 100)
     levels: tuple[LevelName, ...] = Field(
         default=LEVELS, description="levels that fly, two or more; the first is the reference"
     )

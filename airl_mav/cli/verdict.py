@@ -8,26 +8,26 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
-from airl_mav.core.fields import quantity
 from airl_mav.core.progress import RichProgress
-from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
+from airl_mav.flight.sequential import LOOKS
 from airl_mav.report.comparison.show import print_comparison
-from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
-    Decisions,
+    ArenaName,
     Flights,
-    Lateness,
     LevelName,
 )
 
+DEFAULT_REQUIREMENT = "success >= 95 %"
 
-class VerdictOptions(Gate, Flights, Lateness, Decisions, Aircraft):
+
+class VerdictOptions(OnboardOptions):
     """Fly a policy as late as an onboard computer decides, until its success rate is decided.
 
     Flights are added until they show that the rate is reached, or that it is not; a verdict is
@@ -43,25 +43,20 @@ class VerdictOptions(Gate, Flights, Lateness, Decisions, Aircraft):
         default=DEFAULT_POLICY,
         description="a name, or a path to a folder with policy.onnx and card.json",
     )
+    arena: ArenaName = DEFAULT_ARENA
     require: Annotated[tuple[str, ...], REPEATED] = Field(
-        default=("success >= 95 %",), description=Gate.model_fields["require"].description
-    )
-    computer: str = Field(
-        default=DEFAULT_COMPUTER,
-        description="onboard computer: a shipped profile, or a path to a .toml",
-    )
-    reference: str = Field(
-        default=DEFAULT_REFERENCE,
-        description="computer that the flights are compared with: a shipped profile, or a path",
-    )
-    arena: str = Field(
-        default=DEFAULT_ARENA, description="arena profile: a shipped name, or a path to a .toml"
+        default=(),
+        description=f"{Gate.model_fields['require'].description}; by default"
+        f" '{DEFAULT_REQUIREMENT}'",
     )
     level: LevelName = Field(
         default="lockstep", description=Flights.model_fields["level"].description
     )
-    episodes: int = quantity(
-        "greatest number of flights on the onboard computer", "1", ge=1, le=100_000, default=500
+    episodes: int = episodes(
+        "greatest number of flights on the onboard computer; it is looked whether they decide after"
+        f" {', '.join(map(str, LOOKS[:10]))}, ...",
+        500,
+        LOOKS[0],
     )
     out: Path | None = Field(
         default=None,
@@ -80,12 +75,15 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
     verdict, 130 Ctrl-C.
     """
     console = console or Console()
-    requirements = requirements_of(options)
+    # Not the field's default: what is given would be added to it.
+    asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})
+    requirements = requirements_of(asked)
     with RichProgress(console) as progress:
         sought = seek_verdict(
             scenario_of(options),
             requirements,
             reference=options.reference,
+            reference_workload=options.reference_workload,
             out=options.out,
             progress=progress,
         )

@@ -195,6 +195,7 @@ def run_experiment(experiment: Experiment, out: Path | None, progress: Progress)
         experiment.declaration,
         command=" ".join(sys.argv),
         free=free_fields("gym"),
+        growing=("episodes",),
         say=lambda text: progress.note(text, "yellow"),
     ) as store:
         for level, group in groupby(
@@ -231,7 +232,11 @@ def _fly_live(
     tell: Callable[[CellRun], None],
 ) -> CampaignRun:
     runs: list[CellRun] = []
+    first_of = shared_flights(cells)
     for cell in cells:
+        if (first := first_of[cell.name]) is not cell:
+            runs.append(replace(next(run for run in runs if run.cell is first), cell=cell))
+            continue
         flown = fly_live(cell.scenario, store.cell_path(cell.name), progress, name=cell.name)
         runs.append(CellRun(cell, flown.path, flown.episodes, flown.new))
         if flown.ended != "complete":

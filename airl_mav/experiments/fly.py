@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
 
 from airl_mav.core.progress import Progress, RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
+from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
@@ -20,21 +21,41 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
-def fly_scenario(scenario: ResolvedScenario, out: Path | None, progress: Progress) -> FlownRun:
+def workers_of(asked: Scenario) -> AbstractContextManager[Executor | None]:
+    """Give who flies a scenario; None at level sitl, whose processes are those of one run."""
+    return (
+        nullcontext()
+        if asked.level == "sitl"
+        else open_executor(asked, in_process=asked.level == "gym")
+    )
+
+
+def fly_scenario(
+    scenario: ResolvedScenario,
+    out: Path | None,
+    progress: Progress,
+    *,
+    executor: Executor | None = None,
+) -> FlownRun:
     """Fly what is left of a scenario at any level, several flights at a time where that can be.
 
     Ctrl-C and SIGTERM end it with what has ended kept; all else as of `live.fly_live`.
+
+    Args:
+        scenario: What is flown.
+        out: Run folder; see there.
+        progress: Who looks on.
+        executor: Who flies, of `workers_of`, where several scenarios share workers; None: this one
+            gets its own.
     """
     asked = scenario.scenario
     name = run_name(scenario)
     if asked.level == "sitl":
         return fly_live(scenario, out, progress, name=name)
     cell = Cell(name, f"{scenario.policy.name} in {scenario.arena_name}", scenario)
-    with (
-        stop_on_signals() as stop,
-        open_executor(asked, in_process=asked.level == "gym") as executor,
-    ):
-        run = run_cell(out, cell, executor, progress=progress, stop=stop)
+    with stop_on_signals() as stop, nullcontext(executor) if executor else workers_of(asked) as who:
+        assert who is not None  # noqa: S101 (the level is not sitl)
+        run = run_cell(out, cell, who, progress=progress, stop=stop)
     (flown,) = run.cells
     tell_end(flown.path, run.ended, run.error or "", progress)
     return FlownRun(flown.path, run.ended, flown.episodes, flown.new, run.error or "")

@@ -35,4 +35,5 @@ def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Ex
     if in_process and workers == 1:
         yield InProcessExecutor()
         return
-    yield ProcessExecutor(workers)
+    with ProcessExecutor(workers) as executor:
+        yield executor

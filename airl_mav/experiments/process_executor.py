@@ -20,7 +20,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from types import ModuleType
-from typing import Any, ClassVar, Generic
+from typing import Any, ClassVar, Generic, NamedTuple
 
 from airl_mav.experiments.executors import (
     ONE_THREAD,
@@ -41,12 +41,25 @@ END_S = 5.0
 """A worker without work ends by itself in so long, or is killed [wall s]."""
 
 
-@dataclass(frozen=True)
 class ProcessExecutor:
-    """Worker processes of this machine, at most `workers` at a time, one thread each."""
+    """Worker processes of this machine, at most `workers` at a time, one thread each.
 
-    workers: int
+    They live on from run to run, until the executor is closed: a context manager does that.
+    """
+
     streams: ClassVar[bool] = False
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self._idle: list[_Idle] = []
+
+    def __enter__(self) -> ProcessExecutor:
+        """Return it: no process is started before it has a job."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the workers."""
+        self.close()
 
     def run(
         self,
@@ -57,9 +70,9 @@ class ProcessExecutor:
         stop: Stop = never,
         lost: Callable[[str], None] = lambda _: None,
     ) -> Results[J, R]:
-        """Carry out jobs; see `executors.Executor`. No process is started before it has a job."""
+        """Carry out jobs; see `executors.Executor`. Only workers that are busy end with it."""
         waiting = iter(jobs)
-        pool: _Pool[J] = _Pool(start)
+        pool: _Pool[J] = _Pool(start, self._idle)
         try:
             while len(pool.busy) < self.workers and not stop():
                 try:
@@ -88,6 +101,22 @@ class ProcessExecutor:
         finally:
             pool.end()
 
+    def close(self) -> None:
+        """End the workers, which have nothing to do."""
+        for idle in self._idle:
+            idle.connection.close()
+        for idle in self._idle:
+            idle.process.join(END_S)
+            _remove(idle.process)
+        self._idle.clear()
+
+
+class _Idle(NamedTuple):
+    """A worker without work."""
+
+    connection: Connection
+    process: BaseProcess
+
 
 @dataclass
 class _Worker(Generic[J]):
@@ -103,29 +132,38 @@ class _Worker(Generic[J]):
 class _Pool(Generic[J]):
     """The worker processes of one run."""
 
-    def __init__(self, start: Start[J, Any]) -> None:
+    def __init__(self, start: Start[J, Any], idle: list[_Idle]) -> None:
         self._start = start
         self.busy: dict[Connection, _Worker[J]] = {}
-        self._ending: list[BaseProcess] = []
-        """Those without work."""
+        self._idle = idle
+        """Those without work: they are taken before new ones are started."""
 
     def hire(self, job: J, attempt: int = 1) -> None:
-        """Start a worker with its first job."""
-        ours, process = _spawn(self._start)
-        self.busy[ours] = _Worker(process, job, attempt)
-        _send(ours, job)
+        """Take a worker and give it its first job of this run."""
+        worker = self._take_idle() or _spawn()
+        self.busy[worker.connection] = _Worker(worker.process, job, attempt)
+        _send(worker.connection, (self._start, job))
+
+    def _take_idle(self) -> _Idle | None:
+        """Return a worker without work; those that were lost meanwhile are passed over."""
+        while self._idle:
+            worker = self._idle.pop()
+            if worker.process.is_alive():
+                return worker
+            worker.connection.close()
+            _remove(worker.process)
+        return None
 
     def give(self, connection: Connection, waiting: Iterator[J]) -> None:
-        """Give a worker its next job, or let it go."""
+        """Give a worker its next job, or let it wait for the next run."""
         worker = self.busy[connection]
         try:
             worker.job, worker.attempt = next(waiting), 1
         except StopIteration:
             del self.busy[connection]
-            connection.close()
-            self._ending.append(worker.process)
+            self._idle.append(_Idle(connection, worker.process))
         else:
-            _send(connection, worker.job)
+            _send(connection, (None, worker.job))
 
     def bury(self, connection: Connection) -> str:
         """Remove a worker that was lost; return how it ended."""
@@ -138,19 +176,20 @@ class _Pool(Generic[J]):
         return cause
 
     def end(self) -> None:
-        """End all workers: those at work at once."""
+        """End the workers that are at work, at once."""
         for connection, worker in self.busy.items():
             worker.process.kill()
             connection.close()
-            self._ending.append(worker.process)
+        for worker in self.busy.values():
+            _remove(worker.process)
         self.busy.clear()
-        for process in self._ending:
-            process.join(END_S)
-            if process.exitcode is None:
-                process.kill()
-                process.join()
-            process.close()
-        self._ending.clear()
+
+
+def _remove(process: BaseProcess) -> None:
+    """End a process, if it has not ended by itself, and free what is kept of it."""
+    process.kill()
+    process.join()
+    process.close()
 
 
 def _send(connection: Connection, job: Any) -> None:
@@ -159,20 +198,20 @@ def _send(connection: Connection, job: Any) -> None:
         connection.send(job)
 
 
-def _spawn(start: Start[Any, Any]) -> tuple[Connection, BaseProcess]:
+def _spawn() -> _Idle:
     """Start a worker; return the parent's end of its pipe, and the process."""
     context = multiprocessing.get_context("spawn")
     # Would be started with the first worker otherwise, and let Ctrl-C through again.
     resource_tracker.ensure_running()
     ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(theirs, start), daemon=True)
+    process = context.Process(target=_serve, args=(theirs,), daemon=True)
     with ExitStack() as stack:
         stack.enter_context(theirs)
         stack.enter_context(_environment(ONE_THREAD))
         stack.enter_context(_interrupts_blocked())
         stack.enter_context(_program_hidden())
         process.start()
-    return ours, process
+    return _Idle(ours, process)
 
 
 @contextmanager
@@ -227,21 +266,26 @@ def _cause(exitcode: int | None) -> str:
 # --- in the worker
 
 
-def _serve(connection: Connection, start: Start[Any, Any]) -> None:
-    """Carry out jobs until the pipe is closed."""
+def _serve(connection: Connection) -> None:
+    """Carry out jobs until the pipe is closed; the first one of a run says how to start."""
     _end_with_parent()
+    start: Start[Any, Any] | None = None
     work: Work[Any, Any] | None = None
 
     def carry_out(job: Any) -> Iterable[Any]:
-        nonlocal work
-        work = work or start(never)
+        nonlocal start, work
+        if start is not None:
+            work = None  # What was loaded for the run before goes first.
+            work, start = start(never), None
+        assert work is not None  # noqa: S101 (no run begins without a start)
         return work(job)
 
     while True:
         try:
-            job = connection.recv()
+            new, job = connection.recv()
         except EOFError:
             return
+        start = new or start
         told = answer(partial(carry_out, job))
         try:
             connection.send(told)

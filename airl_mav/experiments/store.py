@@ -98,6 +98,7 @@ def open_campaign(
     *,
     command: str,
     free: Collection[str] = (),
+    growing: Collection[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> Iterator[CampaignStore]:
     """Keep the folder of a campaign, new or to be gone on with, to this process.
@@ -109,6 +110,7 @@ def open_campaign(
         declaration: What is asked for.
         command: The command line, for a new campaign.
         free: Settings that may differ when it goes on, a table of them by its name.
+        growing: Numbers among the cells' settings that may be greater when it goes on.
         say: Is told when another process has the folder.
 
     Raises:
@@ -117,17 +119,23 @@ def open_campaign(
     """
     path = path.absolute()
     with locked(path, say):
-        yield CampaignStore(path, _declare(path, declaration, command, free))
+        yield CampaignStore(path, _declare(path, declaration, command, free, growing))
 
 
-def _declare(path: Path, declaration: Declaration, command: str, free: Collection[str]) -> Campaign:
+def _declare(
+    path: Path,
+    declaration: Declaration,
+    command: str,
+    free: Collection[str],
+    growing: Collection[str],
+) -> Campaign:
     """Write the declaration, unless it contradicts the one that is there."""
     check_folder(path, CAMPAIGN_FILE)
     if not (path / CAMPAIGN_FILE).exists():
         campaign = Campaign(declaration, provenance(command))
     else:
         held = load_campaign(path)
-        if difference := _difference(held.declaration, declaration, free):
+        if difference := _difference(held.declaration, declaration, free, growing):
             raise UsageError(
                 f"--out {path}: holds a campaign with {difference}; accepted: another folder, or "
                 "the same settings to go on"
@@ -139,14 +147,19 @@ def _declare(path: Path, declaration: Declaration, command: str, free: Collectio
     return campaign
 
 
-def _difference(held: Declaration, asked: Declaration, free: Collection[str]) -> str | None:
+def _difference(
+    held: Declaration, asked: Declaration, free: Collection[str], growing: Collection[str]
+) -> str | None:
     """Return the first setting that differs, or None."""
     if held.kind != asked.kind:
         return f"kind = {held.kind!r}, not {asked.kind!r}"
     if difference := another_config(held.settings, asked.settings, free):
         return difference
     for name, cell in asked.cells.items():
-        theirs = held.cells.get(name)
-        if theirs and (difference := another_config(theirs.settings, cell.settings, free)):
+        if (theirs := held.cells.get(name)) is None:
+            continue
+        old, new = theirs.settings, cell.settings
+        grown = {each for each in growing if old.get(each, 0) < new.get(each, 0)}
+        if difference := another_config(old, new, {*free, *grown}):
             return f"another cell {name}: {difference}"
     return None

@@ -1,31 +1,33 @@
 """`airl verdict`: fly until it is decided whether a policy holds on an onboard computer.
 
-Flights are added in steps, and after each step the success rate is tested in a way that may be
-looked at any number of times (`flight.sequential`). What is required besides is judged once, on the
-flights that this took.
+Flights are added in steps, and after each step the success rate is tested in a way that allows for
+all of these looks (`flight.sequential`). What is required besides is judged once, on the flights
+that this took.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import Experiment, entry_of
-from airl_mav.experiments.fly import fly_scenario
+from airl_mav.experiments.executors import Executor
+from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
+from airl_mav.experiments.fly import fly_scenario, workers_of
 from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
-from airl_mav.experiments.live import Ended
-from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.requirements import Finding, Requirement
-from airl_mav.flight.sequential import Decision, RateTest
-from airl_mav.rehearsal.run_folder import RUN_FILE, load
-from airl_mav.report.comparison.model import Comparison
+from airl_mav.experiments.live import Ended, FlownRun
+from airl_mav.flight.requirements import Requirement
+from airl_mav.flight.sequential import LOOKS, Decision
+from airl_mav.flight.statistics import reached_goals
+from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
+from airl_mav.report.comparison.model import Comparison, comparison_file
 from airl_mav.report.comparison.show import (
+    FLOWN_UNTIL,
     Runs,
     build_comparison,
     judge_comparison,
@@ -34,9 +36,6 @@ from airl_mav.report.comparison.show import (
 from airl_mav.report.verdict import OverallVerdict
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-
-STEPS = (20, 40, 60, 80, 100, 150, 200, 300, 400, 600, 800, 1000, 1500, 2000, 3000, 5000, 10_000)
-"""Numbers of flights after which it is looked whether they decide."""
 
 
 @dataclass(frozen=True)
@@ -76,96 +75,62 @@ def seek_verdict(
     Raises:
         UsageError: It cannot be flown, or the folder holds another verdict's flights.
     """
-    tests = {each: _test_of(each) for each in requirements if _is_rate(each)}
+    tests = [each.test() for each in requirements if each.least_rate]
     if not tests:
         raise FieldError("require", accepted="at least one least success rate: 'success >= 95 %'")
-    declared = _declare(scenario, reference, reference_workload)
-    out = out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{declared.name}"
-    target, undelayed = (_role(declared, role) for role in ("target", "reference"))
-    episodes: Sequence[EpisodeRecord] = ()
-    n = 0
-    for n in _steps(scenario.episodes, _planned(out / target.name)):
-        ended, episodes = _fly(target, n, out, progress)
-        if ended != "complete":
-            return SoughtVerdict(out, ended)
-        decided = [test.decide(*_count(episodes)) for test in tests.values()]
-        if Decision.UNDECIDED not in decided:
-            break
-    ended, _ = _fly(undelayed, max(n, _planned(out / undelayed.name)), out, progress)
-    if ended != "complete":
-        return SoughtVerdict(out, ended)
-    entries = [entry_of(cell, cell.name) for cell in (undelayed, target)]
-    comparison, runs = build_comparison(out, "gap", {**declared.facts, "episodes": n}, entries)
-    verdict = judge_comparison(comparison, runs, requirements)
-    verdict = replace(
-        verdict,
-        findings=tuple(
-            _settled(finding, tests[finding.requirement], episodes)
-            if finding.requirement in tests
-            else finding
-            for finding in verdict.findings
-        ),
+    declared = declare_gap(
+        scenario,
+        mitigated=NOT_MITIGATED,
+        reference=reference,
+        reference_workload=reference_workload,
     )
+    cells = {cell.role: cell for cell in declared.cells}
+    target, undelayed = cells["target"], cells["reference"]
+    out = out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-verdict-{file_name(declared.name)}"
+    check_folder(out, comparison_file(out, declared.kind).name)
+    for warning in known_seeds((target,)):
+        progress.note(warning, "yellow")
+    with workers_of(scenario) as executor:
+        fly = partial(_fly, out=out, progress=progress, executor=executor)
+        for n in _looks(scenario.episodes, _planned(out / target.name)):
+            flown = fly(target, n)
+            if flown.ended != "complete":
+                return SoughtVerdict(out, flown.ended)
+            reached = reached_goals(flown.episodes)
+            decided = all(test.decide(reached) is not Decision.UNDECIDED for test in tests)
+            # Of flights that stayed invalid there is no verdict, and more do not make one.
+            if decided or len(reached) < n:
+                break
+        flown = fly(undelayed, max(n, _planned(out / undelayed.name)))
+    if flown.ended != "complete":
+        return SoughtVerdict(out, flown.ended)
+    facts = {**declared.facts, "episodes": n, FLOWN_UNTIL: "the success rate was decided"}
+    # The number planned is that of the last look, as the run says itself.
+    entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
+    comparison, runs = build_comparison(out, declared.kind, facts, entries)
+    verdict = judge_comparison(comparison, runs, requirements)
     page = write_comparison(comparison, runs, out, verdict)
     return SoughtVerdict(out, "complete", verdict, comparison, runs, page)
 
 
-def _declare(scenario: Scenario, reference: str, workload: str | None) -> Experiment:
-    return declare_gap(
-        scenario, mitigated=NOT_MITIGATED, reference=reference, reference_workload=workload
-    )
-
-
-def _role(experiment: Experiment, role: str) -> Cell:
-    (cell,) = (cell for cell in experiment.cells if cell.role == role)
-    return cell
-
-
 def _fly(
-    cell: Cell, n: int, out: Path, progress: Progress
-) -> tuple[Ended, Sequence[EpisodeRecord]]:
+    cell: Cell, n: int, *, out: Path, progress: Progress, executor: Executor | None
+) -> FlownRun:
     """Fly the first n episodes of a cell, as far as they are not there."""
     asked = cell.scenario.scenario.model_copy(update={"episodes": n})
-    flown = fly_scenario(resolve(asked), out / cell.name, progress)
-    return flown.ended, flown.episodes
+    return fly_scenario(resolve(asked), out / cell.name, progress, executor=executor)
 
 
 def _planned(run: Path) -> int:
     """Return how many episodes a run folder plans; 0: there is none."""
-    return len(load(run).info.seeds) if (run / RUN_FILE).exists() else 0
+    return len(load_info(run).seeds) if (run / RUN_FILE).exists() else 0
 
 
-def _steps(most: int, planned: int) -> list[int]:
-    """Return the numbers of flights to look at: a run that was begun goes on where it was."""
-    steps = sorted({step for step in STEPS if planned < step < most} | {most})
-    return [planned, *steps] if 0 < planned < most else steps
+def _looks(most: int, planned: int) -> list[int]:
+    """Return the numbers of flights to look at: a run that was begun goes on where it was.
 
-
-def _is_rate(requirement: Requirement) -> bool:
-    return (requirement.measure, requirement.gap, requirement.sense) == ("success", False, ">=")
-
-
-def _test_of(requirement: Requirement) -> RateTest:
-    """Return the test of a least success rate. Raises FieldError for one of 100 %."""
-    if requirement.limit >= 100.0:
-        raise FieldError(
-            "require", str(requirement), "a success rate below 100 %: no number of flights shows it"
-        )
-    return RateTest(0.01 * requirement.limit)
-
-
-def _count(episodes: Sequence[EpisodeRecord]) -> tuple[int, int]:
-    """Return how many flights reached the goal, and how many there are."""
-    valid = [episode for episode in episodes if not episode.invalid]
-    return sum(episode.outcome is Outcome.SUCCESS for episode in valid), len(valid)
-
-
-def _settled(finding: Finding, test: RateTest, episodes: Sequence[EpisodeRecord]) -> Finding:
-    """Return a finding as the test that may be looked at again and again decides it."""
-    successes, n = _count(episodes)
-    decision = test.decide(successes, n)
-    more = None
-    if decision is Decision.UNDECIDED and n:
-        needed = test.flights_needed(successes / n)
-        more = None if needed is None else max(1, needed - n)
-    return replace(finding, decision=decision, more_flights=more)
+    Raises FieldError if the greatest number is below the first look.
+    """
+    if most < LOOKS[0]:
+        raise FieldError("episodes", most, f"value >= {LOOKS[0]}, the first look")
+    return [look for look in LOOKS if planned <= look <= max(most, planned)] or [planned]

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.sequential import MOST_FLIGHTS, Decision
+from airl_mav.flight.sequential import Decision, RateTest
 from airl_mav.flight.statistics import Aggregate, Estimate, wilson
+
+MOST_FLIGHTS = 1_000_000
+"""A decision that would take more flights than this is called out of reach."""
 
 
 class Measure(NamedTuple):
@@ -72,6 +75,19 @@ class Requirement:
         """Return the requirement as it is written."""
         gap = " gap" if self.gap else ""
         return f"{self.measure}{gap} {self.sense} {self.limit:g} {self.unit}"
+
+    @property
+    def least_rate(self) -> bool:
+        """Whether it is a least success rate: what can be tested as flights come in."""
+        return (self.measure, self.gap, self.sense) == ("success", False, ">=")
+
+    def test(self) -> RateTest:
+        """Return the test of a least success rate. Raises FieldError for one of 100 %."""
+        if self.limit >= 100.0:
+            raise FieldError(
+                "require", str(self), "a success rate below 100 %: no number of flights shows it"
+            )
+        return RateTest(0.01 * self.limit)
 
     def fulfilled_by(self, value: float) -> bool:
         """Return whether a value, in `unit`, keeps within the bound."""
@@ -156,6 +172,25 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
         rate = requirement.measure == "success" and not requirement.gap
         more = _more_flights(requirement, estimate, wilson_percent if rate else None)
     return Finding(requirement, decision, estimate, more)
+
+
+def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
+    """Return a finding as it is where flights were added until a least success rate was decided.
+
+    The interval would be wrong more often than it says: it was looked at again and again.
+
+    Args:
+        finding: What the interval says; other requirements keep it.
+        reached: Whether each flight, in the order of the seeds, was a success.
+    """
+    if not finding.requirement.least_rate:
+        return finding
+    test, n = finding.requirement.test(), len(reached)
+    decision, more = test.decide(reached), None
+    if decision is Decision.UNDECIDED and n:
+        needed = test.flights_needed(sum(reached) / n, n)
+        more = None if needed is None else needed - n
+    return replace(finding, decision=decision, more_flights=more)
 
 
 def decide(requirement: Requirement, estimate: Estimate) -> Decision:

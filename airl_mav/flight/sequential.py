@@ -1,33 +1,36 @@
-"""Tests of a success rate that may be looked at after every flight, and stopped at any of them.
+"""Is a success rate at least a threshold? A test that is looked at as flights come in.
 
-Looking at an ordinary interval after each flight and stopping when it has decided makes false
-verdicts as often as one looks. An e-process does not: against a hypothesis that is true, it reaches
-1 / alpha with a probability of alpha at most, over all looks together (Ville's inequality; Ramdas
-et al., Game-Theoretic Statistics and Safe Anytime-Valid Inference, Statistical Science 38, 2023).
+Looking at an ordinary interval again and again, and stopping when it has decided, makes false
+verdicts as often as one looks. A group-sequential test shares the error out over looks that are
+planned beforehand (Lan & DeMets, Biometrika 70, 1983; Jennison & Turnbull, Group Sequential Methods
+with Applications to Clinical Trials, 2000, chapters 7 and 12). Flights are counted, so the error is
+worked out exactly, by binomial sums, not by a normal approximation.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import special
+from scipy import stats
 
 ALPHA = 0.05
-"""Greatest probability of a false verdict, over all looks at a campaign."""
+"""Greatest probability of a false verdict over all looks: half of it for "meets" where the rate is
+too low, half of it for "does not meet" where it is not, as a 95 % interval shares it out."""
 
-MOST_FLIGHTS = 1_000_000
-"""A verdict that would take more flights than this is called out of reach."""
+LOOKS = (
+    *(20, 40, 60, 80),
+    *(scale * step for scale in (10, 100, 1000) for step in (10, 15, 20, 30, 40, 50, 70)),
+    100_000,
+)
+"""Numbers of flights after which it is looked whether they decide."""
 
-# What failures are weighed against: odds of a failure that lie a factor from the threshold's. The
-# weights decide how soon a verdict comes, never whether it is right. Most lies on a factor of 2 to
-# 3: the difference that a hundred flights can show.
-_LOG_FACTORS: NDArray[np.float64] = np.log(2.0) * np.arange(0.125, 5.001, 0.125)
-_WEIGHTS: NDArray[np.float64] = np.exp(-0.5 * ((_LOG_FACTORS - math.log(2.5)) / 0.7) ** 2)
-_LOG_WEIGHTS: NDArray[np.float64] = np.log(_WEIGHTS / _WEIGHTS.sum())
+HALF_SPENT = 100
+"""Number of flights by which half of the error is spent: such as a decision may well take.
+`benchmarks/bench_verdict.py` compares the flights that this and other ways of spending it take."""
 
 
 class Decision(str, Enum):
@@ -38,60 +41,105 @@ class Decision(str, Enum):
     UNDECIDED = "too few flights to tell"
 
 
+def error_spent(flights: int) -> float:
+    """Return how much error either side may have made by so many flights.
+
+    It grows for ever and never reaches half of `ALPHA`: how many flights there are at most need not
+    be known beforehand.
+    """
+    return 0.5 * ALPHA * flights / (flights + HALF_SPENT)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What decides after so many flights."""
+
+    flights: int
+    few: int
+    """So many failures, or fewer, show that the threshold is met; -1: none can."""
+    many: int
+    """So many failures, or more, show that it is not."""
+
+    def decide(self, failures: int) -> Decision:
+        """Return what failures among the flights show."""
+        if failures <= self.few:
+            return Decision.MET
+        return Decision.NOT_MET if failures >= self.many else Decision.UNDECIDED
+
+
+def plan_looks(
+    threshold: float,
+    looks: Sequence[int] = LOOKS,
+    spent: Callable[[int], float] = error_spent,
+) -> Iterator[Look]:
+    """Give the looks of a test, one after the other.
+
+    Both errors are greatest at the threshold itself. There, what campaigns that are still undecided
+    have come to is carried from look to look as a distribution of their failures; as many of its
+    outermost counts decide as the error that may be spent by then permits.
+
+    Args:
+        threshold: Success rate, between 0 and 1, both excluded.
+        looks: Numbers of flights, growing.
+        spent: Error that either side may have made by so many flights.
+    """
+    undecided, fewest, before = np.ones(1), 0, 0
+    error_few = error_many = 0.0
+    for flights in looks:
+        step = flights - before
+        new = stats.binom.pmf(np.arange(step + 1), step, 1.0 - threshold)
+        undecided, before = np.convolve(undecided, new), flights
+        left_few = spent(flights) - error_few
+        left_many = spent(flights) - error_many
+        n_few = int(np.searchsorted(np.cumsum(undecided), left_few, side="right"))
+        n_many = int(np.searchsorted(np.cumsum(undecided[::-1]), left_many, side="right"))
+        kept = undecided.size - n_many
+        error_few += float(undecided[:n_few].sum())
+        error_many += float(undecided[kept:].sum())
+        # The fewest failures that are possible are none, or one more than decided before.
+        yield Look(flights, fewest + n_few - 1, fewest + kept)
+        undecided, fewest = undecided[n_few:kept], fewest + n_few
+
+
+@cache
+def _planned(threshold: float, looks: int) -> tuple[Look, ...]:
+    return tuple(plan_looks(threshold, LOOKS[:looks]))
+
+
 @dataclass(frozen=True)
 class RateTest:
-    """Is a success rate at least a threshold, or below it?"""
+    """Is a success rate at least a threshold, or below it? Looked at after each of `LOOKS`."""
 
     threshold: float
     """Between 0 and 1, both excluded."""
-    alpha: float = ALPHA
 
     def __post_init__(self) -> None:
         """Raise ValueError for a threshold that no number of flights can show."""
         if not 0.0 < self.threshold < 1.0:
             raise ValueError(f"threshold={self.threshold}: must be > 0 and < 1")
 
-    def decide(self, successes: int, n: int) -> Decision:
-        """Return what n flights, of which some were successes, show. May be asked after each."""
-        limit = -math.log(self.alpha)
-        if self._log_evidence(n - successes, n, 1.0) >= limit:
-            return Decision.NOT_MET
-        if self._log_evidence(n - successes, n, -1.0) >= limit:
-            return Decision.MET
+    def decide(self, reached: Sequence[bool]) -> Decision:
+        """Return what the first look that decides has shown; later flights do not change it.
+
+        Args:
+            reached: Whether each flight, in the order of the seeds, was a success.
+        """
+        done = sum(look <= len(reached) for look in LOOKS)
+        for look in _planned(self.threshold, done):
+            decision = look.decide(look.flights - sum(reached[: look.flights]))
+            if decision is not Decision.UNDECIDED:
+                return decision
         return Decision.UNDECIDED
 
-    def flights_needed(self, rate: float) -> int | None:
-        """Return after how many flights a rate would decide; None beyond `MOST_FLIGHTS`.
+    def flights_needed(self, rate: float, flown: int = 0) -> int | None:
+        """Return after how many flights a rate would decide; None: after none of `LOOKS`.
 
         Args:
             rate: Success rate that the flights would keep, 0 to 1.
+            flown: Number of flights that have not decided.
         """
-
-        def decides(n: int) -> bool:
-            return self.decide(round(rate * n), n) is not Decision.UNDECIDED
-
-        enough = 1
-        while not decides(enough):
-            enough *= 2
-            if enough > MOST_FLIGHTS:
-                return None
-        short = enough // 2
-        while enough - short > 1:
-            middle = (short + enough) // 2
-            short, enough = (short, middle) if decides(middle) else (middle, enough)
-        return enough
-
-    def _log_evidence(self, failures: int, n: int, side: float) -> float:
-        """Return the logarithm of the e-value of one side.
-
-        Args:
-            failures: Number of flights that failed.
-            n: Number of flights.
-            side: 1: for more failures than the threshold permits; -1: for fewer.
-        """
-        odds = math.log1p(-self.threshold) - math.log(self.threshold)
-        # The likelihood ratio of a failure rate against that of the threshold, mixed over rates.
-        rates = odds + side * _LOG_FACTORS
-        ratio = failures * (special.log_expit(rates) - special.log_expit(odds))
-        ratio += (n - failures) * (special.log_expit(-rates) - special.log_expit(-odds))
-        return float(special.logsumexp(ratio + _LOG_WEIGHTS))
+        for look in plan_looks(self.threshold):
+            failures = round((1.0 - rate) * look.flights)
+            if look.flights > flown and look.decide(failures) is not Decision.UNDECIDED:
+                return look.flights
+        return None

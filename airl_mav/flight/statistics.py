@@ -122,15 +122,20 @@ def median_of(values: ArrayLike) -> Estimate:
     return Estimate(middle, float(data[out]), float(data[n - 1 - out]), n)
 
 
+def reached_goals(episodes: Sequence[EpisodeRecord]) -> list[bool]:
+    """Return whether each valid flight reached its goal: an aborted one did not."""
+    return [e.outcome is Outcome.SUCCESS for e in episodes if not e.invalid]
+
+
 def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     """Work out a run's figures, over its valid episodes."""
     outcomes = dict.fromkeys(Outcome, 0)
     for episode in episodes:
         outcomes[episode.outcome] += 1
-    flown = [episode for episode in episodes if not episode.invalid]
-    good = successful(flown)
+    reached = reached_goals(episodes)
+    good = successful([episode for episode in episodes if not episode.invalid])
     return Aggregate(
-        success_rate=wilson(sum(e.outcome is Outcome.SUCCESS for e in flown), len(flown)),
+        success_rate=wilson(sum(reached), len(reached)),
         outcomes=outcomes,
         **{name: bootstrap_mean(known(good, name)) for name in AVERAGED},
     )

@@ -60,7 +60,8 @@ FOLDER_KINDS = {
     RUN_FILE: "a single run",
     CAMPAIGN_FILE: "a campaign",
     "train.json": "a training",
-    **dict.fromkeys(("gap.json", "ladder.json", "matrix.json"), "runs of an earlier version"),
+    "gap.json": "a verdict, or a gap of an earlier version",
+    **dict.fromkeys(("ladder.json", "matrix.json"), "runs of an earlier version"),
 }
 """What a folder holds, by the first of these files that is found in it."""
 
@@ -175,9 +176,8 @@ class RunFolder:
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
         """Replace the settings and the seeds that are planned, in `run.json`."""
-        path = self.path / RUN_FILE
-        info = read_typed(path, _INFO, SCHEMA, "run")
-        _write_info(path, replace(info, config=dict(config), seeds=tuple(seeds)))
+        info = replace(load_info(self.path), config=dict(config), seeds=tuple(seeds))
+        _write_info(self.path / RUN_FILE, info)
 
     def tlog_path(self, index: int) -> Path:
         """Return the path of an episode's raw MAVLink log."""
@@ -263,7 +263,7 @@ def open_folder(
         folder = RunFolder.create(out, name, config, setup=scenario.setup, seeds=seeds)
         save_scenario(scenario.scenario, folder.path / SCENARIO_FILE)
         return folder, ()
-    held = load(out).info
+    held = load_info(out)
     grows = len(held.seeds) < len(seeds) and held.seeds == seeds[: len(held.seeds)]
     free = free_fields(scenario.scenario.level) | ({"episodes"} if grows else set())
     if difference := another_config(held.config, config, free):
@@ -298,13 +298,18 @@ def another_config(
     return None
 
 
+def load_info(path: Path) -> RunInfo:
+    """Read `run.json` alone. Raises UsageError."""
+    return read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+
+
 def load(path: Path) -> LoadedRun:
     """Read a run folder back; a last line cut short by a kill is passed over.
 
     Raises:
         UsageError: The folder holds no run, or a file of it cannot be read or is damaged.
     """
-    info = read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+    info = load_info(path)
     records: dict[int, EpisodeRecord] = {}
     stamp_crcs, path_crcs = {}, {}
     for place, data in read_lines(path / EPISODES_FILE, LINE_SCHEMA):

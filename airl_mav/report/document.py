@@ -95,6 +95,8 @@ class Document:
     lead: str = ""
     answers: tuple[str, ...] = ()
     """What came out, in whole sentences."""
+    status: str = ""
+    """What that comes to, where it is a verdict: gives the box around it its colour."""
     headlines: tuple[Headline, ...] = ()
     facts: Facts = ()
     """What was flown."""

@@ -9,15 +9,17 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import Progress
-from airl_mav.experiments import campaign
+from airl_mav.experiments import campaign, experiment
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, run_cells
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
 from airl_mav.experiments.experiment import Experiment, run_experiment
+from airl_mav.experiments.fly import fly_scenario
 from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.store import (
     Declaration,
@@ -93,6 +95,33 @@ def test_cells_with_the_same_flights_share_them(tmp_path: Path, reference: Path)
     assert run.cells[2].episodes == run.cells[0].episodes
     assert not (tmp_path / "c").exists()
     assert same(tmp_path, reference)
+
+
+def test_live_cells_with_the_same_flights_share_them(tmp_path: Path) -> None:
+    first = gym_cell("a", episodes=2)
+    twin = replace(gym_cell("b", episodes=2, slots=3), title="the same again")
+    ended: list[CellRun] = []
+    # The twin flies in place of level sitl: who shares with whom is under test, not the level.
+    with (
+        open_campaign(tmp_path, declared([first]), command="a test") as store,
+        patch.object(experiment, "fly_live", lambda *given, name: fly_scenario(*given)),
+    ):
+        run = experiment._fly_live(store, [first, twin], Progress(), ended.append)
+    assert [each.cell for each in ended] == [first]
+    assert [each.cell for each in run.cells] == [first, twin]
+    assert [each.path for each in run.cells] == [tmp_path / "a"] * 2
+    assert run.cells[1].episodes == run.cells[0].episodes
+    assert not (tmp_path / "b").exists()
+
+
+def test_an_experiment_grows_by_more_episodes(tmp_path: Path, reference: Path) -> None:
+    for episodes in (4, 8):
+        grown = Experiment("matrix", "", {}, tuple(cells(episodes)))
+        assert run_experiment(grown, tmp_path, Progress()).ended == "complete"
+    assert same(tmp_path, reference)
+    fewer = Experiment("matrix", "", {}, tuple(cells(4)))
+    with pytest.raises(UsageError, match="another cell a: episodes = 8, not 4"):
+        run_experiment(fewer, tmp_path, Progress())
 
 
 def test_what_is_finished_is_told_and_not_flown_again(tmp_path: Path) -> None:
@@ -298,8 +327,9 @@ def test_another_campaign_is_not_mixed_in(
     [
         ("run.json", "a single run"),
         ("train.json", "a training"),
+        ("gap.json", "a verdict, or a gap of an earlier version"),
         # Begun by a version that wrote no declaration.
-        *((f"{kind}.json", "runs of an earlier version") for kind in ("gap", "ladder", "matrix")),
+        *((f"{kind}.json", "runs of an earlier version") for kind in ("ladder", "matrix")),
     ],
 )
 def test_a_folder_of_something_else_is_no_campaign(tmp_path: Path, file: str, what: str) -> None:

@@ -160,5 +160,5 @@ if __name__ == "__main__":
     # Workers do not see the program that started them, only what can be imported.
     from tests.support import worker_jobs
 
-    for _ in ProcessExecutor(2).run(range(4), partial(worker_jobs.sleeps, Path(sys.argv[1]))):
-        pass
+    with ProcessExecutor(2) as executor:
+        list(executor.run(range(4), partial(worker_jobs.sleeps, Path(sys.argv[1]))))

@@ -51,11 +51,15 @@ def ray_executor() -> Iterator[Executor]:
         pytest.param("ray", marks=[NEEDS_RAY, pytest.mark.slow, pytest.mark.xdist_group("ray")]),
     ]
 )
-def executor(request: pytest.FixtureRequest) -> Executor:
+def executor(request: pytest.FixtureRequest) -> Iterator[Executor]:
     if request.param == "ray":
         found: Executor = request.getfixturevalue("ray_executor")
-        return found
-    return InProcessExecutor() if request.param == "in-process" else ProcessExecutor(2)
+        yield found
+    elif request.param == "in-process":
+        yield InProcessExecutor()
+    else:
+        with ProcessExecutor(2) as processes:
+            yield processes
 
 
 # --- what all executors do
@@ -140,7 +144,8 @@ def test_one_worker_is_this_process_where_that_is_allowed() -> None:
 
 
 def test_no_more_processes_than_workers() -> None:
-    done = list(ProcessExecutor(2).run(range(20), worker_jobs.doubles))
+    with ProcessExecutor(2) as executor:
+        done = list(executor.run(range(20), worker_jobs.doubles))
     assert sorted(double for _, (double, _) in done) == [2 * job for job in range(20)]
     pids = {pid for _, (_, pid) in done}
     assert 1 <= len(pids) <= 2
@@ -150,22 +155,41 @@ def test_no_more_processes_than_workers() -> None:
 
 def test_each_worker_starts_once_and_no_more_start_than_there_are_jobs(tmp_path: Path) -> None:
     start = partial(worker_jobs.counted, tmp_path)
-    assert sorted(ProcessExecutor(5).run(range(2), start)) == [(0, 0), (1, 1)]
+    with ProcessExecutor(5) as executor:
+        assert sorted(executor.run(range(2), start)) == [(0, 0), (1, 1)]
     assert 1 <= len(list(tmp_path.glob("start-*"))) <= 2
     assert len(list(tmp_path.glob("job-*"))) == 2
+
+
+def test_a_worker_lives_on_over_the_runs_and_starts_each_anew(tmp_path: Path) -> None:
+    with ProcessExecutor(1) as executor:
+        ((_, (_, first)),) = executor.run([1], worker_jobs.doubles)
+        start = partial(worker_jobs.counted, tmp_path)
+        assert sorted(executor.run(range(3), start)) == [(job, job) for job in range(3)]
+        assert [path.name for path in tmp_path.glob("start-*")] == [f"start-{first}"]
+        # One that is lost without work is replaced when its turn comes, and no job's fault.
+        os.kill(first, signal.SIGKILL)
+        wait_until(partial(has_ended, first), "a worker to end", 30.0)
+        lost: list[str] = []
+        ((_, (_, second)),) = executor.run([1], worker_jobs.doubles, lost=lost.append)
+        assert second != first
+        assert lost == []
+    assert not is_running(second)
 
 
 def test_a_slow_job_holds_nobody_up(tmp_path: Path) -> None:
     # Dealt out beforehand, half of the others would wait for the first, and it for them.
     start = partial(worker_jobs.all_but_the_first, tmp_path, 9)
-    done = [job for job, _ in ProcessExecutor(2).run(range(9), start)]
+    with ProcessExecutor(2) as executor:
+        done = [job for job, _ in executor.run(range(9), start)]
     assert done[-1] == 0
     assert sorted(done) == list(range(9))
 
 
 def test_a_worker_has_one_thread_and_is_deaf_to_ctrl_c() -> None:
     before = dict(os.environ)
-    ((_, told),) = ProcessExecutor(1).run([1], worker_jobs.surroundings)
+    with ProcessExecutor(1) as executor:
+        ((_, told),) = executor.run([1], worker_jobs.surroundings)
     assert told["threads"] == ONE_THREAD
     assert told["deaf"]
     assert dict(os.environ) == before
@@ -178,8 +202,9 @@ def test_a_worker_has_one_thread_and_is_deaf_to_ctrl_c() -> None:
 def test_the_job_of_a_lost_worker_is_given_to_another(tmp_path: Path, how: str, name: str) -> None:
     lost: list[str] = []
     start = partial(worker_jobs.dies, tmp_path, 2, how)
-    done = ProcessExecutor(2).run(range(6), start, name=seed, lost=lost.append)
-    assert sorted(done) == [(job, job) for job in range(6)]
+    with ProcessExecutor(2) as executor:
+        done = executor.run(range(6), start, name=seed, lost=lost.append)
+        assert sorted(done) == [(job, job) for job in range(6)]
     assert lost == [f"a worker was lost by {name}: seed 3 begins again"] * 2
 
 
@@ -187,8 +212,8 @@ def test_a_job_that_loses_three_workers_ends_it_all(tmp_path: Path) -> None:
     start = partial(worker_jobs.dies, tmp_path, 3, "kill")
     done = []
     message = r"^seed 3: lost 3 workers, the last one by SIGKILL$"
-    with pytest.raises(WorkerError, match=message):
-        for job, _ in ProcessExecutor(1).run(range(6), start, name=seed):
+    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match=message):
+        for job, _ in executor.run(range(6), start, name=seed):
             done.append(job)
     assert done == [0, 1, 2]
     assert len(list(tmp_path.iterdir())) == 3
@@ -197,8 +222,8 @@ def test_a_job_that_loses_three_workers_ends_it_all(tmp_path: Path) -> None:
 def test_a_broken_job_is_told_in_one_line() -> None:
     start = partial(worker_jobs.complains, "broken")
     message = r"^seed 3: RuntimeError: three lines of trouble$"
-    with pytest.raises(WorkerError, match=message):
-        list(ProcessExecutor(1).run(range(6), start, name=seed))
+    with ProcessExecutor(1) as executor, pytest.raises(WorkerError, match=message):
+        list(executor.run(range(6), start, name=seed))
 
 
 def test_whoever_stops_does_not_wait_for_what_is_under_way(
@@ -210,8 +235,9 @@ def test_whoever_stops_does_not_wait_for_what_is_under_way(
         return len(list(tmp_path.glob("pid-*"))) == 2
 
     start = partial(worker_jobs.sleeps, tmp_path)
-    done = ProcessExecutor(2).run(range(4), start, stop=both_sleep)
-    assert sorted(job for job, _ in done) == [0, 1]
+    with ProcessExecutor(2) as executor:
+        done = executor.run(range(4), start, stop=both_sleep)
+        assert sorted(job for job, _ in done) == [0, 1]
     for path in tmp_path.glob("pid-*"):
         assert not is_running(int(path.read_text()))
 

@@ -1,104 +1,166 @@
-"""Verdicts that are looked for after every flight: right as often as they say."""
+"""The test of a success rate that is looked at as flights come in: right as often as it says."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy import stats
 
-from airl_mav.flight import sequential
-from airl_mav.flight.sequential import ALPHA, Decision, RateTest
+from airl_mav.flight.sequential import (
+    ALPHA,
+    LOOKS,
+    Decision,
+    Look,
+    RateTest,
+    error_spent,
+    plan_looks,
+)
 
-CAMPAIGNS, FLIGHTS = 1000, 400
+CAMPAIGNS, FLIGHTS = 20_000, 500
 
 
-def campaigns(rate: float, threshold: float) -> dict[Decision, int]:
-    """Fly campaigns that stop at the first look that decides; count how they end."""
+def flown(n: int, failures: int) -> list[bool]:
+    """Flights whose failures are spread evenly."""
+    ends = np.floor(np.arange(n + 1) * failures / max(n, 1))
+    return [bool(value) for value in np.diff(ends) == 0]
+
+
+def campaigns(rate: float, threshold: float) -> dict[Decision, float]:
+    """Simulate campaigns of at most 500 flights; return how large a share ends how."""
     rng = np.random.default_rng(7)
-    successes = np.cumsum(rng.random((CAMPAIGNS, FLIGHTS)) < rate, axis=1)
-    test = RateTest(threshold)
-    # Every count of successes at every look is decided once.
-    known = {
-        (n, k): test.decide(k, n)
-        for n in range(1, FLIGHTS + 1)
-        for k in np.unique(successes[:, n - 1]).tolist()
-    }
-    ends = dict.fromkeys(Decision, 0)
-    for row in successes.tolist():
-        looks = (known[n, k] for n, k in enumerate(row, 1))
-        ends[next((d for d in looks if d is not Decision.UNDECIDED), Decision.UNDECIDED)] += 1
+    left: NDArray[np.int64] = np.zeros(CAMPAIGNS, np.int64)
+    ends = dict.fromkeys(Decision, 0.0)
+    before = 0
+    for look in plan_looks(threshold):
+        if look.flights > FLIGHTS:
+            break
+        left = left + rng.binomial(look.flights - before, 1.0 - rate, left.size)
+        before = look.flights
+        ends[Decision.MET] += np.sum(left <= look.few) / CAMPAIGNS
+        ends[Decision.NOT_MET] += np.sum(left >= look.many) / CAMPAIGNS
+        left = left[(left > look.few) & (left < look.many)]
+    ends[Decision.UNDECIDED] = left.size / CAMPAIGNS
     return ends
 
 
-@pytest.mark.parametrize("threshold", [0.95, 0.8])
+@pytest.mark.parametrize("threshold", [0.95, 0.8, 0.5])
 def test_at_the_threshold_hardly_a_campaign_is_judged_falsely(threshold: float) -> None:
     ends = campaigns(threshold, threshold)
     # "meets" is true there, but just below it would not be.
-    assert ends[Decision.NOT_MET] <= ALPHA * CAMPAIGNS
-    assert ends[Decision.MET] <= ALPHA * CAMPAIGNS
+    assert ends[Decision.NOT_MET] <= 0.5 * ALPHA
+    assert ends[Decision.MET] <= 0.5 * ALPHA
+    # As much of the error is used as counts of flights permit: no flights are wasted.
+    assert ends[Decision.NOT_MET] + ends[Decision.MET] > 0.5 * ALPHA
 
 
-def test_a_plain_interval_looked_at_after_every_flight_would_be_false_far_more_often() -> None:
+def test_a_plain_interval_looked_at_as_often_would_be_false_far_more_often() -> None:
     rng = np.random.default_rng(7)
-    successes = np.cumsum(rng.random((CAMPAIGNS, FLIGHTS)) < 0.95, axis=1)
-    n = np.arange(1, FLIGHTS + 1)
-    too_few = np.asarray(stats.binom.cdf(successes, n, 0.95)) < ALPHA
-    assert np.mean(np.any(too_few, axis=1)) > 2.0 * ALPHA
+    successes = np.cumsum(rng.random((1000, FLIGHTS)) < 0.95, axis=1)
+    n = np.array([look for look in LOOKS if look <= FLIGHTS])
+    too_few = np.asarray(stats.binom.cdf(successes[:, n - 1], n, 0.95)) < 0.5 * ALPHA
+    assert np.mean(np.any(too_few, axis=1)) > ALPHA
 
 
-def test_what_is_far_from_the_threshold_is_soon_decided() -> None:
+def ends_by_brute_force(
+    looks: Sequence[Look], failure_rate: float, decision: Decision
+) -> list[float]:
+    """Return the probability that each look decides so: every sequence of flights, one by one."""
+    found = [0.0] * len(looks)
+    for failed in itertools.product((0, 1), repeat=looks[-1].flights):
+        for k, look in enumerate(looks):
+            first = look.decide(sum(failed[: look.flights]))
+            if first is not Decision.UNDECIDED:
+                if first is decision:
+                    failures = sum(failed)
+                    found[k] += failure_rate**failures * (1.0 - failure_rate) ** (
+                        len(failed) - failures
+                    )
+                break
+    return found
+
+
+def test_the_error_is_what_all_sequences_of_flights_add_up_to() -> None:
+    """Few enough flights to go through all of them; one count more would spend too much."""
+    numbers, threshold = (3, 7, 12), 0.6
+
+    def spent(n: int) -> float:
+        return 0.2 * n / 12
+
+    looks = list(plan_looks(threshold, numbers, spent))
+    assert any(look.few >= 0 for look in looks)
+    for decision, change in ((Decision.MET, (1, 0)), (Decision.NOT_MET, (0, -1))):
+        ends = np.cumsum(ends_by_brute_force(looks, 1.0 - threshold, decision))
+        for k, look in enumerate(looks):
+            assert ends[k] <= spent(look.flights) + 1e-12
+            wider = Look(look.flights, look.few + change[0], look.many + change[1])
+            more = ends_by_brute_force([*looks[:k], wider], 1.0 - threshold, decision)
+            assert sum(more) > spent(look.flights)
+
+
+@given(threshold=st.floats(0.001, 0.999))
+@settings(max_examples=30)
+def test_the_first_look_is_a_binomial_test(threshold: float) -> None:
+    look = next(plan_looks(threshold))
+    failures = np.arange(-1, look.flights + 2)
+    few = stats.binom.cdf(failures, look.flights, 1.0 - threshold) <= error_spent(look.flights)
+    many = stats.binom.sf(failures - 1, look.flights, 1.0 - threshold) <= error_spent(look.flights)
+    assert look.few == failures[few].max()
+    assert look.many == failures[many].min()
+
+
+def test_the_error_that_may_be_spent_grows_and_has_an_end() -> None:
+    spent = [error_spent(look) for look in LOOKS]
+    assert sorted(spent) == spent
+    assert spent[-1] < 0.5 * ALPHA
+
+
+@pytest.mark.parametrize("threshold", [0.8, 0.9, 0.95])
+def test_what_is_far_from_the_threshold_is_soon_decided(threshold: float) -> None:
+    assert campaigns(threshold - 0.15, threshold)[Decision.NOT_MET] > 0.99
+    needed = RateTest(threshold).flights_needed(threshold - 0.15)
+    assert needed is not None
+    assert needed <= 100
+
+
+def test_the_first_look_that_decides_is_the_verdict() -> None:
     test = RateTest(0.95)
-    assert campaigns(0.8, 0.95)[Decision.NOT_MET] > 0.99 * CAMPAIGNS
-    needed = test.flights_needed(0.87)
-    assert needed is not None and needed <= 100, "12 points fewer at 396 ms: within 100 flights"
-    assert test.flights_needed(1.0) is not None
-    assert test.decide(100, 100) is Decision.MET
-    assert test.decide(80, 100) is Decision.NOT_MET
+    assert test.decide([False] * 20) is Decision.NOT_MET
+    # What is flown for another requirement's sake does not take it back.
+    assert test.decide([False] * 20 + [True] * 980) is Decision.NOT_MET
+    assert test.decide([True] * 1000) is Decision.MET
+    # Only the planned looks count: nineteen failures have not been looked at.
+    assert test.decide([False] * 19) is Decision.UNDECIDED
+    assert test.decide([]) is Decision.UNDECIDED
+
+
+@pytest.mark.parametrize("rate", [0.6, 0.87, 0.93, 0.97, 1.0])
+def test_so_many_flights_of_that_rate_decide(rate: float) -> None:
+    test = RateTest(0.95)
+    needed = test.flights_needed(rate)
+    assert needed is not None
+    before = max([look for look in LOOKS if look < needed], default=0)
+    expected = Decision.MET if rate > 0.95 else Decision.NOT_MET
+    assert test.decide(flown(needed, round((1.0 - rate) * needed))) is expected
+    assert test.decide(flown(before, round((1.0 - rate) * before))) is Decision.UNDECIDED
+    # Of those that have been flown, none is needed again.
+    later = test.flights_needed(rate, needed)
+    assert later is not None
+    assert later > needed
 
 
 def test_a_borderline_rate_says_how_many_flights_it_would_take() -> None:
-    test = RateTest(0.95)
-    needed = test.flights_needed(0.955)
-    assert needed is not None and needed > 5000
-    assert test.decide(round(0.955 * needed), needed) is Decision.MET
-    half = needed // 2
-    assert test.decide(round(0.955 * half), half) is Decision.UNDECIDED
-    assert test.flights_needed(0.95) is None
-
-
-@given(
-    failures=st.integers(0, 60),
-    successes=st.integers(0, 300),
-    threshold=st.floats(0.05, 0.99),
-)
-def test_the_evidence_is_a_mixture_of_likelihood_ratios(
-    failures: int, successes: int, threshold: float
-) -> None:
-    """Held against the sum of binomial likelihoods by scipy."""
-    n = failures + successes
-    test = RateTest(threshold)
-    odds = (1.0 - threshold) / threshold
-    for side in (1.0, -1.0):
-        rates = odds * np.exp(side * sequential._LOG_FACTORS)
-        likelihood = stats.binom.logpmf(failures, n, rates / (1.0 + rates))
-        expected = np.logaddexp.reduce(likelihood + sequential._LOG_WEIGHTS)
-        expected -= stats.binom.logpmf(failures, n, 1.0 - threshold)
-        assert test._log_evidence(failures, n, side) == pytest.approx(expected, rel=1e-7, abs=1e-7)
-
-
-@given(n=st.integers(1, 60), threshold=st.floats(0.1, 0.97))
-def test_at_the_threshold_the_evidence_is_one_on_average(n: int, threshold: float) -> None:
-    """What makes it an e-process: its expectation under the hypothesis is 1."""
-    failures = np.arange(n + 1)
-    weights = stats.binom.pmf(failures, n, 1.0 - threshold)
-    test = RateTest(threshold)
-    for side in (1.0, -1.0):
-        evidence = [math.exp(test._log_evidence(int(k), n, side)) for k in failures]
-        assert float(np.dot(weights, evidence)) == pytest.approx(1.0, rel=1e-6)
+    needed = RateTest(0.95).flights_needed(0.955)
+    assert needed is not None
+    # An interval that is looked at once would take 1.96^2 p (1 - p) / 0.005^2 of them.
+    assert 7000 < needed < 50_000
+    assert RateTest(0.95).flights_needed(0.95) is None
 
 
 @pytest.mark.parametrize("threshold", [0.0, 1.0, math.nan])

@@ -10,7 +10,8 @@ from typing import Any
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError
-from airl_mav.flight.requirements import Requirement, find
+from airl_mav.flight.requirements import Requirement, find, settle
+from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, runs
 from airl_mav.report.comparison.build import load_runs
@@ -37,6 +38,10 @@ from airl_mav.report.verdict import (
 )
 
 Runs = Mapping[str, LoadedRun]
+
+FLOWN_UNTIL = "flown_until"
+"""Fact of a comparison whose flights were added until the success rate was decided: the rate is
+judged by the test that they were stopped by."""
 
 _BUILD: dict[Kind, Callable[[Mapping[str, Any], Sequence[RunEntry], Runs], Comparison]] = {
     "compare": runs.build_runs,
@@ -109,16 +114,19 @@ def judge_comparison(
     for run in _judged(comparison):
         contrast = against.get(run.name)
         reference = "" if contrast is None else comparison.run(contrast.entry.reference).label
-        parts.append(
-            judge_run(
-                run.setup,
-                run.quality,
-                loaded[run.name].episodes,
-                [each for each in requirements if contrast is not None or not each.gap],
-                None if contrast is None else contrast.paired,
-                reference,
-            )
+        episodes = loaded[run.name].episodes
+        part = judge_run(
+            run.setup,
+            run.quality,
+            episodes,
+            [each for each in requirements if contrast is not None or not each.gap],
+            None if contrast is None else contrast.paired,
+            reference,
         )
+        if FLOWN_UNTIL in comparison.facts:
+            reached = reached_goals(episodes)
+            part = replace(part, findings=tuple(settle(each, reached) for each in part.findings))
+        parts.append(part)
     verdict = join_verdicts(parts, f"{len(parts)} runs")
     # Whoever is compared must be valid as well.
     invalid = {name: invalid_flights(run.episodes) for name, run in loaded.items()}
@@ -174,7 +182,7 @@ def comparison_to_document(
 ) -> Document:
     """Return everything that a comparison says; nothing is drawn yet."""
     document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
-    return replace(document, answers=verdict.lines)
+    return replace(document, answers=verdict.lines, status=verdict.status)
 
 
 def print_comparison(comparison: Comparison, loaded: Runs, console: Console, page: Path) -> None:
