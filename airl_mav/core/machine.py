@@ -83,7 +83,8 @@ def machine_state(
     cores = psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else []
     now = [core.current for core in cores or ()]
     return MachineState(
-        governor=", ".join(sorted({text for path in governors if (text := _text(path))})) or None,
+        governor=", ".join(sorted({text for path in governors if (text := sysfs_text(path))}))
+        or None,
         frequency_mhz=(min(now), max(now)) if now else None,
         # 0: not known.
         frequency_limit_mhz=max((core.max for core in cores or ()), default=0.0) or None,
@@ -110,7 +111,7 @@ def _temperature_c() -> float | None:
 
 def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
     """Return what slows the processor down, as text; None where the system does not tell."""
-    bits = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
+    bits = sysfs_text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
     if bits is None and (answer := ask_pi()) is not None:
         bits = answer.partition("=")[2]
     if bits is not None:
@@ -123,7 +124,7 @@ def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
         for path in sorted(
             (root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count")
         )
-        if (count := _number(path)) is not None
+        if (count := sysfs_number(path)) is not None
     ]
     if counts:
         return f"{sum(counts):.0f} times since the start of the system" if sum(counts) else "none"
@@ -153,15 +154,17 @@ def _vcgencmd() -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _text(path: Path) -> str | None:
+def sysfs_text(path: Path) -> str | None:
+    """Return what a small file says, None where it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip() or None
     except OSError:
         return None
 
 
-def _number(path: Path) -> float | None:
-    text = _text(path)
+def sysfs_number(path: Path) -> float | None:
+    """Return the number that a small file says, None where it says none."""
+    text = sysfs_text(path)
     try:
         return None if text is None else float(text)
     except ValueError:

@@ -76,4 +76,10 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
         Column("95 % interval"),
         Column("n"),
     )
-    return TableView("conduct", "Deadlines and smoothness", columns, rows, (CONDUCT_NOTE,))
+    notes = [CONDUCT_NOTE]
+    if not summary.timed:
+        notes.append(
+            f"At level {run.info.setup.level} the companion is no process of its own: it has no "
+            "processor time, memory or power."
+        )
+    return TableView("conduct", "Deadlines and smoothness", columns, rows, tuple(notes))
