@@ -114,7 +114,9 @@ def test_a_battery_that_is_drawn_from(tmp_path: Path, now: dict[str, str], watts
         f"{SUPPLY}/hidpp_battery_0/power_now": "50000",
         f"{SUPPLY}/AC/type": "Mains",
     }
-    assert powered(tmp_path, {**PACKAGE, **files}) == (pytest.approx(watts), "battery: BAT0")
+    found_w, name = powered(tmp_path, {**PACKAGE, **files})
+    assert found_w == pytest.approx(watts)
+    assert name == "battery: BAT0"
 
 
 def test_a_battery_that_is_charged_says_nothing(tmp_path: Path) -> None:
