@@ -53,7 +53,7 @@ class EpisodeRecord:
     invalid: tuple[str, ...] = ()
     """Why the flight is no test of the policy (`flight.validity`): the host disturbed it in every
     attempt. Empty: it is one."""
-    companion: ProcessUse | None = None
+    companion_use: ProcessUse | None = None
     """What the companion process took of its machine for the flight, from arming to the ground;
     None where it is no process of its own (gym, lockstep), and in older records."""
     sha256: dict[str, str] | None = None

@@ -125,7 +125,7 @@ def _record(
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,
         notes=tuple(episode.notes),
-        companion=None if episode.ended is None else episode.ended.use,
+        companion_use=None if episode.ended is None else episode.ended.use,
     )
 
 

@@ -217,7 +217,7 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
         ("simulated time given up", f"{ms(slipped_us)} ms", flights),
         *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
         ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
-        *_use_rows([episode.companion for episode in run.episodes if episode.companion]),
+        *_use_rows([e.companion_use for e in run.episodes if e.companion_use]),
     ]
     return TableView("real-time", "Real time", columns, tuple(rows))
 

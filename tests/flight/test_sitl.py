@@ -115,7 +115,7 @@ def test_what_was_flown_is_on_record(done: Done) -> None:
 
 def test_what_the_companion_took_is_on_record(done: Done) -> None:
     for episode in done.episodes:
-        use = episode["companion"]
+        use = episode["companion_use"]
         # From arming to the ground: longer than to the verdict, and on the wall clock.
         flown_s = (episode["ended_us"] - episode["started_us"]) / 1e6 / 2.5
         assert 0.7 * flown_s < use["wall_s"] < flown_s + 60.0
