@@ -25,6 +25,7 @@ class ProfileOptions(ProfileRequest):
     Examples:
         airl profile --on my-pi --watts 6.4
         airl profile --network 5x32
+        airl profile --soak 10min
         airl profile static-obstacles --level sitl
         airl profile --level hil --connect udpin://0.0.0.0:14540 --camera tcp://192.168.1.10:5600
     """
@@ -44,7 +45,8 @@ RENAMED_OPTIONS = {**RENAMED, "--price": ("--price-usd",)}
 def run(options: ProfileOptions, console: Console | None = None) -> int:
     """Measure, print the report, and write the profile.
 
-    Exit status: 0 measured, 1 it broke off, 130 Ctrl-C; only with 0 is anything written.
+    Exit status: 0 measured, 1 it broke off, 130 Ctrl-C. Only with 0 is anything written, and with
+    130 where Ctrl-C ended the soak.
     """
     console = console or Console()
     if options.level == "sitl":
@@ -64,4 +66,4 @@ def run(options: ProfileOptions, console: Console | None = None) -> int:
             )
             return EXIT_INTERRUPTED
     print_measurement(measured, console)
-    return 0
+    return EXIT_INTERRUPTED if measured.soak is not None and measured.soak.interrupted else 0

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -28,6 +29,9 @@ PI_FLAGS = {
     19: "soft temperature limit has occurred",
 }
 """Bits of the Raspberry Pi's `get_throttled` (raspberrypi.com, documentation of vcgencmd)."""
+
+PI_PAST = 16
+"""From this bit on the flags are of what has been since the start of the system."""
 
 CPU_SENSORS = ("cpu", "soc", "x86_pkg", "coretemp", "k10temp", "package")
 """Parts of the names of sensors that belong to a processor."""
@@ -80,20 +84,32 @@ def machine_state(
             None asks it.
     """
     governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
-    cores = psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else []
-    now = [core.current for core in cores or ()]
+    cores = _core_frequencies()
+    now = [core.current for core in cores]
     return MachineState(
-        governor=", ".join(sorted({text for path in governors if (text := _text(path))})) or None,
+        governor=", ".join(sorted({text for path in governors if (text := sysfs_text(path))}))
+        or None,
         frequency_mhz=(min(now), max(now)) if now else None,
         # 0: not known.
-        frequency_limit_mhz=max((core.max for core in cores or ()), default=0.0) or None,
-        temperature_c=_temperature_c(),
+        frequency_limit_mhz=max((core.max for core in cores), default=0.0) or None,
+        temperature_c=temperature_c(),
         throttling=_throttling(root, ask_pi or _vcgencmd),
         load=psutil.getloadavg(),
     )
 
 
-def _temperature_c() -> float | None:
+def _core_frequencies() -> Sequence[Any]:
+    """Return what psutil says of each core's frequency; empty where it says nothing."""
+    return (psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else None) or ()
+
+
+def mean_frequency_mhz() -> float | None:
+    """Return the mean of the cores' frequencies; None where the system does not tell."""
+    now = [core.current for core in _core_frequencies()]
+    return sum(now) / len(now) if now else None
+
+
+def temperature_c() -> float | None:
     """Return the hottest sensor of the processor [°C]."""
     if not hasattr(psutil, "sensors_temperatures"):  # Linux and FreeBSD have it.
         return None
@@ -108,9 +124,21 @@ def _temperature_c() -> float | None:
     )
 
 
+def throttled_since(before: str | None, after: str | None) -> bool | None:
+    """Return whether a processor was slowed down between two states of `throttling`.
+
+    None where the system does not tell. The Raspberry Pi's flags of the past stay set until it is
+    started again: one that was set before says nothing, one of the present does.
+    """
+    if before is None or after is None:
+        return None
+    now = set(after.split(", ")) & {text for bit, text in PI_FLAGS.items() if bit < PI_PAST}
+    return bool(now) or (after != "none" and after != before)
+
+
 def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
     """Return what slows the processor down, as text; None where the system does not tell."""
-    bits = _text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
+    bits = sysfs_text(root / "sys/devices/platform/soc/soc:firmware/get_throttled")
     if bits is None and (answer := ask_pi()) is not None:
         bits = answer.partition("=")[2]
     if bits is not None:
@@ -123,7 +151,7 @@ def _throttling(root: Path, ask_pi: Callable[[], str | None]) -> str | None:
         for path in sorted(
             (root / "sys/devices/system/cpu").glob("cpu[0-9]*/thermal_throttle/*_throttle_count")
         )
-        if (count := _number(path)) is not None
+        if (count := sysfs_number(path)) is not None
     ]
     if counts:
         return f"{sum(counts):.0f} times since the start of the system" if sum(counts) else "none"
@@ -153,15 +181,17 @@ def _vcgencmd() -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _text(path: Path) -> str | None:
+def sysfs_text(path: Path) -> str | None:
+    """Return what a small file says, None where it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip() or None
     except OSError:
         return None
 
 
-def _number(path: Path) -> float | None:
-    text = _text(path)
+def sysfs_number(path: Path) -> float | None:
+    """Return the number that a small file says, None where it says none."""
+    text = sysfs_text(path)
     try:
         return None if text is None else float(text)
     except ValueError:

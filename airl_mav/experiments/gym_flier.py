@@ -127,6 +127,7 @@ class GymFlier:
         assert arena is not None  # noqa: S101 (it has just been flown in)
         outcome = OUTCOMES[flown.verdict]
         flights, trajectory = navigation.flights(), trace.trajectory(slot)
+        latency = trace.latency(slot)
         ended_us = round(flown.flight_time_s * US_PER_S)
         record = EpisodeRecord(
             index=index,
@@ -151,9 +152,11 @@ class GymFlier:
                 ended_us,
                 self.scenario.computer.onboard_watts,
                 self.scenario.pack_j,
+                decisions=latency,
+                hold_s=rules.hold_s,
             ),
         )
-        return FlownEpisode(record, trajectory, trace.latency(slot))
+        return FlownEpisode(record, trajectory, latency)
 
 
 def _pilots(scenario: ResolvedScenario) -> Pilots:

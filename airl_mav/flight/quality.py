@@ -1,13 +1,24 @@
-"""Quality of flight of one episode: time, distance, energy."""
+"""Quality of flight of one episode: time, distance, energy, smoothness, deadlines."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.smoothness import (
+    command_steps,
+    commanded_velocity,
+    flown_velocity,
+    jerk_of,
+    sample_times,
+)
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,19 @@ class Quality:
     """How far that is at the flight's mean speed [m]."""
     missions_per_charge: float | None = None
     """How many such flights that is."""
+    deadline_misses: float | None = None
+    """Share of decisions that took effect later than the hold time after their frame was exposed,
+    or never (`latency.deadlines`), 0 to 1. None of this and the following where there is nothing
+    to work it out from, and in older records."""
+    jerk_rms_m_s3: float | None = None
+    """Of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""
+    jerk_peak_m_s3: float | None = None
+    command_jerk_rms_m_s3: float | None = None
+    """Of the commanded velocity, at the same bandwidth [m/s³]."""
+    command_jerk_peak_m_s3: float | None = None
+    command_step_m_s: float | None = None
+    """Mean step of the commanded velocity at a switch of action [m/s]."""
+    command_step_max_m_s: float | None = None
 
     @property
     def total_energy_j(self) -> float:
@@ -66,6 +90,9 @@ def measure_quality(
     ended_us: int,
     computer_watts: float,
     pack_j: float | None = None,
+    *,
+    decisions: Mapping[str, NDArray[Any]] | None = None,
+    hold_s: float = 0.0,
 ) -> Quality:
     """Measure an episode.
 
@@ -75,6 +102,8 @@ def measure_quality(
         ended_us: Time of the verdict, simulated [µs].
         computer_watts: What the computer draws from the pack [W].
         pack_j: What the pack holds at the start (`Battery.energy_j`) [J]; None: not known.
+        decisions: Columns of the decision log, as in `latency.npz`; None: not known.
+        hold_s: How long an action is held [s]; 0: no decision has a deadline.
 
     Raises:
         ValueError: The end comes before the start.
@@ -98,4 +127,33 @@ def measure_quality(
         endurance_s=None if missions is None else missions * leg.time_s,
         range_m=None if missions is None else missions * leg.distance_m,
         missions_per_charge=missions,
+        **_conduct(trajectory, decisions or {}, navigation_us, ended_us, hold_s),
     )
+
+
+def _conduct(
+    trajectory: Trajectory,
+    decisions: Mapping[str, NDArray[Any]],
+    start_us: int,
+    end_us: int,
+    hold_s: float,
+) -> dict[str, float | None]:
+    """Return the measures of deadlines and smoothness by field; arguments as `measure_quality`."""
+    times_us = sample_times(trajectory, start_us, end_us)
+    flown = jerk_of(flown_velocity(trajectory, times_us))
+    steps = command_steps(decisions)
+    commanded = None
+    if "sent_us" in decisions:
+        commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
+    misses = None
+    if hold_s > 0.0:
+        misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)
+    return {
+        "deadline_misses": misses,
+        "jerk_rms_m_s3": None if flown is None else flown.rms_m_s3,
+        "jerk_peak_m_s3": None if flown is None else flown.peak_m_s3,
+        "command_jerk_rms_m_s3": None if commanded is None else commanded.rms_m_s3,
+        "command_jerk_peak_m_s3": None if commanded is None else commanded.peak_m_s3,
+        "command_step_m_s": float(steps.mean()) if steps.size else None,
+        "command_step_max_m_s": float(steps.max()) if steps.size else None,
+    }

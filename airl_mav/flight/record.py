@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from airl_mav.core.files import typed
+from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 
@@ -52,6 +53,9 @@ class EpisodeRecord:
     invalid: tuple[str, ...] = ()
     """Why the flight is no test of the policy (`flight.validity`): the host disturbed it in every
     attempt. Empty: it is one."""
+    companion_use: ProcessUse | None = None
+    """What the companion process took of its machine for the flight, from arming to the ground;
+    None where it is no process of its own (gym, lockstep), and in older records."""
     sha256: dict[str, str] | None = None
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA

@@ -30,7 +30,8 @@ class Measure(NamedTuple):
     """The unit in what the figures are kept in: 0.01 for percent, 1000 for kJ."""
     attribute: str
     """Of `Aggregate` and of `PairedComparison`."""
-    gap_unit: str = "%"
+    gap_unit: str | None = "%"
+    """None: no gap of it can be required."""
 
 
 MEASURES: dict[str, Measure] = {
@@ -39,6 +40,9 @@ MEASURES: dict[str, Measure] = {
     "distance": Measure("distance", "m", 1.0, "distance_m"),
     "energy": Measure("energy", "kJ", 1e3, "energy_j"),
     "total_energy": Measure("energy with computer", "kJ", 1e3, "total_energy_j"),
+    "deadline_misses": Measure("deadline misses", "%", 0.01, "deadline_misses", None),
+    "jerk": Measure("jerk, flown, RMS", "m/s3", 1.0, "jerk_rms_m_s3", None),
+    "command_step": Measure("step of the command", "m/s", 1.0, "command_step_m_s", None),
 }
 """By the word that a requirement names them by."""
 
@@ -49,7 +53,7 @@ ACCEPTED = (
 
 _REQUIREMENT = re.compile(
     r"\s*(?P<measure>[a-z_]+)(?P<gap>\s+gap)?\s*(?P<sense>>=|<=)\s*"
-    r"(?P<limit>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-zA-Z]+)?\s*",
+    r"(?P<limit>[-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*(?P<unit>%|[a-zA-Z][a-zA-Z0-9/]*)?\s*",
 )
 
 
@@ -69,7 +73,7 @@ class Requirement:
     def unit(self) -> str:
         """Unit of the limit; a gap is in percent, that of a rate in percentage points."""
         measure = MEASURES[self.measure]
-        return measure.gap_unit if self.gap else measure.unit
+        return (measure.gap_unit or "") if self.gap else measure.unit
 
     def __str__(self) -> str:
         """Return the requirement as it is written."""
@@ -138,6 +142,8 @@ def parse_requirement(text: str) -> Requirement:
         raise FieldError("require", text, ACCEPTED) from None
     sense: Literal[">=", "<="] = ">=" if found["sense"] == ">=" else "<="
     requirement = Requirement(found["measure"], found["gap"] is not None, sense, limit)
+    if requirement.gap and MEASURES[requirement.measure].gap_unit is None:
+        raise FieldError("require", text, f"{requirement.measure} without gap")
     if found["unit"] not in (None, requirement.unit):
         raise FieldError("require", text, f"the unit {requirement.unit}")
     if requirement.measure == "success" and not requirement.gap and not 0.0 < limit <= 100.0:

@@ -43,7 +43,14 @@ MEANS = ("flight_time_s", "distance_m", "energy_j", "computer_energy_j", "total_
 PACK_MEASURES = ("endurance_s", "range_m", "missions_per_charge")
 """Measures that older runs were recorded without."""
 
-AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES)
+SMOOTHNESS = ("jerk_rms_m_s3", "command_step_m_s")
+"""The same of these."""
+
+OF_ALL_FLIGHTS = ("deadline_misses",)
+"""Measures of quality whose means are over all valid flights: a late decision counts most where it
+made a flight fail."""
+
+AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES, *SMOOTHNESS)
 """Measures of a flight's quality that have a mean and a median."""
 
 NO_ESTIMATE = Estimate(None, None, None, 0)
@@ -66,9 +73,13 @@ class Aggregate:
     outcomes: dict[Outcome, int]
     """Number of episodes by outcome, aborted ones included."""
     endurance_s: Estimate = NO_ESTIMATE
-    """None of these three in runs that were recorded without."""
+    """None of this and the following in runs that were recorded without."""
     range_m: Estimate = NO_ESTIMATE
     missions_per_charge: Estimate = NO_ESTIMATE
+    jerk_rms_m_s3: Estimate = NO_ESTIMATE
+    command_step_m_s: Estimate = NO_ESTIMATE
+    deadline_misses: Estimate = NO_ESTIMATE
+    """Fraction, 0 to 1: the mean over all valid flights, successful or not."""
 
 
 def wilson(successes: int, n: int) -> Estimate:
@@ -133,11 +144,14 @@ def aggregate(episodes: Sequence[EpisodeRecord]) -> Aggregate:
     for episode in episodes:
         outcomes[episode.outcome] += 1
     reached = reached_goals(episodes)
-    good = successful([episode for episode in episodes if not episode.invalid])
+    flown = [episode for episode in episodes if not episode.invalid]
+    good = successful(flown)
+    qualities = [episode.quality for episode in flown if episode.quality is not None]
     return Aggregate(
         success_rate=wilson(sum(reached), len(reached)),
         outcomes=outcomes,
         **{name: bootstrap_mean(known(good, name)) for name in AVERAGED},
+        **{name: bootstrap_mean(known(qualities, name)) for name in OF_ALL_FLIGHTS},
     )
 
 

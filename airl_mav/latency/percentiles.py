@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 99.0: 662, 99.9: 6636}
+MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 95.0: 130, 99.0: 662, 99.9: 6636}
 """Fewest samples for a percentile p: so many that, if the true p-quantile lay above the bound that
 we print, at most one sample over the bound would be a 1 % chance (the early-stopping rule of MLPerf
 LoadGen at 99 % confidence)."""
@@ -31,7 +31,7 @@ def percentile(samples: ArrayLike, p: float) -> float | None:
     """Return the p-th percentile, a value that was seen (nearest rank); None with too few samples.
 
     Raises:
-        KeyError: p is not 50, 90, 99 or 99.9.
+        KeyError: p is not 50, 90, 95, 99 or 99.9.
     """
     values = np.asarray(samples)
     if values.size < MIN_SAMPLES[p]:

@@ -33,8 +33,8 @@ Z_999 = 3.0902323061678132
 """99.9 % quantile of the standard normal distribution."""
 
 _DISTRIBUTIONS = {"lognormal": "lognormal", "normal": "normal-truncated"}
-_TIME = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(us|µs|ms|s)")
-_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3}
+_MS = {"us": 1e-3, "µs": 1e-3, "ms": 1.0, "s": 1e3, "min": 60e3, "h": 3600e3}
+_TIME = re.compile(rf"(\d+(?:\.\d*)?|\.\d+)\s*({'|'.join(_MS)})")
 
 
 def select_injection(
@@ -120,10 +120,13 @@ def _latency(fields: dict[str, object], text: str, option: str) -> Latency:
     return validated(Latency, fields, f"{option} {text}")
 
 
-def _milliseconds(text: str) -> float | None:
-    """Return a time with its unit in ms, None when it is none."""
+def duration_ms(text: str) -> float | None:
+    """Return a time with its unit, as `150ms` or `10min`, in ms; None when it is none."""
     found = _TIME.fullmatch(text.strip())
-    if found is None:
-        return None
-    value_ms = float(found[1]) * _MS[found[2]]
-    return value_ms if value_ms <= LONGEST_MS else math.inf
+    return None if found is None else float(found[1]) * _MS[found[2]]
+
+
+def _milliseconds(text: str) -> float | None:
+    """Return a latency with its unit in ms, infinite beyond the longest; None when it is none."""
+    value_ms = duration_ms(text)
+    return math.inf if value_ms is not None and value_ms > LONGEST_MS else value_ms

@@ -191,6 +191,7 @@ class _Flight:
             self._resolved,
             referee,
             trajectory,
+            latency,
             referee.navigation_us,
             index=self._index,
             seed=self._seed,

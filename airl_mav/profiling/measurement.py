@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,16 @@ from airl_mav.profiles.computer import (
     write_samples,
 )
 from airl_mav.profiling.request import ProfileRequest
+from airl_mav.profiling.soak import Soak
 
 SCHEMA = 1
 """Version of the facts beside the samples."""
 
 ROUND_TRIP = "mavlink_round_trip"
 """Key of the TIMESYNC exchanges in flight."""
+
+PAGE_NEEDS = frozenset({"jinja2", "matplotlib"})
+"""What draws the page of a soak; the [sim] extra has it."""
 
 T1_UNCERTAINTY = "t1_uncertainty"
 """Key of the greatest error of each decision's t1."""
@@ -102,6 +107,23 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class DrawnPower:
+    """What the computer draws, as far as its own sensors tell."""
+
+    source: str
+    """What told it, or why nothing did."""
+    idle_w: float | None = None
+    """Mean before anything was measured [W]."""
+    busy_w: float | None = None
+    """Mean while the decisions were measured [W]."""
+
+    def __str__(self) -> str:
+        """Return what was measured, in words; why nothing was."""
+        idle, busy = (f"{w:.2f} W" for w in (self.idle_w or 0.0, self.busy_w or 0.0))
+        return self.source if self.busy_w is None else f"{idle} idle, {busy} busy, {self.source}"
+
+
+@dataclass(frozen=True)
 class ComputerMeasurement:
     """How long a computer takes for a policy's decisions."""
 
@@ -120,8 +142,11 @@ class ComputerMeasurement:
     """Processor, cores, memory, operating system and Python."""
     before: MachineState
     after: MachineState
+    power: DrawnPower
+    soak: Soak | None = None
+    """What happened in the soak, if one was asked for."""
     files: tuple[Path, ...] = ()
-    """Profile, samples, stamps and facts, if they were written."""
+    """Profile, samples, stamps and facts, if they were written, and those of the soak."""
 
     @property
     def stages(self) -> dict[str, Samples]:
@@ -155,15 +180,40 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     by_file = Latency(distribution="samples", samples_file=samples.name)
     written = workload.model_copy(update={"latency": by_file})
     title = f"t2 of {measured.card.name} on {profile.cpu}, {measured.network.runtime}, ms, in order"
+    more: tuple[Path, ...] = ()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if measured.soak is not None:
+            more = _save_soak(measured, measured.soak, path.with_name(f"{stem}.soak.npz"))
         write_samples(samples, workload.latency.samples_ms or (), (title, workload.source))
         save_arrays(arrays, {**recording.columns, "flight": recording.flight_numbers})
         write_json(facts, _facts(measured, path.parent))
         write_profile(path, with_workload(profile, measured.workload, written))
     except OSError as error:
         raise UsageError(f"--out {path.parent}: {error.strerror}") from None
-    return path, samples, arrays, facts
+    return path, samples, arrays, facts, *more
+
+
+def _save_soak(measured: ComputerMeasurement, soaked: Soak, series: Path) -> tuple[Path, ...]:
+    """Write the series of a soak and, where it can be drawn, its page; return both."""
+    save_arrays(series, soaked.series)
+    if not PAGE_NEEDS.issubset(name for name in PAGE_NEEDS if find_spec(name)):
+        return (series,)
+    # Imported late: a drone's computer need not draw.
+    from airl_mav.profiling.soak_page import write_soak_page
+
+    facts = (
+        ("policy", measured.card.name),
+        ("network", measured.card.network),
+        ("processor", measured.profile.cpu),
+        ("runtime", measured.network.runtime),
+        ("power", measured.power.source),
+    )
+    title = f"{measured.card.name} on {measured.computer}"
+    page = write_soak_page(
+        soaked, series.parent, series.stem, title, facts, machine=measured.machine
+    )
+    return series, page
 
 
 def _facts(measured: ComputerMeasurement, out: Path) -> dict[str, Any]:
@@ -183,5 +233,7 @@ def _facts(measured: ComputerMeasurement, out: Path) -> dict[str, Any]:
         "load_us": recording.load_us,
         "first_us": recording.first_us,
         "stages_us": {key: asdict(summarize(samples)) for key, samples in measured.stages.items()},
+        "power": asdict(measured.power),
+        "soak": None if measured.soak is None else measured.soak.facts(),
         "remarks": recording.remarks,
     }

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import re
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from airl_mav.core.clock import utc_now
-from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.machine import MachineState, machine_state
+from airl_mav.core.clock import WallClock, utc_now
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.machine import (
+    MachineState,
+    machine_state,
+    mean_frequency_mhz,
+    temperature_c,
+)
+from airl_mav.core.power import PowerMeter, PowerSampling, PowerSource, find_power_source
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.core.provenance import describe_machine
 from airl_mav.profiles.computer import (
@@ -22,19 +29,38 @@ from airl_mav.profiles.computer import (
     existing_profile,
     with_workload,
 )
-from airl_mav.profiling.measurement import ComputerMeasurement, ProfilingError, Recording, save
+from airl_mav.profiling.bare import BareLoop
+from airl_mav.profiling.measurement import (
+    ComputerMeasurement,
+    DrawnPower,
+    ProfilingError,
+    Recording,
+    save,
+)
 from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
 from airl_mav.profiling.request import ProfileRequest
+from airl_mav.profiling.soak import Reading, Soak, soak
+from airl_mav.rehearsal.signals import stop_on_signals
 
 BUSY_SHARE = 0.25
 """Load average over one minute, per usable core, above which a machine is not idle."""
 
-UNKNOWN = {"watts": "watts: not measured", "price_usd": "price: not known"}
+IDLE_US = 3 * US_PER_S
+"""How long the power of a machine that only waits is looked at."""
+
+WATTS_REMARK = "watts: "
+"""How the source of a profile begins to say that nobody gave the watts."""
+
+UNKNOWN = {"watts": f"{WATTS_REMARK}not measured", "price_usd": "price: not known"}
 """What the source of a profile says of a field that was not given."""
 
 
 def profile(
-    request: ProfileRequest, *, out: Path | None = None, progress: Progress | None = None
+    request: ProfileRequest,
+    *,
+    out: Path | None = None,
+    progress: Progress | None = None,
+    root: Path = Path("/"),
 ) -> ComputerMeasurement:
     """Measure how long this computer takes for a policy's decisions.
 
@@ -43,6 +69,7 @@ def profile(
         out: Folder of computer profiles to which this one and its samples are written, at the very
             end; a profile that it holds keeps its other workloads. None: nothing is written.
         progress: Who looks on.
+        root: Where /sys is found, for the power.
 
     Returns:
         The measurement; its `profile` can be flown as, by `Scenario.computer`, once it is written.
@@ -65,13 +92,19 @@ def profile(
         card, network = policy.card, policy.network
         progress.note(f"profile    {card.name} at level {request.level}, {network.runtime}")
         progress.note(f"network    {card.network}")
+        source, told_by = find_power_source(root)
+        idle_w = None if source is None else _idle_power(source)
         before = machine_state()
         bar = progress.bar("decisions", request.warm_up + request.decisions, unit="decisions")
         try:
-            recording = _measure(request, policy, bar)
+            with ExitStack() as sampling:
+                meter = source and sampling.enter_context(PowerSampling(source, WallClock()))
+                recording = _measure(request, policy, bar)
         finally:
             bar.close()
         after = machine_state()
+        power = DrawnPower(told_by, idle_w, meter.mean_w if meter else None)
+        soaked = _soak(request, policy, source, progress) if request.soak else None
     if remark := busy_remark(before, int(machine["cores_usable"])):
         recording = replace(recording, remarks=(*recording.remarks, remark))
     date = f"{utc_now():%Y-%m-%d}"
@@ -89,7 +122,7 @@ def profile(
         assumed="; ".join(recording.remarks),
     )
     name = request.workload or _workload_name(request, card.name)
-    known = _computer(request, computer, cpu, held, date)
+    known = _computer(request, computer, cpu, held, date, power)
     measured = ComputerMeasurement(
         request=request,
         card=card,
@@ -100,6 +133,8 @@ def profile(
         machine=machine,
         before=before,
         after=after,
+        power=power,
+        soak=soaked,
     )
     return measured if path is None else replace(measured, files=save(measured, path))
 
@@ -120,6 +155,49 @@ def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Reco
         raise ProfilingError(str(error)) from error
 
 
+def _idle_power(source: PowerSource) -> float | None:
+    """Return the mean power of a machine that only waits [W]."""
+    clock = WallClock()
+    meter = PowerMeter(source, clock)
+    clock.sleep_until(IDLE_US)
+    return meter.sample()
+
+
+def _soak(
+    request: ProfileRequest,
+    policy: PolicyUnderTest,
+    source: PowerSource | None,
+    progress: Progress,
+) -> Soak:
+    """Go on deciding, without a pause, for as long as was asked for; Ctrl-C ends it early."""
+    seconds = request.soak_s
+    assert seconds is not None  # noqa: S101 (it was asked for)
+    loop = BareLoop(request, policy)
+    meter = None if source is None else PowerMeter(source, loop.clock)
+
+    def read() -> Reading:
+        watts = None if meter is None else meter.sample()
+        return Reading(mean_frequency_mhz(), temperature_c(), watts)
+
+    with stop_on_signals() as stop:
+        progress.note(
+            f"soak       {request.soak} without a pause; Ctrl-C ends it, and keeps the rest"
+        )
+        bar = progress.bar("soak", round(seconds), unit="s")
+        try:
+            return soak(
+                loop.decide,
+                seconds,
+                loop.clock,
+                read=read,
+                state=machine_state,
+                stop=stop,
+                progress=lambda passed_s: bar.update(completed=passed_s),
+            )
+        finally:
+            bar.close()
+
+
 def busy_remark(before: MachineState, cores: int) -> str | None:
     """Return a warning if other programs used the processor at the start, None if not."""
     if before.load is None or before.load[0] <= BUSY_SHARE * cores:
@@ -131,23 +209,37 @@ def busy_remark(before: MachineState, cores: int) -> str | None:
 
 
 def _computer(
-    request: ProfileRequest, name: str, cpu: str, held: ComputerProfile | None, date: str
+    request: ProfileRequest,
+    name: str,
+    cpu: str,
+    held: ComputerProfile | None,
+    date: str,
+    power: DrawnPower,
 ) -> ComputerProfile:
-    """Return the computer as its file has it, with the watts and the price of the request."""
+    """Return the computer as its file has it, with the watts and the price of the request.
+
+    Watts that nobody gave are those that were measured, but at level sitl, where the simulator
+    draws them too.
+    """
     given = {"watts": request.watts, "price_usd": request.price_usd}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    unknown = [remark for name, remark in UNKNOWN.items() if name not in changes]
+    said = {name: remark for name, remark in UNKNOWN.items() if name not in changes}
+    nobody_gave = "watts" in said and (held is None or WATTS_REMARK in held.source)
+    if nobody_gave and power.busy_w is not None and request.level != "sitl":
+        changes["watts"] = round(power.busy_w, 2)
+        said["watts"] = f"{WATTS_REMARK}measured while deciding at level {request.level} ({power})"
     if held is None:
         return ComputerProfile(
             description=f"{name}, as measured by airl profile",
             cpu=cpu,
-            source="; ".join((f"airl profile, {date}", *unknown)),
+            source="; ".join((f"airl profile, {date}", *said.values())),
             **{"watts": 0.0, "price_usd": 0.0, **changes},
         )
-    source = held.source
-    for remark in set(UNKNOWN.values()).difference(unknown):
-        source = source.replace(f"; {remark}", "")
-    return held.model_copy(update={**changes, "source": source})
+    # What was said of a figure goes with the figure.
+    replaced = tuple(UNKNOWN[name].partition(" ")[0] for name in changes)
+    parts = [part for part in held.source.split("; ") if not part.startswith(replaced)]
+    parts += [said[name] for name in changes if name in said]
+    return held.model_copy(update={**changes, "source": "; ".join(parts)})
 
 
 def _workload_name(request: ProfileRequest, policy: str) -> str:

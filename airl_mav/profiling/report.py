@@ -42,6 +42,10 @@ def print_measurement(measured: ComputerMeasurement, console: Console) -> None:
     for remark in measured.recording.remarks:
         _say(console, f"- {remark}")
     _say(console, verdict(measured.card, measured.t2_us), style="bold")
+    if measured.soak is not None:
+        _say(console, measured.soak.sentence(), style="bold")
+        if measured.files and not any(path.suffix == ".html" for path in measured.files):
+            _say(console, "- the page of the soak is drawn by pip install 'airl-mav[sim]'")
     for path in measured.files:
         _say(console, f"written    {path}")
     if measured.files:
@@ -69,6 +73,7 @@ def _machine_table(measured: ComputerMeasurement) -> TableView:
     states = zip(measured.before.rows(), measured.after.rows(), strict=True)
     for (name, before), (_, after) in states:
         rows.append((name, before, "" if before == after == NOT_OFFERED else after))
+    rows.append(("power", f"{measured.power}", ""))
     columns = tuple(Column(title, number=False) for title in ("machine", "before", "after"))
     return TableView("machine", measured.computer, columns, tuple(rows))
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import quantity
+from airl_mav.latency.source import duration_ms
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.scenario.model import GREATEST_SEED, Inference
 from airl_mav.scenario.stand_alone import CompanionAddresses
@@ -16,6 +19,8 @@ NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 
 FLOWN_SPEED_M_S = 0.1
 """Speed limit in flight: far below what a goal or a wall could be reached with."""
+
+SHORTEST_SOAK_MS, LONGEST_SOAK_MS = 10e3, 24 * 3600e3
 
 ProfileLevel = Literal["bare", "sitl", "hil"]
 
@@ -65,6 +70,12 @@ class ProfileRequest(CompanionAddresses, Inference):
         le=1,
         default=0.05,
     )
+    soak: str | None = Field(
+        default=None,
+        description="after the measurement, go on with inference alone for so long, as 90s, 10min"
+        " or 1h, and watch latency, frequency and temperature: does this computer slow down as it"
+        " gets warm?",
+    )
     on: str | None = Field(
         default=None,
         pattern=NAME,
@@ -78,8 +89,8 @@ class ProfileRequest(CompanionAddresses, Inference):
         " default after policy, level, runtime and threads",
     )
     watts: float | None = quantity(
-        "power that the computer draws, which is not measured here; by default that of an existing"
-        " profile, or 0",
+        "power that the computer draws; by default as measured, where this computer tells it,"
+        " or that of an existing profile, or 0",
         "W",
         ge=0,
         le=10_000,
@@ -105,6 +116,22 @@ class ProfileRequest(CompanionAddresses, Inference):
         " by default the first shipped one whose camera fits",
     )
     ports: Ports = Field(default_factory=Ports, description="ports of level sitl")
+
+    @field_validator("soak")
+    @classmethod
+    def _known_duration(cls, soak: str | None) -> str | None:
+        if (
+            soak is not None
+            and not SHORTEST_SOAK_MS <= (duration_ms(soak) or 0.0) <= LONGEST_SOAK_MS
+        ):
+            raise FieldError("soak", soak, "10s to 24h, as 90s, 10min or 1h")
+        return soak
+
+    @property
+    def soak_s(self) -> float | None:
+        """How long the soak lasts [s]; None: there is none."""
+        given_ms = None if self.soak is None else duration_ms(self.soak)
+        return None if given_ms is None else given_ms * US_PER_MS / US_PER_S
 
     @property
     def flown_as(self) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
+from airl_mav.core.process_use import ProcessUse
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
@@ -171,6 +172,8 @@ class Ended(_Line):
     notes: tuple[str, ...] = ()
     path: str
     """Of the decision log."""
+    use: ProcessUse | None = None
+    """What the mission took of the companion's machine; None where it is no process of its own."""
     sha256: dict[str, str] = Field(default_factory=dict)
     """In lockstep, the fingerprint of what the policy saw; see docs/explanation/lockstep.md."""
 

@@ -18,6 +18,7 @@ from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.process_use import UseMeter
 from airl_mav.rehearsal.channel import (
     Abort,
     Begin,
@@ -75,6 +76,7 @@ class Missions:
             LinkError: No flight controller is heard.
         """
         aircraft, clock = self._scenario.scenario, self._clock
+        use = UseMeter(WallClock())
         self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
         with (
             held_to(aircraft.cpu_quota),
@@ -89,6 +91,7 @@ class Missions:
                     link.connect(CONNECT_TIMEOUT_S)
                 policy = self._scenario.fresh_policy(request.seed)
                 check_camera(policy, frames, self._stop)
+                use.begin()
                 result = fly_mission(
                     link,
                     frames,
@@ -103,9 +106,10 @@ class Missions:
                     guard=ThreadGuard(clock),
                     latency=self._scenario.latency_sampler(request.seed, native=True),
                 )
+                used = use.end()
                 save_arrays(Path(request.record), result.log.columns())
                 self._channel.send(
-                    Ended(reason=result.reason, notes=result.notes, path=request.record)
+                    Ended(reason=result.reason, notes=result.notes, path=request.record, use=used)
                 )
 
     def _announce(self, phase: str) -> None:

@@ -86,7 +86,7 @@ def join_episode(
         latency |= join_stamps(
             _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
         )
-    record = _record(episode, scenario, trajectory, arrays["tick/slips_us"])
+    record = _record(episode, scenario, trajectory, latency, arrays["tick/slips_us"])
     figures = host_figures(
         flight_us=record.ended_us - record.started_us,
         slipped_us=record.slipped_us,
@@ -103,13 +103,18 @@ def join_episode(
 
 
 def _record(
-    episode: Episode, scenario: ResolvedScenario, trajectory: Trajectory, slips: NDArray[np.int64]
+    episode: Episode,
+    scenario: ResolvedScenario,
+    trajectory: Trajectory,
+    latency: Mapping[str, NDArray[Any]],
+    slips: NDArray[np.int64],
 ) -> EpisodeRecord:
     state, loaded, began_us = episode.verdict_state, episode.loaded, episode.navigating_us
     return judged_record(
         scenario,
         episode.referee,
         trajectory,
+        latency,
         # What the referee knew in flight was the time given up by its newest state, an older one.
         None if began_us is None else int(without_slips(np.array([began_us]), slips)[0]),
         index=episode.index,
@@ -120,6 +125,7 @@ def _record(
         slipped_us=state.slipped_us - loaded.slipped_us if state else 0,
         battery_remaining=state.battery if state else None,
         notes=tuple(episode.notes),
+        companion_use=None if episode.ended is None else episode.ended.use,
     )
 
 
@@ -127,6 +133,7 @@ def judged_record(
     scenario: ResolvedScenario,
     referee: Referee,
     trajectory: Trajectory,
+    latency: Mapping[str, NDArray[Any]],
     navigation_us: int | None,
     *,
     seed: int,
@@ -139,6 +146,7 @@ def judged_record(
         scenario: What was flown.
         referee: Who judged; a flight without a verdict is aborted.
         trajectory: The true path.
+        latency: The columns of its decisions.
         navigation_us: When navigation began, by the clock of the trajectory [µs]; None: never.
         seed: Of the episode.
         started_us: When it began, by the same clock [µs].
@@ -153,6 +161,8 @@ def judged_record(
             verdict.time_us,
             scenario.computer.onboard_watts,
             scenario.pack_j,
+            decisions=latency,
+            hold_s=scenario.pilot.hold_s,
         )
     return EpisodeRecord(
         seed=seed,

@@ -33,6 +33,9 @@ class Measure:
         "endurance_s",
         "range_m",
         "missions_per_charge",
+        "deadline_misses",
+        "jerk_rms_m_s3",
+        "command_step_m_s",
     ]
     """Its field in an `Aggregate`; of the first six, also in a `PairedComparison`."""
     title: str
@@ -73,6 +76,13 @@ TOTAL_ENERGY = Measure("total_energy_j", "energy, both", "kJ", 1e-3, 2)
 ENDURANCE = Measure("endurance_s", "endurance", "min", 1.0 / S_PER_MIN, 1)
 RANGE = Measure("range_m", "range", "km", 1e-3, 2)
 MISSIONS = Measure("missions_per_charge", "missions per charge", "", 1.0, 1)
+
+DEADLINE_MISSES = Measure("deadline_misses", "deadline misses", "%", 100.0, 1, "points")
+JERK = Measure("jerk_rms_m_s3", "jerk, flown, RMS", "m/s³", 1.0, 2)
+COMMAND_STEP = Measure("command_step_m_s", "step of the command, mean", "m/s", 1.0, 2)
+
+CONDUCT = (DEADLINE_MISSES, JERK, COMMAND_STEP)
+"""Deadlines and smoothness. Runs that were recorded without have none of these."""
 
 PACK = (ENDURANCE, RANGE, MISSIONS)
 """Runs that were recorded without have none of these."""

@@ -16,6 +16,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.ages import ages_table, run_ages
+from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import (
     REPORT_FILE,
     SHEET_COLUMNS,
@@ -133,6 +134,7 @@ def build_page(
             origin=run.info.setup.injection.origin,
             setup=setup_rows(run),
             quality=quality_table(summary),
+            conduct=conduct_table(run, summary),
             real_time=real_time_table(run, summary) if summary.timed else None,
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,

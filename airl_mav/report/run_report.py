@@ -13,6 +13,7 @@ from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.statistics import aggregate
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import arenas_of, vehicle_of
+from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_verdict
 from airl_mav.report.forensics.worst import EXAMINED, ranked
 from airl_mav.report.run_page import build_page, pictured
@@ -96,6 +97,8 @@ def print_report(
     flights = count_outcomes([episode.outcome for episode in run.episodes])
     print_facts([*setup_rows(run), ("flights", flights)], console)
     views = [latency_table(summary), episodes_table(run, MAX_LISTED), quality_table(summary)]
+    if (conduct := conduct_table(run, summary)) is not None:
+        views.append(conduct)
     if summary.timed:
         views.append(real_time_table(run, summary))
     for view in views:

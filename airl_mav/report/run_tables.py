@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.setup import Part, Setup
@@ -41,6 +42,8 @@ from airl_mav.report.table import (
     ms,
     percentile_cell,
 )
+
+BYTES_PER_MIB = 1 << 20
 
 
 def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
@@ -214,8 +217,32 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
         ("simulated time given up", f"{ms(slipped_us)} ms", flights),
         *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
         ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
+        *_use_rows([e.companion_use for e in run.episodes if e.companion_use]),
     ]
     return TableView("real-time", "Real time", columns, tuple(rows))
+
+
+def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
+    """Return what the companion took of its machine as rows; none of a run recorded without."""
+    if not uses:
+        return []
+    n, wall_s = f"{len(uses)}", sum(use.wall_s for use in uses)
+    cores = f"{sum(use.cpu_s for use in uses) / wall_s:.2f} cores" if wall_s else NONE
+    mean_s = sum(use.cpu_s for use in uses) / len(uses)
+    peaks = [use.peak_memory_bytes for use in uses if use.peak_memory_bytes is not None]
+    begun = all(use.peak_since == "begin" for use in uses)
+    since = "of any flight" if begun else "since the process began"
+    powers = [use.power_w for use in uses if use.power_w is not None]
+    watts = f"{np.mean(powers):.1f} W ({uses[-1].power_source})" if powers else NONE
+    return [
+        ("companion, processor time a flight", f"{mean_s:.2f} s, {cores}", n),
+        (
+            f"companion, greatest memory {since}",
+            f"{max(peaks) / BYTES_PER_MIB:.0f} MiB" if peaks else NONE,
+            f"{len(peaks)}",
+        ),
+        ("mean power of the machine", watts, f"{len(powers)}"),
+    ]
 
 
 def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:

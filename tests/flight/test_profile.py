@@ -41,6 +41,8 @@ from companion.mission import MissionResult
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT
 from tests.unit.test_companion_light import BLOCK
+from tests.unit.test_machine_power import ORIN_NX
+from tests.unit.test_machine_state import write
 
 SMALL = ("--network", "2x4", "--image", "64x48")
 
@@ -206,6 +208,9 @@ def test_runs_of_slow_decisions_are_seen() -> None:
         (["--hold-s", "2"], "--hold-s 2: accepted: 0 <= value <= 1 s"),
         (["--on", "../x"], "--on ../x: accepted"),
         (["--watts", "-1"], "--watts -1: accepted"),
+        (["--soak", "long"], "--soak long: accepted: 10s to 24h, as 90s, 10min or 1h"),
+        (["--soak", "9.9s"], "--soak 9.9s: accepted: 10s to 24h"),
+        (["--soak", "25h"], "--soak 25h: accepted: 10s to 24h"),
         (["--vehicle", "quad-256x144"], "--vehicle quad-256x144: camera"),
     ],
 )
@@ -320,6 +325,66 @@ def test_interrupted_profile_writes_nothing(tmp_path: Path) -> None:
     assert process.returncode == 130, rest
     assert "interrupted: nothing was written" in rest
     assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
+    words = [sys.executable, "-u", "-m", "airl_mav.cli.main", "profile", "--soak", "10min"]
+    process = subprocess.Popen(
+        [*words, "--decisions", "20", "--on", "box", "--out", str(tmp_path / "out")],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    for what in ("profile", "network", "soak"):
+        assert what in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    rest = process.communicate(timeout=60)[0]
+    assert process.returncode == 130, rest
+    stem = tmp_path / "out/box.static-obstacles-bare"
+    facts = json.loads(Path(f"{stem}.json").read_text())
+    assert facts["soak"]["interrupted"]
+    assert facts["soak"]["duration_s"] < 60.0 < facts["soak"]["asked_s"] == 600.0
+    assert "of 10.0 min, interrupted: t2 from the first to the last" in rest
+    with np.load(f"{stem}.soak.npz") as series:
+        assert len(series["time_s"]) == round(facts["soak"]["duration_s"])
+        assert series["time_s"][-1] == facts["soak"]["duration_s"]
+        assert (series["n"] >= 1).all()
+        assert (series["p50_ms"] <= series["max_ms"]).all()
+    page = Path(f"{stem}.soak.html").read_text(encoding="utf-8")
+    assert "data:image/svg+xml" in page
+    assert "interrupted" in page
+    # The measurement before the soak is whole, and flies.
+    work = load_computer(str(tmp_path / "out/box.toml")).workloads["static-obstacles-bare"]
+    assert len(work.latency.samples_ms or ()) == 20
+
+
+def test_power_that_the_computer_tells_is_its_watts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("airl_mav.profiling.profile.IDLE_US", 20_000)
+    root, out = write(tmp_path / "machine", ORIN_NX), tmp_path / "out"
+    few = ProfileRequest(on="box", decisions=10, warm_up=1)
+    measured = profile(few, out=out, root=root)
+    assert measured.power.idle_w == pytest.approx(5.016 * 1.2)
+    assert measured.power.busy_w == pytest.approx(5.016 * 1.2)
+    told = "measured while deciding at level bare (6.02 W idle, 6.02 W busy, INA monitor: VDD_IN)"
+    held = load_computer(str(out / "box.toml"))
+    assert held.watts == pytest.approx(6.02)
+    assert held.source.endswith(f"; watts: {told}; price: not known")
+    facts = json.loads((out / "box.static-obstacles-bare.json").read_text())
+    assert facts["power"]["source"] == "INA monitor: VDD_IN"
+    # Measured again: said once. Given by a person: kept, whatever is measured later.
+    profile(few, out=out, root=root)
+    assert load_computer(str(out / "box.toml")).source.count("watts: ") == 1
+    profile(few.model_copy(update={"watts": 9.0, "price_usd": 5.0}), out=out, root=root)
+    profile(few, out=out, root=root)
+    held = load_computer(str(out / "box.toml"))
+    assert (held.watts, held.price_usd) == (9.0, 5.0)
+    assert "watts: " not in held.source
+    assert "price: " not in held.source
 
 
 @pytest.mark.slow

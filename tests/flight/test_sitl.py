@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +111,36 @@ def test_what_was_flown_is_on_record(done: Done) -> None:
         assert episode["started_us"] < episode["navigation_us"] < episode["ended_us"]
         assert 0.9 < episode["battery_remaining"] < 1.0
         assert episode["wall_s"] > 0.0
+
+
+def test_what_the_companion_took_is_on_record(done: Done) -> None:
+    for episode in done.episodes:
+        use = episode["companion_use"]
+        # From arming to the ground: longer than to the verdict, and on the wall clock.
+        flown_s = (episode["ended_us"] - episode["started_us"]) / 1e6 / 2.5
+        assert 0.7 * flown_s < use["wall_s"] < flown_s + 60.0
+        # MAVSDK, camera and policy take some of a core, and never as much as all of them.
+        assert 0.01 < use["cpu_s"] < use["wall_s"] * (os.cpu_count() or 1)
+        assert 30e6 < use["peak_memory_bytes"] < 1e9
+        assert use["peak_since"] in ("begin", "process start")
+        assert use["power_w"] is None or use["power_w"] > 0.0
+        assert use["power_source"]
+    assert "companion, processor time a flight" in done.output
+    assert "mean power of the machine" in (done.folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("index", range(EPISODES))
+def test_deadlines_and_steps_follow_from_the_decisions(done: Done, index: int) -> None:
+    archive, quality = done.arrays("latency.npz"), done.episodes[index]["quality"]
+    taken = archive[f"{index:03d}/motor_us"] - archive[f"{index:03d}/capture_us"]
+    late = sum(1 for each in taken if each > 500_000)
+    assert quality["deadline_misses"] == pytest.approx(late / len(taken))
+    setpoints = archive[f"{index:03d}/setpoint"].astype(float)
+    steps = [np.hypot.reduce(b[:3] - a[:3]) for a, b in pairwise(setpoints)]
+    assert quality["command_step_m_s"] == pytest.approx(np.mean(steps))
+    assert quality["command_step_max_m_s"] == pytest.approx(max(steps))
+    assert 0.0 < quality["jerk_rms_m_s3"] < quality["jerk_peak_m_s3"]
+    assert quality["jerk_rms_m_s3"] < quality["command_jerk_rms_m_s3"]
 
 
 def test_episodes_are_on_one_clock(done: Done) -> None:

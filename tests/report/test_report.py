@@ -21,6 +21,7 @@ from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.ages import ages_table, run_ages
+from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.forensics.worst import examine_worst
 from airl_mav.report.run_page import MAX_PICTURED, build_page
@@ -143,6 +144,46 @@ def test_quality_tables(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
         assert episode.quality is not None
         assert row["distance"] == f"{episode.quality.distance_m:.2f}"
         assert row["why"].startswith(episode.reason)
+
+
+def test_deadlines_and_smoothness(demo: tuple[LoadedRun, dict[int, Arena]], page: str) -> None:
+    run, _ = demo
+    view = conduct_table(run, summarize_run(run))
+    assert view is not None
+    late = [np.mean(s["motor_us"] - s["capture_us"] > 500_000) for s in run.latency.values()]
+    misses = cells(view, "deadline misses")
+    assert misses["value"] == f"{100 * np.mean(late):.1f} %"
+    assert misses["n"] == str(len(run.episodes))
+    reached = [e for e in run.episodes if e.outcome is Outcome.SUCCESS]
+    rows = [run.latency[e.index]["setpoint"][:, :3].astype(float) for e in reached]
+    steps = np.concatenate([np.sqrt(((r[1:] - r[:-1]) ** 2).sum(axis=1)) for r in rows])
+    assert cells(view, "step of the command, greatest")["value"] == f"{steps.max():.2f} m/s"
+    assert cells(view, "step of the command, p95")["value"] == "too few"
+    # Steps of 0.01, 0.02, ... 2 m/s in one flight, none in the others.
+    ramp = np.zeros((201, 4))
+    ramp[1:, 0] = np.cumsum(np.arange(1, 201) / 100)
+    long = {reached[0].index: {"sent_us": np.arange(201), "setpoint": ramp}}
+    longer = conduct_table(replace(run, latency=long), summarize_run(run))
+    assert longer is not None
+    assert cells(longer, "step of the command, p95")["value"] == "1.90 m/s"
+    peaks = [e.quality.jerk_peak_m_s3 or 0.0 for e in reached if e.quality]
+    assert cells(view, "jerk, flown, peak")["value"] == f"{max(peaks):,.1f} m/s³"
+    assert view.title in page
+
+
+def test_a_run_recorded_without_them_has_no_such_table(
+    demo: tuple[LoadedRun, dict[int, Arena]],
+) -> None:
+    run, _ = demo
+    old = []
+    for episode in run.episodes:
+        assert episode.quality is not None
+        quality = replace(
+            episode.quality, deadline_misses=None, jerk_rms_m_s3=None, command_step_m_s=None
+        )
+        old.append(replace(episode, quality=quality))
+    run = replace(run, episodes=tuple(old))
+    assert conduct_table(run, summarize_run(run)) is None
 
 
 def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:

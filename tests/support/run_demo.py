@@ -109,7 +109,14 @@ def demo_episode(
         wall_s=(verdict.time_us - started_us) / 1e6 + 0.002,
         slipped_us=0 if index else 8_000,
         battery_remaining=charge,
-        quality=measure_quality(trajectory, navigation_us, verdict.time_us, WATTS),
+        quality=measure_quality(
+            trajectory,
+            navigation_us,
+            verdict.time_us,
+            WATTS,
+            decisions={**log.columns(), "motor_us": np.array(setpoints, np.int64)[:, 1]},
+            hold_s=0.5,
+        ),
         notes=("watchdog: a decision was 620 ms late",) if index == 2 else (),
     )
     accepted = np.array(setpoints, np.int64).reshape(-1, 2)

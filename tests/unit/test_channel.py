@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import os
 import queue
 import threading
 import types
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import pytest
 from hypothesis import given
@@ -58,6 +59,10 @@ def values(annotation: Any) -> st.SearchStrategy[Any]:
         return st.tuples(*(values(arg) for arg in args))
     if origin is dict:
         return st.dictionaries(values(args[0]), values(args[1]), max_size=3)
+    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+        hints = get_type_hints(annotation)
+        names = [field.name for field in dataclasses.fields(annotation)]
+        return st.builds(annotation, **{name: values(hints[name]) for name in names})
     return st.from_type(annotation)
 
 

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,11 @@ import pytest
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import append_lines, read_lines
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import SCHEMA, EpisodeRecord
 from tests.support.run_demo import demo_arena, demo_episode
+
+QUALITY_DEFAULTS = {field.name for field in fields(Quality) if field.default is None}
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +43,15 @@ def test_the_line_is_plain_json(record: EpisodeRecord) -> None:
     assert data["quality"]["distance_m"] == record.quality.distance_m
 
 
-def test_a_line_of_an_older_run_has_no_endurance(record: EpisodeRecord) -> None:
+def test_a_line_of_an_older_run_lacks_what_it_was_recorded_without(record: EpisodeRecord) -> None:
     data = json.loads(json.dumps(record.as_data()))
-    for name in ("endurance_s", "range_m", "missions_per_charge"):
+    later = [name for name in data["quality"] if name in QUALITY_DEFAULTS]
+    assert {"endurance_s", "deadline_misses", "command_step_max_m_s"} <= set(later)
+    for name in later:
         del data["quality"][name]
     old = EpisodeRecord.from_data(data, "here")
     assert old.quality is not None
-    assert old.quality.endurance_s is None
+    assert {getattr(old.quality, name) for name in later} == {None}
     assert old.quality.energy_j == data["quality"]["energy_j"]
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 from airl_mav.latency.percentiles import MIN_SAMPLES, percentile, summarize
 
 
-@pytest.mark.parametrize("p", [90.0, 99.0, 99.9])
+@pytest.mark.parametrize("p", [90.0, 95.0, 99.0, 99.9])
 def test_the_floors_are_the_early_stopping_rule(p: float) -> None:
     """Fewest n with P(at most one of n samples over the bound) <= 1 %, were the bound too low."""
     n = 2

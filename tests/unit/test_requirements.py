@@ -49,6 +49,9 @@ AGAINST = PairedComparison(
         ("success gap >= -1 points", Requirement("success", True, ">=", -1.0)),
         ("energy <= 3.5 kJ", Requirement("energy", False, "<=", 3.5)),
         ("flight_time <= 1e1 s", Requirement("flight_time", False, "<=", 10.0)),
+        ("deadline_misses <= 1 %", Requirement("deadline_misses", False, "<=", 1.0)),
+        ("jerk <= 12 m/s3", Requirement("jerk", False, "<=", 12.0)),
+        ("command_step <= 2.5 m/s", Requirement("command_step", False, "<=", 2.5)),
     ],
 )
 def test_what_is_read(text: str, requirement: Requirement) -> None:
@@ -67,6 +70,8 @@ def test_what_is_read(text: str, requirement: Requirement) -> None:
         ("success >= 101 %", "up to 100 %"),
         ("flight_time <= 10 %", "the unit s"),
         ("success gap >= -1 %", "the unit points"),
+        ("jerk gap <= 10 %", "jerk without gap"),
+        ("jerk <= 12 m/s", "the unit m/s3"),
     ],
 )
 def test_what_is_refused(text: str, hint: str) -> None:
@@ -142,4 +147,12 @@ def test_a_gap_needs_a_reference() -> None:
 def test_every_measure_is_a_figure_of_runs_and_of_pairs() -> None:
     for word, measure in MEASURES.items():
         assert isinstance(getattr(QUALITY, measure.attribute), Estimate), word
-        assert isinstance(getattr(AGAINST, measure.attribute), Change), word
+        if measure.gap_unit is not None:
+            assert isinstance(getattr(AGAINST, measure.attribute), Change), word
+
+
+def test_late_decisions_are_judged_as_a_share() -> None:
+    quality = replace(QUALITY, deadline_misses=Estimate(0.02, 0.015, 0.03, 100))
+    finding = find(parse_requirement("deadline_misses <= 1 %"), quality, None)
+    assert finding.decision is Decision.NOT_MET
+    assert finding.sentence().endswith("(2.0 % [1.5, 3.0], n = 100)")

@@ -18,6 +18,7 @@ from airl_mav.report.comparison.figures import (
 )
 from airl_mav.report.comparison.model import Comparison, RunEntry, kind_of, load_entries
 from airl_mav.report.comparison.tables import (
+    conduct_table,
     contrast_table,
     facts_table,
     pair_sentences,
@@ -86,7 +87,10 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
         Section(facts.title, tables=(facts,))
         if comparison.different
         else Section(facts.title, sentences=("Nothing in what was flown on what.",)),
-        Section("Quality of flight", tables=(runs_table(comparison.runs),)),
+        Section(
+            "Quality of flight",
+            tables=(runs_table(comparison.runs), *conduct_table(comparison.runs)),
+        ),
         Section(
             "Paired differences",
             sentences=pair_sentences(comparison),

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
+from airl_mav.report.conduct import CONDUCT_NOTE
 from airl_mav.report.document import Facts, Headline, estimate_headline
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
+    CONDUCT,
     FEW_FLIGHTS,
     MEASURES,
     Measure,
@@ -105,6 +108,14 @@ def runs_table(
     if len({run.quality.success_rate.n for run in runs}) > 1:
         notes.append("Not the same number of flights in all runs: compare on the same seeds.")
     return TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
+
+
+def conduct_table(runs: Sequence[ComparedRun]) -> tuple[TableView, ...]:
+    """Return deadlines and smoothness of every run by itself; empty where none recorded them."""
+    if not any(measure.of(run.quality).n for run in runs for measure in CONDUCT):
+        return ()
+    view = runs_table(runs, title="Deadlines and smoothness", measures=CONDUCT)
+    return (replace(view, key="conduct", notes=(CONDUCT_NOTE,)),)
 
 
 def facts_table(comparison: Comparison) -> TableView:

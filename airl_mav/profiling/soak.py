@@ -1,0 +1,195 @@
+"""Thermal soak: deciding without a pause for minutes, until the computer is as warm as it gets."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.machine import MachineState, throttled_since
+from airl_mav.latency.percentiles import percentile, summarize
+from airl_mav.latency.stages import Samples
+
+ROW_US = US_PER_S
+"""The series has a row for each second."""
+
+WINDOW_US = 60 * US_PER_S
+"""The last minute is compared with the first; in a soak of less than two, its halves."""
+
+FREQUENCY_DROP = 0.05
+"""A processor whose mean frequency falls by more than this share has dropped it. Less is what a
+governor does from second to second."""
+
+
+class Reading(NamedTuple):
+    """What the machine says of itself at a moment; None: nothing."""
+
+    frequency_mhz: float | None
+    """Mean of the cores."""
+    temperature_c: float | None
+    power_w: float | None
+    """Mean since the last reading."""
+
+
+@dataclass(frozen=True)
+class Soak:
+    """What happened to a computer that went on deciding."""
+
+    asked_s: float
+    interrupted: bool
+    """It was ended early."""
+    series: dict[str, NDArray[np.float64]]
+    """A row for each second: `time_s` (its end, since the beginning), `n` decisions, their
+    `p50_ms` and `max_ms`, `frequency_mhz`, `temperature_c`, `power_w`; NaN where not told."""
+    window_s: float
+    """How long the first and the last part are [s]."""
+    first_us: Samples
+    """t2 of the decisions of the first part, in their order."""
+    last_us: Samples
+    """Those of the last part."""
+    throttled: bool | None
+    """Whether the system says that it slowed the processor down; None: it does not tell."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasted [s]."""
+        return float(self.series["time_s"][-1])
+
+    def ends(self, name: str) -> tuple[float, float] | None:
+        """Return the mean of a column over the first and over the last part; None: not told."""
+        column, time_s = self.series[name], self.series["time_s"]
+        first, last = max(self.window_s, time_s[0]), self.duration_s - self.window_s
+        parts = time_s <= first, time_s > last
+        known = [column[part & np.isfinite(column)] for part in parts]
+        if not all(part.size for part in known):
+            return None
+        return float(known[0].mean()), float(known[1].mean())
+
+    @property
+    def frequency_dropped(self) -> bool | None:
+        """Whether the processor is slower at the end; None where the system does not tell."""
+        ends = self.ends("frequency_mhz")
+        return None if ends is None else ends[1] < (1.0 - FREQUENCY_DROP) * ends[0]
+
+    def facts(self) -> dict[str, Any]:
+        """Return the soak without its series, as plain values."""
+        return {
+            "asked_s": self.asked_s,
+            "duration_s": self.duration_s,
+            "interrupted": self.interrupted,
+            "window_s": self.window_s,
+            "first_us": asdict(summarize(self.first_us)),
+            "last_us": asdict(summarize(self.last_us)),
+            **{name: self.ends(name) for name in Reading._fields},
+            "frequency_dropped": self.frequency_dropped,
+            "throttled": self.throttled,
+        }
+
+    def sentence(self) -> str:
+        """Return how the last part differs from the first, in one line."""
+        part = "minute" if self.window_s == WINDOW_US / US_PER_S else f"{self.window_s:.0f} s"
+        moved = [
+            f"{name} {_change(percentile(self.first_us, p), percentile(self.last_us, p))}"
+            for name, p in (("p50", 50.0), ("p99", 99.0))
+        ]
+        early = f" of {_minutes(self.asked_s)}, interrupted" if self.interrupted else ""
+        return (
+            f"soak of {_minutes(self.duration_s)}{early}: t2 from the first to the last {part}: "
+            f"{', '.join(moved)}; {self._frequency()}; {self._temperature()}; {self._throttling()}"
+        )
+
+    def _frequency(self) -> str:
+        ends = self.ends("frequency_mhz")
+        if ends is None:
+            return "frequency: not told by this system"
+        fell = "dropped" if self.frequency_dropped else "did not drop"
+        return f"frequency {fell} ({ends[0]:.0f} to {ends[1]:.0f} MHz)"
+
+    def _temperature(self) -> str:
+        ends = self.ends("temperature_c")
+        if ends is None:
+            return "temperature: not told by this system"
+        return f"temperature {ends[0]:.1f} to {ends[1]:.1f} °C"
+
+    def _throttling(self) -> str:
+        if self.throttled is None:
+            return "throttling: not told by this system"
+        return "throttled" if self.throttled else "not throttled"
+
+
+def soak(
+    decide: Callable[[], tuple[int, int]],
+    duration_s: float,
+    clock: Clock,
+    *,
+    read: Callable[[], Reading],
+    state: Callable[[], MachineState],
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Soak:
+    """Go on deciding, and look at the machine every second.
+
+    Args:
+        decide: Makes a decision; returns when it began and when it ended by the clock [µs].
+        duration_s: How long, > 0 [s].
+        clock: Tells the time.
+        read: Looks at the machine; not while a decision is timed.
+        state: Returns the state of the machine, before and after.
+        stop: Returns whether to end early. The first row is always finished.
+        progress: Told the seconds that have passed, each row.
+    """
+    before, begun_us = state(), clock.time_us()
+    end_us = begun_us + round(duration_s * US_PER_S)
+    rows: list[tuple[float, ...]] = []
+    first: list[tuple[int, Samples]] = []
+    last: deque[tuple[int, Samples]] = deque()
+    now_us = begun_us
+    while now_us < end_us and not (rows and stop()):
+        row_end_us = min(now_us + ROW_US, end_us)
+        taken: list[int] = []
+        while now_us < row_end_us:
+            started_us, now_us = decide()
+            taken.append(now_us - started_us)
+        samples = np.array(taken, np.int64)
+        since_us = now_us - begun_us
+        if since_us <= WINDOW_US or not first:
+            first.append((since_us, samples))
+        last.append((since_us, samples))
+        while len(last) > 1 and last[0][0] <= since_us - WINDOW_US:
+            last.popleft()
+        told = (np.nan if value is None else value for value in read())
+        p50_ms, max_ms = (float(np.percentile(samples, p)) / US_PER_MS for p in (50, 100))
+        rows.append((since_us / US_PER_S, len(samples), p50_ms, max_ms, *told))
+        progress(since_us / US_PER_S)
+        now_us = clock.time_us()
+    names = ("time_s", "n", "p50_ms", "max_ms", *Reading._fields)
+    lasted_us = last[-1][0]
+    window_us = min(WINDOW_US, lasted_us // 2)
+    early = [part for end, part in first if end <= window_us] or [first[0][1]]
+    late = [part for end, part in last if end > lasted_us - window_us]
+    return Soak(
+        asked_s=duration_s,
+        interrupted=now_us < end_us,
+        series=dict(zip(names, np.array(rows, np.float64).T, strict=True)),
+        window_s=window_us / US_PER_S,
+        first_us=np.concatenate(early),
+        last_us=np.concatenate(late),
+        throttled=throttled_since(before.throttling, state().throttling),
+    )
+
+
+def _change(before_us: float | None, after_us: float | None) -> str:
+    if before_us is None or after_us is None:
+        return "too few decisions"
+    share = f" ({after_us / before_us - 1.0:+.0%})" if before_us else ""
+    return f"{before_us / US_PER_MS:.3f} to {after_us / US_PER_MS:.3f} ms{share}"
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds / 60.0:.1f} min" if seconds >= 120.0 else f"{seconds:.0f} s"
