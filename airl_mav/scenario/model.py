@@ -237,9 +237,9 @@ class Flights(Workers):
 class Scenario(Flights, Lateness, Decisions, Aircraft):
     """All that a rehearsal can be asked for.
 
-    The fields are flat, but for the tables `payload`, `wind`, `watchdog`, `real`
-    and `ports`. What is left at
-    None is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
+    The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
+    `real` and `ports`. What is left at None is decided by `airl_mav.scenario.resolve.resolve`,
+    mostly from the policy's card.
 
     Raises:
         FieldError: A field is unknown, of the wrong type, or out of range.

@@ -50,7 +50,7 @@ ENDLESS = Rules(goal_radius=0.0, time_limit_us=10**12)
 
 
 def fly(fleet: Fleet, arenas: ArenaBatch, ticks: int, rules: Rules = ENDLESS) -> None:
-    advance(fleet, arenas, np.full(len(fleet.time_us), ticks), VEHICLE, rules)
+    advance(fleet, arenas, np.full(len(fleet.time_us), ticks), VEHICLE, rules, None)
 
 
 def command(fleet: Fleet, i: int, setpoint: np.ndarray) -> None:
@@ -237,7 +237,7 @@ def test_every_vehicle_flies_its_own_number_of_ticks() -> None:
     fleet, arenas = new_fleet(3), batch_of([OPEN] * 3)
     for i in range(3):
         hover(fleet, i, 30.0, VEHICLE)
-    advance(fleet, arenas, np.array([0, 3, 250]), VEHICLE, ENDLESS)
+    advance(fleet, arenas, np.array([0, 3, 250]), VEHICLE, ENDLESS, None)
     assert list(fleet.time_us) == [0, 3 * TICK_US, 250 * TICK_US]
 
 
@@ -406,6 +406,6 @@ def test_a_heavy_vehicle_begins_in_a_steady_hover(thrust_curve: float) -> None:
     )
     hover(fleet, 0, 30.0, VEHICLE, heavy)
     for _ in range(20):
-        advance(fleet, arenas, np.array([25]), VEHICLE, ENDLESS)
+        advance(fleet, arenas, np.array([25]), VEHICLE, ENDLESS, None)
         assert abs(fleet.position[0, 2] + 30.0) < 1e-3
         assert abs(fleet.velocity[0, 2]) < 1e-3
