@@ -202,7 +202,7 @@ class Flights(Workers):
         " speed",
     )
     episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
-    seed: int = _seed("episode i uses seed + i for arena, sensors, wind and latency")
+    seed: int = _seed("episode i uses seed + i for arena, sensors, wind, spread and latency")
     arena_seed: int | None = _seed(
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,

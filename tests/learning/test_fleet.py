@@ -27,6 +27,8 @@ from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import level_power_w
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls
@@ -61,15 +63,25 @@ def command(fleet: Fleet, i: int, setpoint: np.ndarray) -> None:
 class PlantPilot:
     """The same setpoints on the pybullet plant, controlled on its true state."""
 
-    def __init__(self, altitude_m: float, battery: float = 1.0) -> None:
-        self.plant = Plant(QUAD, None, np.random.default_rng(0))
+    def __init__(
+        self,
+        altitude_m: float,
+        battery: float = 1.0,
+        *,
+        seed: int = 0,
+        aircraft: Aircraft | None = None,
+        airframe: Airframe = VEHICLE.airframe,
+    ) -> None:
+        self.plant = Plant(
+            QUAD, None, np.random.default_rng(seed), aircraft=aircraft, airframe=airframe
+        )
         self.plant.battery_remaining = battery
         self.energy = 0.0
         client, body = self.plant.world.client, self.plant._body
         half = math.sqrt(0.5)
         client.resetBasePositionAndOrientation(body, (0, 0, altitude_m), (0, 0, half, half))
         self.plant.motion = self.plant._read()
-        a = VEHICLE.airframe
+        a = airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()
         trim_for_hover(self.memory, a.mass * 9.80665 / (4 * a.thrust_max), VEHICLE.gains)
