@@ -96,7 +96,7 @@ def measure_ours() -> list[Result]:
                 fleet.setpoint[:] = rng.uniform([-1, -1, -0.3, -1.5], [3, 1, 0.3, 1.5], (N, 4))
                 fleet.repeat_us[:] = fleet.time_us
                 start = time.process_time()
-                advance(fleet, arenas, ticks, vehicle, rules)
+                advance(fleet, arenas, ticks, vehicle, rules, None)
                 if camera:
                     render_images(
                         fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images

@@ -1,8 +1,8 @@
 """Compare two runs over pairs of flights: the default policy in calm air and in wind."""
 
 from airl_mav import Scenario, rehearse
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.scenario.aircraft import WindSettings
 
 calm = rehearse(Scenario(level="lockstep", episodes=4), out="runs/calm")
 windy = rehearse(

@@ -12,8 +12,12 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
+from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.spread import draw_airframe
+from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.flight_controller import FlightController
@@ -32,9 +36,9 @@ class EpisodeSetup:
     arena: Arena | None
     """None = an endless floor."""
     seed: int
-    """Of sensors and wind."""
+    """Of sensors, wind, and what is drawn of the aircraft."""
     aircraft: Aircraft = field(default_factory=Aircraft)
-    """What was asked of it: wind, estimator, charge of the battery."""
+    """What was asked of it: wind, spread, sensors, estimator, charge of the battery."""
     computer_w: float = 0.0
     """What the onboard computer draws from the pack [W]."""
 
@@ -74,14 +78,16 @@ class Simulation:
         Raises:
             UsageError: The vehicle's parameter overrides are wrong.
         """
-        rng = np.random.default_rng(setup.seed)
+        asked, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
+        wind = wind_of_episode(asked.wind, setup.seed)
         self.autopilot: FlightController = autopilot or builtin_autopilot(setup)
         self.plant = Plant(
             setup.vehicle,
             setup.arena,
-            rng,
+            np.random.default_rng(setup.seed),
             start_us=start_us,
-            aircraft=setup.aircraft,
+            aircraft=asked.model_copy(update={"wind": wind}),
+            airframe=draw_airframe(nominal, asked.spread, stream(setup.seed, Stream.AIRFRAME)),
             rate_hz=self.autopilot.rate_hz,
             computer_w=setup.computer_w,
         )
@@ -89,7 +95,9 @@ class Simulation:
         self._camera: DepthCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
-            self._camera = DepthCamera(setup.vehicle.camera, setup.arena, start_us)
+            self._camera = DepthCamera(
+                setup.vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed
+            )
         self.recorder = FlightRecorder(self.autopilot.internals) if recording else None
         """None = nothing is recorded."""
         self.start_us = start_us

@@ -42,7 +42,7 @@ POSITIONAL = "positional"
 REPEATED = "repeated"
 """Marks a field whose option may be given several times, a value each."""
 
-PREFIXED = ("payload", "wind")
+PREFIXED = ("payload", "sensors", "spread", "wind")
 """Tables whose options carry the table's name; those of the others are unique by themselves."""
 
 RENAMED: dict[str, tuple[str, ...]] = {

@@ -83,10 +83,24 @@ def new_memory(n: int | None = None) -> Memory:
     return np.zeros(MEMORY_SIZE if n is None else (n, MEMORY_SIZE))
 
 
-def trim_for_hover(memory: Memory, command: float, gains: Gains) -> None:
-    """Set the vertical integral to what it settles at in a hover at a collective `command` 0..1."""
+def trim_for_hover(
+    memory: Memory, command: float, gains: Gains, north: float = 0.0, east: float = 0.0
+) -> None:
+    """Set the integrals of the velocity to what they settle at in a hover.
+
+    Args:
+        memory: Of one vehicle (MEMORY_SIZE,), updated.
+        command: Collective 0..1.
+        gains: Hold the hover thrust.
+        north: Acceleration that the vehicle leans for, against the wind [m/s²].
+        east: The same towards east.
+    """
     # thrust_from_acceleration, solved for the acceleration that gives the command.
-    memory[_VEL_INT + 2] = (gains.hover_thrust - command) * GRAVITY_M_S2 / gains.hover_thrust
+    upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)
+    memory[_VEL_INT], memory[_VEL_INT + 1] = north, east
+    memory[_VEL_INT + 2] = (
+        (gains.hover_thrust - upright * command) * GRAVITY_M_S2 / gains.hover_thrust
+    )
 
 
 def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:

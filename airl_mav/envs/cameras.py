@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.noise import is_noisy, noisy_frame
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.core.constants import TICK_US
 from airl_mav.core.kernels import kernel
+from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
-from airl_mav.envs.draws import Stream, stream
 from airl_mav.envs.fleet import Fleet
-from airl_mav.envs.randomise import noisy_depth
 from airl_mav.envs.saved_state import Stateful
-from airl_mav.envs.spec import Randomisation
+from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
 
 
@@ -46,28 +47,23 @@ def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
 class Cameras(Stateful):
     """Frames come at the camera's rate; their phase to the decisions is drawn from the seed."""
 
-    def __init__(
-        self, n: int, camera: Camera, transport_us: int, randomisation: Randomisation
-    ) -> None:
+    def __init__(self, n: int, camera: Camera, transport_us: int, noise: SensorNoise) -> None:
         """Make n cameras; `transport_us` is the time from capture to decoded [µs]."""
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
         """(n, h, w) newest frames, Z16 [mm]."""
         self._period_us = camera.period_us
         self._transport_us = transport_us
-        self._randomisation = randomisation
-        self._noisy = bool(randomisation.depth_noise or randomisation.depth_dropout)
+        self._noise = noise
         self._mount = Mount(
             (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
         )
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._first_us = np.zeros(n, np.int64)
-        self._rngs: list[np.random.Generator | None] = [None] * n
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
         self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self._period_us)
-        self._rngs[i] = stream(seed, Stream.DEPTH)
 
     def age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how old the newest decoded frame is at a time (n,) [µs] of each episode."""
@@ -75,17 +71,25 @@ class Cameras(Stateful):
         age: NDArray[np.int64] = self._transport_us + since_us % self._period_us
         return age
 
-    def capture(self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_]) -> None:
-        """Take the frames of the vehicles in `who` (n,), from where they are now."""
+    def capture(
+        self,
+        fleet: Fleet,
+        arenas: ArenaBatch,
+        who: NDArray[np.bool_],
+        seeds: NDArray[np.int64],
+    ) -> None:
+        """Take the frames of the vehicles in `who` (n,), from where they are now.
+
+        The noise is drawn from the episodes' `seeds` (n,).
+        """
         render_images(fleet, arenas, who, self._mount, self._lens, self.image)
-        if self._noisy:
-            for i in np.flatnonzero(who):
-                rng = self._rngs[i]
-                if rng is not None:
-                    self.image[i] = noisy_depth(self.image[i], self._randomisation, rng)
+        # Frames are taken at whole ticks, up to half of one before their time.
+        frame = (fleet.time_us + TICK_US // 2 - self._first_us) // self._period_us
+        for i in np.flatnonzero(who).tolist() if is_noisy(self._noise) else ():
+            self.image[i] = noisy_frame(self.image[i], self._noise, int(seeds[i]), int(frame[i]))
 
     def _held(self) -> Mapping[str, Any]:
-        return {"image": self.image, "first_us": self._first_us, "generators": self._rngs}
+        return {"image": self.image, "first_us": self._first_us}
 
 
 @kernel

@@ -10,7 +10,8 @@ from airl_mav.latency.injection import Injection, choose_injection
 from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity
 from airl_mav.latency.source import longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.loaded import equipped
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
     latency_s = (delay.transport_ms + t2_ms + low_high[1] + delay.link_ms) / MS_PER_S
     acceleration = asked.max_acceleration_m_s2
     if acceleration is None:
-        acceleration = max_acceleration(load_vehicle(spec.vehicle))
+        vehicle, _ = equipped(spec.vehicle, delay.computer, Payload())
+        acceleration = max_acceleration(vehicle)
     return SpeedBound(
         latency_s=latency_s,
         sensing_distance_m=asked.sensing_distance_m,

@@ -7,12 +7,12 @@ block of decisions at a time.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
@@ -22,22 +22,6 @@ BLOCK = 32
 
 NOT_BEGUN = -1
 """Seed of a slot in which no episode has begun."""
-
-
-class Stream(IntEnum):
-    """Independent random streams of an episode's seed; `arena.generate` has 0 to 3."""
-
-    AIRFRAME = 10
-    CAMERA = 11
-    ESTIMATION = 12
-    DELAY = 13
-    DEPTH = 14
-    SOURCE = 15
-
-
-def stream(seed: int, name: Stream) -> np.random.Generator:
-    """Return the generator of one stream of an episode."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(name,)))
 
 
 class DelayDraws(Stateful):

@@ -17,7 +17,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.envs.draws import BLOCK, Stream, stream
+from airl_mav.core.streams import Stream, stream
+from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.policy.observation import Kinematics
 from airl_mav.profiles.vehicle import Estimation
@@ -48,11 +49,15 @@ class EstimationError:
     time_s: Array  # (9,)
 
     @classmethod
-    def from_profile(cls, table: Estimation) -> EstimationError:
-        """Return the model of a vehicle profile's `estimation` table."""
+    def from_profile(cls, table: Estimation, noise: float = 1.0) -> EstimationError:
+        """Return the model of a vehicle profile's `estimation` table, its errors times `noise`.
+
+        The estimator's gains do not depend on the noise that its sensors have, as nobody tells it:
+        to first order its errors are in proportion to theirs.
+        """
         sd, time_s = np.empty(N_ERRORS), np.empty(N_ERRORS)
         for name, (time_name, errors) in GROUPS.items():
-            sd[list(errors)] = getattr(table, name)
+            sd[list(errors)] = noise * getattr(table, name)
             time_s[list(errors)] = getattr(table, time_name)
         return cls(sd, time_s)
 
@@ -99,9 +104,9 @@ def _multiply(a: Array, b: Array) -> Array:
 class Telemetry(Stateful):
     """Telemetry of n episodes: the truth with errors that change once a decision."""
 
-    def __init__(self, n: int, table: Estimation | None) -> None:
-        """Make n slots with the errors of a vehicle profile; None: no errors."""
-        self._model = None if table is None else EstimationError.from_profile(table)
+    def __init__(self, n: int, table: Estimation | None, noise: float = 1.0) -> None:
+        """Make n slots with the errors of a vehicle profile times `noise`; None: no errors."""
+        self._model = None if table is None else EstimationError.from_profile(table, noise)
         self._errors = np.zeros((n, N_ERRORS))
         self._rngs: list[np.random.Generator | None] = [None] * n
         self._normals = np.zeros((n, BLOCK, N_ERRORS))

@@ -13,12 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.control.attitude import attitude_setpoint
 from airl_mav.control.cascade import new_memory, trim_against_torque, trim_for_hover
 from airl_mav.control.gains import Gains
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.envs.contact import NOTHING
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel
+from airl_mav.vehicle.rigid_body import drag_force
+from airl_mav.vehicle.rotation import Vec
 from airl_mav.vehicle.rotor import N_ROTORS, command_for, hover_speeds
 
 
@@ -137,6 +141,10 @@ def new_fleet(n: int) -> Fleet:
     )
 
 
+STILL: Vec = (0.0, 0.0, 0.0)
+"""Velocity of a vehicle at rest, and of calm air, NED [m/s]."""
+
+
 def hover(
     fleet: Fleet,
     i: int,
@@ -144,8 +152,11 @@ def hover(
     vehicle: Vehicle,
     airframe: Airframe | None = None,
     battery: float = 1.0,
+    wind: Vec = STILL,
 ) -> None:
     """Put vehicle i into a hover above the origin, heading north, all counters at zero.
+
+    In wind it leans against it, as after a while in hover: nothing has to settle first.
 
     Args:
         fleet: Where vehicle i is.
@@ -154,6 +165,7 @@ def hover(
         vehicle: What all vehicles share.
         airframe: This vehicle's own; None = the nominal one.
         battery: State of charge at the start, 1 full to 0 empty.
+        wind: Steady wind NED [m/s].
     """
     for array in fleet:
         array[i] = 0
@@ -161,10 +173,19 @@ def hover(
     fleet.airframe[i] = a
     fleet.position[i, 2] = -altitude_m
     fleet.quaternion[i, 0] = 1.0
-    speeds = hover_speeds(a)
+    speeds, north, east = hover_speeds(a), 0.0, 0.0
+    if wind != STILL:
+        push, weight = drag_force(STILL, wind, a), a.mass * GRAVITY_M_S2
+        thrust = (-push[0], -push[1], -push[2] - weight)
+        fleet.quaternion[i] = attitude_setpoint(thrust, 1.0, 0.0)
+        north, east = (GRAVITY_M_S2 * thrust[axis] / -thrust[2] for axis in (0, 1))
+        more = math.sqrt(math.hypot(*thrust) / weight)
+        s0, s1, s2, s3 = (min(1.0, more * speed) for speed in speeds)
+        speeds = s0, s1, s2, s3
     fleet.rotor[i] = speeds
     c0, c1, c2, c3 = (command_for(speed * speed, a.thrust_curve) for speed in speeds)
-    trim_for_hover(fleet.memory[i], math.fsum((c0, c1, c2, c3)) / N_ROTORS, vehicle.gains)
+    collective = math.fsum((c0, c1, c2, c3)) / N_ROTORS
+    trim_for_hover(fleet.memory[i], collective, vehicle.gains, north, east)
     trim_against_torque(fleet.memory[i], (c0, c1, c2, c3), vehicle.gains)
     fleet.battery[i] = battery
     fleet.touched[i] = NOTHING

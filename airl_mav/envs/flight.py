@@ -18,7 +18,7 @@ from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.contact import NOTHING, clearance, touches
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
+from airl_mav.envs.fleet import STILL, Fleet, Rules, Vehicle, Verdict
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import felt, felt_share, flight_power_w
@@ -43,7 +43,12 @@ _TIMEOUT = int(Verdict.TIMEOUT)
 
 @kernel
 def advance(
-    fleet: Fleet, arenas: ArenaBatch, ticks: NDArray[np.int64], vehicle: Vehicle, rules: Rules
+    fleet: Fleet,
+    arenas: ArenaBatch,
+    ticks: NDArray[np.int64],
+    vehicle: Vehicle,
+    rules: Rules,
+    air: NDArray[np.float64] | None,
 ) -> None:
     """Fly every vehicle whose verdict is FLYING for its number of ticks on its setpoint.
 
@@ -59,11 +64,16 @@ def advance(
         ticks: (n,) how many ticks each one flies.
         vehicle: What all vehicles share.
         rules: What ends a flight.
+        air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
+            next, after the last one the first again. None: calm, compiled without any wind.
     """
     weights = filters(vehicle.gains, TICK_S)
     for i in range(len(fleet.time_us)):
         if fleet.verdict[i] == _FLYING:
-            _fly(fleet, arenas, i, ticks[i], vehicle, rules, weights)
+            if air is None:
+                _fly(fleet, arenas, i, ticks[i], vehicle, rules, None, weights)
+            else:
+                _fly(fleet, arenas, i, ticks[i], vehicle, rules, air[i], weights)
 
 
 @kernel
@@ -92,6 +102,7 @@ def _fly(
     ticks: int,
     vehicle: Vehicle,
     rules: Rules,
+    air: NDArray[np.float64] | None,
     weights: Filters,
 ) -> None:
     airframe, gains, pack = airframe_of(fleet.airframe[i]), vehicle.gains, vehicle.pack
@@ -113,7 +124,7 @@ def _fly(
     distance, energy = fleet.distance[i], fleet.energy[i]
     obstacles_move = TICK_S * arenas.tour_speed[i]
     room = 0.0
-    calm = (0.0, 0.0, 0.0)
+    wind = STILL
     left, kept = lag(airframe, TICK_S), felt_share(vehicle.power, TICK_S)
     for _ in range(ticks):
         if time_us >= fleet.repeat_us[i]:
@@ -132,13 +143,16 @@ def _fly(
         s3 = settle(s3, motors[3], airframe, left)
         thrust, torque = wrench(s0, s1, s2, s3, airframe)
         lift = rotate(q, (0.0, 0.0, -thrust))
-        drag = drag_force(v, calm, airframe)
+        if air is not None:
+            row = time_us // TICK_US % len(air)
+            wind = (air[row, 0], air[row, 1], air[row, 2])
+        drag = drag_force(v, wind, airframe)
         force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
         k = airframe.drag_angular
         damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
         # Of the state in which this tick's forces act, as the drag; and so it is worked out beside
         # the step, not after it, which is a tenth of the twin's speed.
-        power = flight_power_w(thrust, v, q, calm, acceleration, airframe, vehicle.power)
+        power = flight_power_w(thrust, v, q, wind, acceleration, airframe, vehicle.power)
         before, moved_from = v, p
         p, v, q, w = step(p, v, q, w, force, damped, airframe, TICK_S)
         acceleration = felt(acceleration, before, v, kept, TICK_S, vehicle.power)

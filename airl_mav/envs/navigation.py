@@ -22,25 +22,29 @@ from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import batch_of, put_arena
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.delay import injections_of
-from airl_mav.envs.draws import DelayDraws, Stream, stream
+from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
-from airl_mav.envs.randomise import draw_airframe
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
+from airl_mav.envs.winds import Winds
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
-from airl_mav.profiles.vehicle import Camera, VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import Camera, VehicleProfile
+from airl_mav.vehicle.spread import draw_airframe
 
 
 @dataclass(frozen=True)
@@ -85,13 +89,14 @@ class Navigation(Stateful):
         Args:
             spec: The environment.
             n: Number of vehicles.
-            vehicle: The profile that `spec` names, where it has been loaded; None: it is loaded.
+            vehicle: The vehicle with all that it carries, where it has been loaded; None: that of
+                `spec`, with the computer of `spec.delay` on board.
             arena: The same of the arena.
             injection: Source of t2; None: that of `spec.delay`.
             latency_draw: Another number gives other draws of the same latency.
             arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
             trace: Records the flights; None records nothing, and changes nothing.
-            computer_w: What the onboard computer draws from the pack [W].
+            computer_w: What the computer on board of that `vehicle` draws from the pack [W].
             battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
 
         Raises:
@@ -99,7 +104,10 @@ class Navigation(Stateful):
         """
         self.spec = spec
         self.n = n
-        self.vehicle: VehicleProfile = vehicle or load_vehicle(spec.vehicle)
+        if vehicle is None:
+            vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
+            computer_w = computer.onboard_watts
+        self.vehicle: VehicleProfile = vehicle
         self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
         self.camera: Camera = self.vehicle.camera.model_copy(
             update=spec.camera.model_dump(exclude_none=True)
@@ -141,8 +149,10 @@ class Navigation(Stateful):
             n, self.injections, round(spec.delay.native_ms * US_PER_MS), draw=latency_draw
         )
         randomisation = spec.randomisation
+        check_spread(self.vehicle, randomisation, "randomisation")
         table = self.vehicle.estimation if randomisation.estimation else None
-        self._telemetry = Telemetry(n, table)
+        self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
+        self._winds = Winds(n, spec.wind)
         self._cameras = Cameras(n, self.camera, self._transport_us, randomisation)
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
@@ -177,7 +187,9 @@ class Navigation(Stateful):
             self._vehicle.airframe, randomisation, stream(seed, Stream.AIRFRAME)
         )
         altitude_m = self.spec.episode.altitude_m
-        hover(self._fleet, i, altitude_m, self._vehicle, airframe, self._charge)
+        north, east, down = self._winds.begin(i, seed).tolist()
+        steady = (north, east, down)
+        hover(self._fleet, i, altitude_m, self._vehicle, airframe, self._charge, steady)
         if self._trace is not None:
             self._trace.begin(i, self._fleet)
         self._decision[i] = 0
@@ -252,7 +264,7 @@ class Navigation(Stateful):
             self._trace.decided(self._fleet, t2_us, self._transport_us, self._link_us)
 
     def _held(self) -> Mapping[str, Any]:
-        return {
+        held = {
             "navigation": {
                 "seeds": self.seeds,
                 "zones": self.zones,
@@ -265,6 +277,7 @@ class Navigation(Stateful):
             "telemetry": self._telemetry,
             "cameras": self._cameras,
         }
+        return held if self._winds.calm else held | {"winds": self._winds}
 
     def set_state(self, state: State) -> None:
         """Restore a saved state; arenas are generated again from their seeds.
@@ -329,12 +342,15 @@ class Navigation(Stateful):
             self._fly(ticks)
 
     def _fly(self, ticks: NDArray[np.int64]) -> None:
-        advance(self._fleet, self._batch, ticks, self._vehicle, self._rules)
+        def fly(ticks: NDArray[np.int64], air: NDArray[np.float64] | None) -> None:
+            advance(self._fleet, self._batch, ticks, self._vehicle, self._rules, air)
+
+        self._winds.fly(self._fleet, ticks, fly)
 
     def _capture(self, who: NDArray[np.bool_]) -> None:
         if self._trace is not None:
             self._trace.captured(self._fleet, who)
-        self._cameras.capture(self._fleet, self._batch, who)
+        self._cameras.capture(self._fleet, self._batch, who, self.seeds)
 
 
 def _ticks(time_us: NDArray[np.int64]) -> NDArray[np.int64]:

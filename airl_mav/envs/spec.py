@@ -13,6 +13,7 @@ from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeL
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import LayoutName
 from airl_mav.profiles.arena import Each
+from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 
 RewardName = Literal["shaped", "paper-scaled", "paper"]
 """See `envs.rewards`."""
@@ -55,7 +56,7 @@ class CameraChange(ProfileModel):
 class Delay(ProfileModel):
     """Decision latency: the stages of docs/architecture.md, in simulated time."""
 
-    computer: str = Field(default="workstation", description="computer profile to fly as")
+    computer: str = Field(default="workstation", description="computer profile to fly as, and with")
     workload: str | None = Field(
         default=None, description="workload whose t2 is drawn; left out: latency, or native_ms"
     )
@@ -110,29 +111,15 @@ class SafeVelocity(ProfileModel):
     )
 
 
-class Randomisation(ProfileModel):
-    """Domain randomisation, drawn with every episode around the profile's value; 0 is none."""
+class Randomisation(SensorNoise, Spread):
+    """Domain randomisation, drawn with every episode around the profile's value; 0 is none.
 
-    mass: float = quantity("mass and inertia, +- this share", "1", ge=0, le=0.9, default=0.0)
-    thrust: float = quantity("greatest thrust, +- this share", "1", ge=0, le=0.9, default=0.0)
-    drag: float = quantity("drag, +- this share", "1", ge=0, le=0.9, default=0.0)
-    rotor_lag: float = quantity(
-        "rotor time constant, +- this share", "1", ge=0, le=0.9, default=0.0
-    )
+    With the fields of a scenario's tables `spread` and `sensors`.
+    """
+
     estimation: bool = Field(
         default=True,
         description="telemetry carries the estimator's error, where the vehicle's profile has it",
-    )
-    depth_noise: float = quantity(
-        "sd of the depth noise at 10 m, as a share; grows with the square of the depth as of a"
-        " stereo camera",
-        "1",
-        ge=0,
-        le=0.9,
-        default=0.0,
-    )
-    depth_dropout: float = quantity(
-        "share of pixels without a return, drawn anew each frame", "1", ge=0, le=0.9, default=0.0
     )
     extra_delay_ms: Annotated[tuple[float, float], Each(0, 10_000, ascending=True)] = quantity(
         "added to t2: one value an episode, drawn from this range", "ms", default=(0.0, 0.0)
@@ -168,6 +155,7 @@ class EnvironmentSpec(ProfileModel):
     randomisation: Randomisation = Field(
         default_factory=Randomisation, description="what is drawn with every episode"
     )
+    wind: WindSettings = Field(default_factory=WindSettings, description="wind")
     curriculum: Curriculum | None = Field(
         default=None, description="zones by success; left out: the whole arena from the start"
     )

@@ -20,10 +20,8 @@ from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
-from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.stand_alone import Listener, episode_of
+from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
-from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.firmware import FrameServer, Loaded
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
@@ -152,7 +150,7 @@ def fly_vehicle_in_lockstep(
     """
     listener = listener or Listener()
     check_vehicle(asked)
-    vehicle = loaded(load_vehicle(asked.vehicle), None, asked.payload)
+    vehicle, computer_w = aircraft_of(asked)
     ports = asked.ports
     with (
         closing(
@@ -166,7 +164,7 @@ def fly_vehicle_in_lockstep(
         ) as endpoint,
         closing(CameraServer(f"tcp://{asked.bind}:{ports.camera_port or '*'}")) as camera,
     ):
-        episode, goal = episode_of(asked, vehicle)
+        episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle)
         stage = RemoteStage(asked, endpoint, camera, broken_off=stop.is_set, say=listener.say)
         with closing(stage):

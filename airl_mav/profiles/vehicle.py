@@ -308,14 +308,19 @@ class VehicleProfile(ProfileModel):
             raise FieldError("body.mass_kg", self.body.mass_kg, problem=problem)
         return self
 
-    def too_heavy(self, mass_kg: float) -> str | None:
-        """Return why the rotors do not carry a mass with a margin to fly with; None: they do."""
+    def too_heavy(self, mass_kg: float, thrust_share: float = 1.0) -> str | None:
+        """Return why the rotors do not carry a mass with a margin to fly with; None: they do.
+
+        They give `thrust_share` of the thrust that the profile says.
+        """
         needed_n = (1.0 + THRUST_MARGIN) * mass_kg * GRAVITY_M_S2
-        if self.thrust_n >= needed_n:
+        thrust_n = thrust_share * self.thrust_n
+        if thrust_n >= needed_n:
             return None
         return (
             f"cannot hover: needs {needed_n:.2f} newton with {100 * THRUST_MARGIN:g} % margin, has "
-            f"{self.thrust_n:.2f} ({len(CORNERS)} x rotor.thrust_max_n {self.rotor.thrust_max_n:g})"
+            f"{thrust_n:.2f} ({len(CORNERS)} x rotor.thrust_max_n "
+            f"{thrust_share * self.rotor.thrust_max_n:g})"
         )
 
     @property

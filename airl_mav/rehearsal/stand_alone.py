@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
-from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.external.programs import how_to_start
@@ -52,7 +52,7 @@ def fly_vehicle(
     """
     listener = listener or Listener()
     check_vehicle(asked)
-    vehicle = loaded(load_vehicle(asked.vehicle), None, asked.payload)
+    vehicle, computer_w = aircraft_of(asked)
     firmware = build_firmware(
         asked,
         vehicle,
@@ -67,7 +67,7 @@ def fly_vehicle(
     )
     with closing(firmware):
         firmware.on_message = listener.text
-        episode, goal = episode_of(asked, vehicle)
+        episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle)
         if (hint := how_to_start(asked, vehicle)) is not None:
             listener.waiting(hint)
@@ -76,10 +76,26 @@ def fly_vehicle(
         fly(firmware, stop, asked.duration, listener.say)
 
 
+def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
+    """Return the vehicle with what it carries, and the power of its computer [W].
+
+    Raises:
+        UsageError: A profile cannot be used, or the rotors do not carry it all.
+    """
+    vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
+    check_spread(vehicle, asked.spread)
+    return vehicle, computer.onboard_watts
+
+
 def episode_of(
-    asked: StandAloneVehicle, vehicle: VehicleProfile
+    asked: StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
 ) -> tuple[EpisodeSetup, tuple[float, float]]:
     """Return the episode that is flown, and its goal (north, east) [m].
+
+    Args:
+        asked: Where it is flown, and in what.
+        vehicle: With what it carries.
+        computer_w: What its computer draws from the pack [W].
 
     Raises:
         UsageError: No arena can be made of the seed.
@@ -88,4 +104,4 @@ def episode_of(
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
     goal = (float(arena.goal[0]), float(arena.goal[1]))
-    return EpisodeSetup(vehicle, arena, asked.seed, asked), goal
+    return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), goal

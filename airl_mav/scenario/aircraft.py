@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 
 VehicleName = Annotated[
     str, Field(description="vehicle profile: a shipped name, or a path to a .toml")
@@ -30,35 +31,6 @@ NO_TWIN = "at level lockstep or sitl; the twin has none"
 
 def _port(description: str, default: int) -> Any:
     return quantity(description, "1", ge=0, le=GREATEST_PORT, default=default)
-
-
-class WindSettings(ProfileModel):
-    """Steady wind and gusts; calm by default."""
-
-    north_m_s: float = quantity("steady wind towards north", "m/s", ge=-50, le=50, default=0.0)
-    east_m_s: float = quantity("steady wind towards east", "m/s", ge=-50, le=50, default=0.0)
-    gust_m_s: float = quantity(
-        "standard deviation of the gusts on each horizontal axis; half of it on the vertical",
-        "m/s",
-        ge=0,
-        le=50,
-        default=0.0,
-    )
-    gust_time_s: float = quantity(
-        "correlation time of the gusts", "s", ge=0.01, le=1000, default=2.0
-    )
-
-
-class Payload(ProfileModel):
-    """A load that is carried as one point of mass; none by default.
-
-    Where it hangs counts from the middle of the rotors.
-    """
-
-    mass_g: float = quantity("mass of the payload", "g", ge=0, le=100_000, default=0.0)
-    forward_m: float = quantity("ahead of the middle", "m", ge=-2, le=2, default=0.0)
-    right_m: float = quantity("to the right of the middle", "m", ge=-2, le=2, default=0.0)
-    down_m: float = quantity("below the middle", "m", ge=-2, le=2, default=0.0)
 
 
 class Ports(ProfileModel):
@@ -139,7 +111,9 @@ class Aircraft(ProfileModel):
     battery_charge: float = quantity(
         "state of charge of the battery at the start", "1", gt=0, le=1, default=1.0
     )
-    wind: Annotated[WindSettings, NO_TWIN] = Field(default_factory=WindSettings, description="wind")
+    wind: WindSettings = Field(default_factory=WindSettings, description="wind")
+    spread: Spread = Field(default_factory=Spread, description="spread of the aircraft")
+    sensors: SensorNoise = Field(default_factory=SensorNoise, description="sensors' noise")
     estimator: Annotated[EstimatorName, NO_TWIN] = Field(
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"

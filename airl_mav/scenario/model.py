@@ -202,7 +202,7 @@ class Flights(Workers):
         " speed",
     )
     episodes: int = quantity("number of episodes", "1", ge=1, le=GREATEST_EPISODES, default=3)
-    seed: int = _seed("episode i uses seed + i for arena, sensors, wind and latency")
+    seed: int = _seed("episode i uses seed + i for arena, sensors, wind, spread and latency")
     arena_seed: int | None = _seed(
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,
@@ -237,9 +237,9 @@ class Flights(Workers):
 class Scenario(Flights, Lateness, Decisions, Aircraft):
     """All that a rehearsal can be asked for.
 
-    The fields are flat, but for the tables `payload`, `wind`, `watchdog`, `real`
-    and `ports`. What is left at
-    None is decided by `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
+    The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
+    `real` and `ports`. What is left at None is decided by `airl_mav.scenario.resolve.resolve`,
+    mostly from the policy's card.
 
     Raises:
         FieldError: A field is unknown, of the wrong type, or out of range.

@@ -11,11 +11,9 @@ from airl_mav.latency.source import select_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.checks import check_firmware, check_level, check_ports
-from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -35,8 +33,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         check_ports(scenario.ports, any_camera=False)
     policy = find_policy(scenario.policy)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
-    computer = load_computer(scenario.computer)
-    vehicle = loaded(load_vehicle(scenario.vehicle), computer, scenario.payload)
+    vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
+    check_spread(vehicle, scenario.spread)
     if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"

@@ -49,7 +49,14 @@ class StandAloneVehicle(Aircraft):
     """Flight controller, vehicle and camera by themselves, for any client."""
 
     arena: ArenaName = DEFAULT_ARENA
-    seed: int = quantity("seed of arena, sensors and wind", "1", ge=0, le=GREATEST_SEED, default=1)
+    computer: str = Field(
+        default="workstation",
+        description="computer profile that is on board, for its mass and its power: a shipped name,"
+        " or a path to a .toml",
+    )
+    seed: int = quantity(
+        "seed of arena, sensors, wind and spread", "1", ge=0, le=GREATEST_SEED, default=1
+    )
     speed: float | Literal["max"] | None = Field(
         default=None,
         description="simulated seconds per wall second, above 0, at most 100; max: as fast as it"

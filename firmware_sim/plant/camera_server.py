@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.noise import is_noisy, noisy_frame
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
+from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
 from firmware_sim.plant.sensors import Rate
 
@@ -22,8 +24,25 @@ from firmware_sim.plant.sensors import Rate
 class DepthCamera:
     """Takes frames of an arena at a fixed rate, from a vehicle's pose."""
 
-    def __init__(self, camera: Camera, arena: Arena, start_us: int = 0) -> None:
-        """Make the camera of a vehicle profile; the first frame is due at `start_us` [µs]."""
+    def __init__(
+        self,
+        camera: Camera,
+        arena: Arena,
+        start_us: int = 0,
+        noise: SensorNoise | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Make the camera of a vehicle profile.
+
+        Args:
+            camera: The camera.
+            arena: What it sees.
+            start_us: When the first frame is due [µs].
+            noise: How noisy its images are; None: not at all.
+            seed: Of that noise.
+        """
+        self._noise = noise if noise is not None and is_noisy(noise) else None
+        self._seed = seed
         self._intrinsics = Intrinsics.of(camera)
         self._mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
         self._rate_hz, self._max_range = camera.rate_hz, camera.range_m
@@ -54,8 +73,10 @@ class DepthCamera:
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        depth = self._look(elapsed_us, position, quaternion)
-        frame = Frame(self._sequence, time_us, depth_to_z16(depth), self._intrinsics)
+        depth = depth_to_z16(self._look(elapsed_us, position, quaternion))
+        if self._noise is not None:
+            depth = noisy_frame(depth, self._noise, self._seed, self._rate.period)
+        frame = Frame(self._sequence, time_us, depth, self._intrinsics)
         self._sequence += 1
         return frame
 

@@ -10,12 +10,14 @@ import numpy as np
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_HZ, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.streams import sensors_and_gusts
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Vec
 from airl_mav.vehicle.rotor import lag
+from airl_mav.vehicle.wind import Wind
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.dynamics import (
@@ -27,7 +29,6 @@ from firmware_sim.plant.dynamics import (
 )
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY, WIDTH, from_bullet
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.plant.wind import Wind
 from firmware_sim.plant.world import FLOOR, World
 
 REST_SPEED_M_S = 0.1
@@ -59,6 +60,7 @@ class Plant:
         *,
         start_us: int = 0,
         aircraft: Aircraft | None = None,
+        airframe: Airframe | None = None,
         rate_hz: int = TICK_HZ,
         computer_w: float = 0.0,
     ) -> None:
@@ -69,7 +71,9 @@ class Plant:
             arena: Where; None = an endless floor.
             rng: All randomness of sensors and wind.
             start_us: Simulated time of the first state [µs].
-            aircraft: What was asked of it: wind, charge of the battery; None = the defaults.
+            aircraft: What was asked of it: wind as `wind_of_episode` returns it, sensors, charge of
+                the battery; None = the defaults.
+            airframe: This vehicle's own; None = that of the profile.
             rate_hz: Ticks a second.
             computer_w: What the onboard computer draws from the pack [W].
         """
@@ -80,10 +84,10 @@ class Plant:
         self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self.collisions: list[Collision] = []
         """Latched collision events, oldest first."""
-        airframe = Airframe.from_profile(profile)
-        sensor_rng, wind_rng = rng.spawn(2)
-        self._sensors = SensorSuite(profile.sensors, sensor_rng, tick_s)
-        self._wind = Wind(asked.wind, wind_rng, tick_s)
+        airframe = airframe or Airframe.from_profile(profile)
+        noise, gusts = sensors_and_gusts(rng)
+        self._sensors = SensorSuite(profile.sensors, noise, tick_s, asked.sensors.navigation_noise)
+        self._wind = Wind(asked.wind, gusts, tick_s)
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
@@ -103,7 +107,7 @@ class Plant:
         self.power_w = standing_power_w(0.0, airframe, model)
         """Electrical power over the newest tick, without the onboard computer's [W]."""
         self._felt: Vec = (0.0, 0.0, 0.0)
-        self._body = self._build_body(profile)
+        self._body = self._build_body(profile, airframe)
         self._touching: set[int] = set()
         self.motion = self._read()
         """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
@@ -185,12 +189,12 @@ class Plant:
             self.battery_remaining,
         )
 
-    def _build_body(self, profile: VehicleProfile) -> int:
+    def _build_body(self, profile: VehicleProfile, airframe: Airframe) -> int:
         client, body = self.world.client, profile.body
         half = (0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m)
         shape = client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
         number = client.createMultiBody(
-            baseMass=body.mass_kg,
+            baseMass=airframe.mass,
             baseCollisionShapeIndex=shape,
             basePosition=(0.0, 0.0, half[2]),
             # Facing north: forward = +y of ENU, a quarter turn about up.
@@ -200,9 +204,9 @@ class Plant:
             number,
             -1,
             localInertiaDiagonal=(
-                body.inertia_xx_kg_m2,
-                body.inertia_yy_kg_m2,
-                body.inertia_zz_kg_m2,
+                airframe.inertia_xx,
+                airframe.inertia_yy,
+                airframe.inertia_zz,
             ),
             linearDamping=0.0,
             angularDamping=0.0,

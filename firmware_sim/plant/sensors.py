@@ -30,6 +30,8 @@ class Rate:
         self._rate_hz = rate_hz
         self.next_us = 0.0
         """Simulated time before which it is not due [µs]."""
+        self.period = 0
+        """Number of the period that the newest sample is of."""
 
     def due(self, time_us: int) -> bool:
         """Return True once for every period that has passed."""
@@ -39,7 +41,7 @@ class Rate:
         # Rounding may put a time that lies on a boundary into the period before it.
         if self._start_us(period + 1) <= time_us:
             period += 1
-        self.next_us = self._start_us(period + 1)
+        self.period, self.next_us = period, self._start_us(period + 1)
         return True
 
     def _start_us(self, period: int) -> float:
@@ -104,9 +106,9 @@ def _point(row: Vector, field: Vector, noise: Vector, sigma: float, mag: Vector)
 class _Compass:
     """Magnetometer: white noise."""
 
-    def __init__(self, magnetometer: Magnetometer, rng: np.random.Generator) -> None:
+    def __init__(self, magnetometer: Magnetometer, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(magnetometer.rate_hz)
-        self._sigma = magnetometer.noise_gauss
+        self._sigma = times * magnetometer.noise_gauss
         self._white = _White(rng, 3)
 
     def read(self, row: Vector) -> Vector:
@@ -119,10 +121,10 @@ class _Compass:
 class _Barometer:
     """Barometer: white noise and a drift that walks."""
 
-    def __init__(self, barometer: Barometer, rng: np.random.Generator) -> None:
+    def __init__(self, barometer: Barometer, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(barometer.rate_hz)
-        self._noise_pa = barometer.noise_pa
-        self._step_pa = barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
+        self._noise_pa = times * barometer.noise_pa
+        self._step_pa = times * barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
         self._drift_pa = 0.0
         self._white = _White(rng, 2)
 
@@ -137,15 +139,16 @@ class _Barometer:
 class _Gps:
     """GPS: white noise, and a slowly wandering position error (Gauss-Markov on each axis)."""
 
-    def __init__(self, gps: Gps, rng: np.random.Generator) -> None:
+    def __init__(self, gps: Gps, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(gps.rate_hz)
         self._gps = gps
         self._keep = math.exp(-1.0 / (gps.rate_hz * gps.drift_time_constant_s))
         sigma = gps.drift_m_sqrt_s * math.sqrt(0.5 * gps.drift_time_constant_s)
-        self._drive = sigma * math.sqrt(1.0 - self._keep**2)
+        self._drive = times * sigma * math.sqrt(1.0 - self._keep**2)
         self._error = np.zeros(3)
         noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
-        self._position_noise = np.array(noise)
+        self._position_noise = times * np.array(noise)
+        self._velocity_noise = times * gps.velocity_noise_m_s
         self._white = _White(rng, 9)
 
     def read(self, row: Vector) -> GpsFix:
@@ -155,7 +158,7 @@ class _Gps:
         position = row[POSITION] + self._error + self._position_noise * white[3:6]
         return GpsFix(
             position=local_to_geodetic(position, HOME),
-            velocity_ned=row[VELOCITY] + gps.velocity_noise_m_s * white[6:9],
+            velocity_ned=row[VELOCITY] + self._velocity_noise * white[6:9],
             eph_m=gps.horizontal_noise_m,
             epv_m=gps.vertical_noise_m,
             satellites=GPS_SATELLITES,
@@ -169,13 +172,28 @@ class SensorSuite:
     often another does.
     """
 
-    def __init__(self, profile: Sensors, rng: np.random.Generator, tick_s: float = TICK_S) -> None:
+    def __init__(
+        self,
+        profile: Sensors,
+        rng: np.random.Generator,
+        tick_s: float = TICK_S,
+        times: float = 1.0,
+    ) -> None:
+        """Switch them on.
+
+        Args:
+            profile: What they are.
+            rng: Of all their noise.
+            tick_s: Length of a tick [s].
+            times: What noise, biases and drifts are multiplied by. What the GPS receiver says of
+                its accuracy stays: nobody is told.
+        """
         imu = profile.imu
         inertial, compass, barometer, gps = rng.spawn(4)
         walk = math.sqrt(tick_s)
         # The profile's noise is that of a sample at the base tick: its density stays.
         white = math.sqrt(TICK_S / tick_s)
-        self._sigma = np.repeat(
+        self._sigma = times * np.repeat(
             [
                 imu.accel_noise_m_s2 * white,
                 imu.gyro_noise_rad_s * white,
@@ -184,12 +202,12 @@ class SensorSuite:
             ],
             3,
         )
-        self._accel_bias = imu.accel_bias_m_s2 * inertial.standard_normal(3)
-        self._gyro_bias = imu.gyro_bias_rad_s * inertial.standard_normal(3)
+        self._accel_bias = times * imu.accel_bias_m_s2 * inertial.standard_normal(3)
+        self._gyro_bias = times * imu.gyro_bias_rad_s * inertial.standard_normal(3)
         self._white = _White(inertial, 12)
-        self._compass = _Compass(profile.magnetometer, compass)
-        self._barometer = _Barometer(profile.barometer, barometer)
-        self._gps = _Gps(profile.gps, gps)
+        self._compass = _Compass(profile.magnetometer, compass, times)
+        self._barometer = _Barometer(profile.barometer, barometer, times)
+        self._gps = _Gps(profile.gps, gps, times)
         self._rates = (self._compass.rate, self._barometer.rate, self._gps.rate)
         self._slow_us = 0.0
         """Simulated time before which none of the slower ones is due [µs]."""

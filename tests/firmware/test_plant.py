@@ -17,16 +17,17 @@ from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.frames import Vector, ned_to_enu, quat_ned_frd_to_enu_flu, quat_wxyz_to_xyzw
 from airl_mav.core.location import HOME
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Sensors, VehicleProfile
-from airl_mav.scenario.aircraft import Aircraft, WindSettings
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.vehicle import wind as wind_module
+from airl_mav.vehicle.wind import Wind
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
-from firmware_sim.plant import wind as wind_module
 from firmware_sim.plant.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.plant.sensors import Rate, SensorSuite
-from firmware_sim.plant.wind import Wind
 from tests.support.solo import SOLO
 
 G = 9.80665

@@ -28,9 +28,9 @@ from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.scenario.aircraft import WindSettings
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario

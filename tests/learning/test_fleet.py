@@ -27,6 +27,8 @@ from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import Aircraft
+from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import level_power_w
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls
@@ -50,7 +52,7 @@ ENDLESS = Rules(goal_radius=0.0, time_limit_us=10**12)
 
 
 def fly(fleet: Fleet, arenas: ArenaBatch, ticks: int, rules: Rules = ENDLESS) -> None:
-    advance(fleet, arenas, np.full(len(fleet.time_us), ticks), VEHICLE, rules)
+    advance(fleet, arenas, np.full(len(fleet.time_us), ticks), VEHICLE, rules, None)
 
 
 def command(fleet: Fleet, i: int, setpoint: np.ndarray) -> None:
@@ -61,15 +63,25 @@ def command(fleet: Fleet, i: int, setpoint: np.ndarray) -> None:
 class PlantPilot:
     """The same setpoints on the pybullet plant, controlled on its true state."""
 
-    def __init__(self, altitude_m: float, battery: float = 1.0) -> None:
-        self.plant = Plant(QUAD, None, np.random.default_rng(0))
+    def __init__(
+        self,
+        altitude_m: float,
+        battery: float = 1.0,
+        *,
+        seed: int = 0,
+        aircraft: Aircraft | None = None,
+        airframe: Airframe = VEHICLE.airframe,
+    ) -> None:
+        self.plant = Plant(
+            QUAD, None, np.random.default_rng(seed), aircraft=aircraft, airframe=airframe
+        )
         self.plant.battery_remaining = battery
         self.energy = 0.0
         client, body = self.plant.world.client, self.plant._body
         half = math.sqrt(0.5)
         client.resetBasePositionAndOrientation(body, (0, 0, altitude_m), (0, 0, half, half))
         self.plant.motion = self.plant._read()
-        a = VEHICLE.airframe
+        a = airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()
         trim_for_hover(self.memory, a.mass * 9.80665 / (4 * a.thrust_max), VEHICLE.gains)
@@ -237,7 +249,7 @@ def test_every_vehicle_flies_its_own_number_of_ticks() -> None:
     fleet, arenas = new_fleet(3), batch_of([OPEN] * 3)
     for i in range(3):
         hover(fleet, i, 30.0, VEHICLE)
-    advance(fleet, arenas, np.array([0, 3, 250]), VEHICLE, ENDLESS)
+    advance(fleet, arenas, np.array([0, 3, 250]), VEHICLE, ENDLESS, None)
     assert list(fleet.time_us) == [0, 3 * TICK_US, 250 * TICK_US]
 
 
@@ -406,6 +418,6 @@ def test_a_heavy_vehicle_begins_in_a_steady_hover(thrust_curve: float) -> None:
     )
     hover(fleet, 0, 30.0, VEHICLE, heavy)
     for _ in range(20):
-        advance(fleet, arenas, np.array([25]), VEHICLE, ENDLESS)
+        advance(fleet, arenas, np.array([25]), VEHICLE, ENDLESS, None)
         assert abs(fleet.position[0, 2] + 30.0) < 1e-3
         assert abs(fleet.velocity[0, 2]) < 1e-3

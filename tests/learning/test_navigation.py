@@ -72,7 +72,14 @@ class ByHand:
 
     def until(self, tick: int) -> None:
         while self.tick < tick:
-            advance(self.fleet, self.batch, np.array([1]), VEHICLE, Rules(3.0, 120_000_000))
+            advance(
+                self.fleet,
+                self.batch,
+                np.array([1]),
+                VEHICLE,
+                Rules(3.0, 120_000_000),
+                None,
+            )
             self.tick += 1
             self.poses.append(self._pose())
 

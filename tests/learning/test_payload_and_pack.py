@@ -12,9 +12,10 @@ from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
+from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
-from airl_mav.scenario.aircraft import Aircraft, Payload
-from airl_mav.scenario.loaded import loaded
+from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, flight_power_w
 from firmware_sim.autopilot.parameter_store import Parameters
@@ -43,7 +44,7 @@ def twin(
     vehicle = vehicle_of(profile, Parameters(profile.parameters).__getitem__, computer_w)
     fleet, arenas = new_fleet(1), batch_of([OPEN])
     hover(fleet, 0, 50.0, vehicle, battery=charge)
-    return fleet, lambda ticks: advance(fleet, arenas, np.array([ticks]), vehicle, ENDLESS)
+    return fleet, lambda ticks: advance(fleet, arenas, np.array([ticks]), vehicle, ENDLESS, None)
 
 
 def small(profile: VehicleProfile) -> VehicleProfile:

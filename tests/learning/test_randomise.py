@@ -7,12 +7,13 @@ import pytest
 from scipy import stats
 
 from airl_mav.camera.frame import MAX_MM
-from airl_mav.envs.draws import Stream, stream
+from airl_mav.camera.noise import noisy_depth
+from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.randomise import draw_airframe, noisy_depth
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.spread import draw_airframe
 
 NOMINAL = Airframe.from_profile(load_vehicle("quad"))
 GROUPS = {

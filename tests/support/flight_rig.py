@@ -12,9 +12,10 @@ import numpy as np
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.aircraft import Aircraft, WindSettings
+from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth

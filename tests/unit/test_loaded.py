@@ -7,10 +7,10 @@ import pytest
 
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.computer import ComputerProfile, load_computer
+from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.channel import Begin
-from airl_mav.scenario.aircraft import Payload
-from airl_mav.scenario.loaded import loaded
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 

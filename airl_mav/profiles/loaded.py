@@ -5,9 +5,9 @@ from __future__ import annotations
 from airl_mav.core.constants import G_PER_KG, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
-from airl_mav.profiles.computer import ComputerProfile
-from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.scenario.aircraft import Payload
+from airl_mav.profiles.computer import ComputerProfile, load_computer
+from airl_mav.profiles.conditions import Payload, Spread
+from airl_mav.profiles.vehicle import CORNERS, VehicleProfile, load_vehicle
 
 
 def loaded(
@@ -66,6 +66,27 @@ def loaded(
     return validated(
         VehicleProfile, {**vehicle.model_dump(), "body": {**body.model_dump(), **carrying}}
     )
+
+
+def equipped(
+    vehicle: str, computer: str, payload: Payload
+) -> tuple[VehicleProfile, ComputerProfile]:
+    """Load a vehicle and a computer by name or path; return the vehicle `loaded`, and the computer.
+
+    Raises:
+        UsageError: A profile cannot be used, or the rotors do not carry it all.
+    """
+    board = load_computer(computer)
+    return loaded(load_vehicle(vehicle), board, payload), board
+
+
+def check_spread(vehicle: VehicleProfile, spread: Spread, table: str = "spread") -> None:
+    """Raise FieldError, naming the table, for a spread whose heaviest and weakest cannot hover."""
+    heaviest_kg = vehicle.body.mass_kg * (1.0 + spread.mass)
+    if (problem := vehicle.too_heavy(heaviest_kg, 1.0 - spread.thrust)) is not None:
+        name = "mass" if spread.mass > spread.thrust else "thrust"
+        problem = f"at the ends of mass and thrust {problem}"
+        raise FieldError(f"{table}.{name}", getattr(spread, name), problem=problem)
 
 
 def _check_balance(

@@ -9,10 +9,25 @@ import numpy as np
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
-from airl_mav.scenario.aircraft import WindSettings
+from airl_mav.core.streams import Stream, stream
+from airl_mav.profiles.conditions import WindSettings
 
 BLOCK = 256
 """Gusts are drawn for so many ticks at once; how many changes no value."""
+
+
+def wind_of_episode(settings: WindSettings, seed: int) -> WindSettings:
+    """Return the wind of the episode of a seed: what is drawn of it is steady then."""
+    if settings.random_m_s == 0.0:
+        return settings
+    rng = stream(seed, Stream.WIND)
+    towards, speed = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, settings.random_m_s)
+    drawn = {
+        "north_m_s": settings.north_m_s + speed * math.cos(towards),
+        "east_m_s": settings.east_m_s + speed * math.sin(towards),
+        "random_m_s": 0.0,
+    }
+    return settings.model_copy(update=drawn)
 
 
 @kernel
@@ -30,7 +45,15 @@ class Wind:
     def __init__(
         self, settings: WindSettings, rng: np.random.Generator, tick_s: float = TICK_S
     ) -> None:
-        self._steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
+        """Begin an episode.
+
+        Args:
+            settings: As `wind_of_episode` returns them.
+            rng: Of the gusts.
+            tick_s: Length of a tick [s].
+        """
+        self.steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
+        """(3,) NED [m/s]."""
         sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])
         self._keep = math.exp(-tick_s / settings.gust_time_s)
         self._drive = math.sqrt(1.0 - self._keep**2) * sigma
@@ -40,13 +63,20 @@ class Wind:
         self._ahead = np.zeros((0, 3))
         self._next = 0
 
+    def ahead(self) -> Vector:
+        """Return the wind NED [m/s] of the next ticks (BLOCK, 3); without gusts one row for all."""
+        if self._calm:
+            return self.steady[None]
+        block = self._rng.standard_normal((BLOCK, 3))
+        _blow(block, self._gust, self._keep, self._drive, self.steady)
+        return block
+
     def step(self) -> Vector:
         """Advance one tick and return the wind (3,) NED [m/s]; not to be written to."""
         if self._calm:
-            return self._steady
+            return self.steady
         if self._next == len(self._ahead):
-            self._ahead, self._next = self._rng.standard_normal((BLOCK, 3)), 0
-            _blow(self._ahead, self._gust, self._keep, self._drive, self._steady)
+            self._ahead, self._next = self.ahead(), 0
         wind: Vector = self._ahead[self._next]
         self._next += 1
         return wind

@@ -1,0 +1,35 @@
+"""Independent random streams of an episode's seed, the same at every level."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """First word of a stream's key.
+
+    `arena.generate` has 0 to 3; the plant's sensors and gusts are 0 and 1 (`sensors_and_gusts`).
+    """
+
+    AIRFRAME = 10
+    CAMERA = 11
+    ESTIMATION = 12
+    DELAY = 13
+    DEPTH = 14
+    SOURCE = 15
+    WIND = 16
+
+
+def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
+    """Return the generator of one stream of an episode; `more` numbers tell its parts apart."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(name, *more)))
+
+
+def sensors_and_gusts(
+    rng: np.random.Generator,
+) -> tuple[np.random.Generator, np.random.Generator]:
+    """Return the generators of sensor noise and of gusts, from a new one of the episode's seed."""
+    sensors, gusts = rng.spawn(2)
+    return sensors, gusts

@@ -1,0 +1,87 @@
+"""The wind over the batch twin: that of every episode, drawn ahead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.frames import Vector
+from airl_mav.core.streams import sensors_and_gusts
+from airl_mav.envs.draws import NOT_BEGUN
+from airl_mav.envs.fleet import Fleet, Verdict
+from airl_mav.envs.saved_state import State, Stateful
+from airl_mav.profiles.conditions import WindSettings
+from airl_mav.vehicle.wind import BLOCK, Wind, wind_of_episode
+
+
+class Winds(Stateful):
+    """The wind of n episodes; from the seed of each the same history of gusts as the plant's."""
+
+    def __init__(self, n: int, settings: WindSettings) -> None:
+        """Prepare n slots."""
+        self.calm = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
+        """Whether no wind blows in any episode."""
+        self._settings = settings
+        self._gusty = settings.gust_m_s > 0.0
+        self._winds: list[Wind | None] = [None] * n
+        self._seeds = np.full(n, NOT_BEGUN, np.int64)
+        self._blocks = np.zeros(n, np.int64)
+        """Blocks drawn in the slot's episode."""
+        self._air = np.zeros((n, BLOCK if self._gusty else 1, 3))
+        """As `flight.advance` takes it: the present block."""
+
+    def begin(self, i: int, seed: int) -> Vector:
+        """Start the episode of slot i; return its steady wind (3,) NED [m/s]."""
+        rng = sensors_and_gusts(np.random.default_rng(seed))[1]
+        wind = Wind(wind_of_episode(self._settings, seed), rng)
+        self._winds[i], self._seeds[i], self._blocks[i] = wind, seed, 0
+        self._draw_block(i)
+        return wind.steady
+
+    def fly(
+        self,
+        fleet: Fleet,
+        ticks: NDArray[np.int64],
+        advance: Callable[[NDArray[np.int64], NDArray[np.float64] | None], None],
+    ) -> None:
+        """Fly all vehicles, in stretches that end with their blocks of wind.
+
+        Args:
+            fleet: Read after each stretch.
+            ticks: (n,) how many ticks each one flies.
+            advance: Flies every vehicle that still does for its number of ticks (n,) in the air
+                that `flight.advance` takes.
+        """
+        if not self._gusty:
+            advance(ticks, None if self.calm else self._air)
+            return
+        left = np.where(fleet.verdict == Verdict.FLYING, ticks, 0)
+        while left.any():
+            tick = fleet.time_us // TICK_US
+            for i in np.flatnonzero((left > 0) & (tick >= self._blocks * BLOCK)).tolist():
+                self._draw_block(i)
+            stretch = np.minimum(left, BLOCK - tick % BLOCK)
+            advance(stretch, self._air)
+            left = np.where(fleet.verdict == Verdict.FLYING, left - stretch, 0)
+
+    def _draw_block(self, i: int) -> None:
+        wind = self._winds[i]
+        if wind is not None:
+            self._air[i] = wind.ahead()
+            self._blocks[i] += 1
+
+    def _held(self) -> Mapping[str, Any]:
+        return {"seeds": self._seeds, "blocks": self._blocks}
+
+    def set_state(self, state: State) -> None:
+        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
+        super().set_state(state)
+        for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
+            blocks = int(self._blocks[i])
+            self.begin(i, int(self._seeds[i]))
+            for _ in range(blocks - 1):
+                self._draw_block(i)
