@@ -200,8 +200,8 @@ def run_ups(vehicle: Vehicle, speeds: ArrayLike, moments_s: Sequence[float]) -> 
         ticks = round(moment / TICK_S)
         advance(fleet, arenas, np.full(n, ticks - flown, np.int64), vehicle, RULES)
         flown = ticks
-        taken.append(Fleet(*(array.copy() for array in fleet)))
-    return Fleet(*(np.concatenate(arrays) for arrays in zip(*taken, strict=True)))
+        taken.append(Fleet._make(array.copy() for array in fleet))
+    return Fleet._make(np.concatenate(arrays) for arrays in zip(*taken, strict=True))
 
 
 def stop(fleet: Fleet, arenas: ArenaBatch, vehicle: Vehicle) -> None:

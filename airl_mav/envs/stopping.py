@@ -134,7 +134,7 @@ def fly_into(
     shared = twin_of(task.vehicle)
     moments = (phases[:, 1] * len(MOMENTS_S)).astype(np.int64)
     flying = run_ups(shared, [speed_m_s], MOMENTS_S)
-    fleet = Fleet(*(array[moments] for array in flying))
+    fleet = Fleet._make(array[moments] for array in flying)
     walls = _walls(fleet.position, task)
     # A setpoint waits for the flight controller's next tick.
     advance(fleet, walls, -(-reaction_us // TICK_US), shared, RULES)

@@ -38,7 +38,8 @@ def f1_velocity(period_s: float, sensing_distance_m: float, max_acceleration_m_s
 def f1_knee_hz(share: float, sensing_distance_m: float, max_acceleration_m_s2: float) -> float:
     """Return the rate of decisions at which the safe velocity is a share q of its roof [Hz].
 
-    From v = q sqrt(2 d a): f = 1 / T = sqrt(a / (2 d)) 2 q / (1 - q²). Faster decisions gain little.
+    From v = q sqrt(2 d a): f = 1 / T = sqrt(a / (2 d)) 2 q / (1 - q²). Beyond it faster decisions
+    gain little.
 
     Args:
         share: q, 0 < q < 1.

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
+from airl_mav.envs.braking import braking_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.envs.braking import braking_of
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.forensics.camera_view import (
     PolicyCamera,
