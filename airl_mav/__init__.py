@@ -17,6 +17,7 @@ __version__ = "0.2.0"
 _EXPORTS = {
     "ExperimentResult": "airl_mav.experiments.experiment",
     "ProfileRequest": "airl_mav.profiling.request",
+    "RooflineRequest": "airl_mav.experiments.roofline",
     "Run": "airl_mav.experiments.run",
     "Scenario": "airl_mav.scenario.model",
     "degrade": "airl_mav.experiments.degrade",
@@ -26,6 +27,7 @@ _EXPORTS = {
     "load_run": "airl_mav.experiments.run",
     "profile": "airl_mav.profiling.profile",
     "rehearse": "airl_mav.experiments.fly",
+    "roofline": "airl_mav.experiments.roofline",
 }
 """Public names, and the modules that define them."""
 
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     from airl_mav.experiments.fly import rehearse
     from airl_mav.experiments.gap import gap
     from airl_mav.experiments.ladder import ladder
+    from airl_mav.experiments.roofline import RooflineRequest, roofline
     from airl_mav.experiments.run import Run, load_run
     from airl_mav.profiling.profile import profile
     from airl_mav.profiling.request import ProfileRequest
@@ -44,6 +47,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ExperimentResult",
     "ProfileRequest",
+    "RooflineRequest",
     "Run",
     "Scenario",
     "degrade",
@@ -53,6 +57,7 @@ __all__ = [
     "load_run",
     "profile",
     "rehearse",
+    "roofline",
 ]
 
 

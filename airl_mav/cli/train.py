@@ -32,10 +32,7 @@ class TrainOptions(TrainRequest):
 
 
 OPTIONS = TrainOptions
-RENAMED_OPTIONS = {
-    "--sensing-distance": ("--sensing-distance-m",),
-    "--max-acceleration": ("--max-acceleration-m-s2",),
-}
+RENAMED_OPTIONS = {"--sensing-distance": ("--sensing-distance-m",)}
 EXTRAS = ("sim", "train")
 
 

@@ -18,6 +18,9 @@ _PACKAGES = ("airl_mav", "firmware_sim")
 """Those of the distribution that hold kernels."""
 
 
+_CACHE_NAME = "numba-"
+"""How the name of a folder of compiled code begins; the digest of the sources follows."""
+
 _IMPORT = re.compile(rf"^from ((?:{'|'.join(_PACKAGES)})[\w.]*) import", re.MULTILINE)
 
 
@@ -54,7 +57,7 @@ def _choose_cache() -> None:
     if numba.config.CACHE_DIR:
         return  # NUMBA_CACHE_DIR: the user has chosen
     package = Path(__file__).resolve().parents[1]
-    name = f"numba-{_sources_digest(package.parent)}"
+    name = f"{_CACHE_NAME}{_sources_digest(package.parent)}"
     for parent in (package / "__pycache__", Path.home() / ".cache" / "airl-mav"):
         folder = parent / name
         try:
@@ -67,6 +70,15 @@ def _choose_cache() -> None:
 
 
 _choose_cache()
+
+
+def cache_folder() -> Path | None:
+    """Return the folder of this state of the sources, for what their kernels were measured to do.
+
+    None where there is none of our own: the user has chosen another, or none can be written.
+    """
+    chosen = Path(numba.config.CACHE_DIR or "")
+    return chosen if chosen.name.startswith(_CACHE_NAME) else None
 
 
 def kernel(function: F) -> F:

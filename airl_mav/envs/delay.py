@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.core.constants import MS_PER_S
+from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.envs.spec import Delay, EnvironmentSpec
+from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.latency.injection import Injection, choose_injection
-from airl_mav.latency.safe_velocity import max_acceleration, safe_velocity
 from airl_mav.latency.source import longest_ms, parse_latency
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import Payload
@@ -18,10 +18,9 @@ from airl_mav.profiles.loaded import equipped
 class SpeedBound:
     """The safe velocity of an environment, and its inputs."""
 
-    latency_s: float
-    """T: frame exposed -> motors reflect it, at the longest t2 [s]."""
+    reaction_s: float
+    """T: an obstacle comes up -> motors answer, at the worst moment and the longest t2 [s]."""
     sensing_distance_m: float
-    max_acceleration_m_s2: float
     safe_velocity_m_s: float
     asked_m_s: float
     """Fastest action without the bound [m/s]."""
@@ -34,9 +33,8 @@ class SpeedBound:
     def describe(self) -> str:
         """Return the bound in one line."""
         facts = (
-            f"safe velocity {self.safe_velocity_m_s:.2f} m/s (latency {self.latency_s:.3f} s, "
-            f"sensing distance {self.sensing_distance_m:g} m, "
-            f"deceleration {self.max_acceleration_m_s2:.2f} m/s²)"
+            f"safe velocity {self.safe_velocity_m_s:.2f} m/s (reaction {self.reaction_s:.3f} s, "
+            f"sensing distance {self.sensing_distance_m:g} m, braking as measured)"
         )
         if self.safe_velocity_m_s < self.asked_m_s:
             share = self.max_speed_m_s / self.asked_m_s
@@ -55,10 +53,12 @@ def injections_of(delay: Delay) -> tuple[Injection, ...]:
 def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
     """Return the safe velocity of an environment; None if it has no bound.
 
-    The latency is the longest of all its sources, with transport and link.
+    The latency is the longest of all its sources; the vehicle is that of the profile, which flies
+    in the environment.
 
     Raises:
-        UsageError: A profile or a source of latency cannot be used.
+        UsageError: A profile or a source of latency cannot be used, or the sensing distance ends
+            within the hull.
     """
     asked, delay = spec.safe_velocity, spec.delay
     if asked is None:
@@ -68,16 +68,18 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
         for source in injections_of(delay)
     )
     low_high = spec.randomisation.extra_delay_ms
-    latency_s = (delay.transport_ms + t2_ms + low_high[1] + delay.link_ms) / MS_PER_S
-    acceleration = asked.max_acceleration_m_s2
-    if acceleration is None:
-        vehicle, _ = equipped(spec.vehicle, delay.computer, Payload())
-        acceleration = max_acceleration(vehicle)
+    t2_s = (t2_ms + low_high[1]) / MS_PER_S
+    vehicle, _ = equipped(spec.vehicle, delay.computer, Payload())
+    loop = DecisionLoop(
+        frame_period_s=vehicle.camera.period_us / US_PER_S,
+        transport_s=delay.transport_ms / MS_PER_S,
+        hold_s=spec.episode.hold_s,
+        link_s=delay.link_ms / MS_PER_S,
+    )
     return SpeedBound(
-        latency_s=latency_s,
+        reaction_s=loop.reaction_s(t2_s),
         sensing_distance_m=asked.sensing_distance_m,
-        max_acceleration_m_s2=acceleration,
-        safe_velocity_m_s=safe_velocity(latency_s, asked.sensing_distance_m, acceleration),
+        safe_velocity_m_s=StoppingTask(vehicle, loop, asked.sensing_distance_m).safe_velocity(t2_s),
         asked_m_s=spec.max_speed_m_s,
     )
 

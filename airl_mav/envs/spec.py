@@ -93,21 +93,15 @@ class Delay(ProfileModel):
 class SafeVelocity(ProfileModel):
     """Actions no faster than the vehicle can stop for what it sees, deciding as late as it does.
 
-    `latency.safe_velocity` has the formula.
+    `envs.stopping` says how.
     """
 
     sensing_distance_m: float = quantity(
-        "how far ahead the policy takes notice of an obstacle; the paper gives none",
+        "depth at which the policy takes notice of an obstacle, from the camera to its surface; the"
+        " paper gives none",
         "m",
         gt=0,
         le=1000,
-    )
-    max_acceleration_m_s2: float | None = quantity(
-        "greatest deceleration; left out: what tilt limit and thrust of the vehicle permit",
-        "m/s²",
-        gt=0,
-        le=1000,
-        default=None,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from functools import cache
 from pathlib import Path
@@ -70,6 +71,11 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     path = _path(kind, name)
     data = _read(kind, path, ())
     return validated(model, data, path)
+
+
+def profile_digest(profile: BaseModel) -> str:
+    """Return the SHA-256 of a profile's content, hexadecimal: its name does not tell a change."""
+    return hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
 
 
 def _path(kind: Kind, name: str) -> Path:

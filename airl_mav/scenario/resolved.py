@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -23,6 +22,7 @@ from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
+from airl_mav.profiles.loading import profile_digest
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import FirmwareName
 from airl_mav.scenario.file import anchored
@@ -103,8 +103,7 @@ class ResolvedScenario:
             "vehicle_body": self.vehicle.body.model_dump(),
             "policy_sha256": self.policy.sha256,
             "profiles_sha256": {
-                kind: hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
-                for kind, profile in profiles.items()
+                kind: profile_digest(profile) for kind, profile in profiles.items()
             },
         }
 

@@ -145,7 +145,6 @@ def configured(
     workload: str | None = None,
     latency: tuple[str, ...] = (),
     sensing_distance_m: float | None = None,
-    max_acceleration_m_s2: float | None = None,
 ) -> TrainingConfig:
     """Return a configuration with some of its values changed.
 
@@ -157,7 +156,6 @@ def configured(
         workload: Whose t2 is drawn in every decision.
         latency: Sources of t2 in place of computer and workload.
         sensing_distance_m: Bounds the speed by the safe velocity [m].
-        max_acceleration_m_s2: Greatest deceleration for it; needs `sensing_distance_m`.
 
     Raises:
         UsageError: A value is out of range, or lacks the other that it needs.
@@ -169,8 +167,6 @@ def configured(
         raise FieldError("workload", workload, "with computer")
     if computer is not None and latency:
         raise FieldError("latency", latency, "without computer")
-    if max_acceleration_m_s2 is not None and sensing_distance_m is None:
-        raise FieldError("max_acceleration_m_s2", max_acceleration_m_s2, "with sensing_distance_m")
     values: dict[str, Any] = config.model_dump(exclude_unset=True)
     values |= {k: v for k, v in {"seed": seed, "steps": steps}.items() if v is not None}
     environment = values.setdefault("environment", {})
@@ -180,8 +176,5 @@ def configured(
         source = {"latency": latency} if latency else {"computer": computer, "workload": workload}
         environment["delay"] = kept | source
     if sensing_distance_m is not None:
-        environment["safe_velocity"] = {
-            "sensing_distance_m": sensing_distance_m,
-            "max_acceleration_m_s2": max_acceleration_m_s2,
-        }
+        environment["safe_velocity"] = {"sensing_distance_m": sensing_distance_m}
     return validated(TrainingConfig, values)

@@ -44,12 +44,8 @@ class TrainRequest(BaseModel):
     sensing_distance_m: float | None = Field(
         default=None,
         description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
-        " longest latency, stops within so many metres; by default the configuration's, or not",
-    )
-    max_acceleration_m_s2: float | None = Field(
-        default=None,
-        description="greatest deceleration for the safe velocity, m/s²; takes --sensing-distance-m;"
-        " by default what the vehicle's tilt limit and thrust permit",
+        " longest latency, stops for what its camera sees so many metres off; by default the"
+        " configuration's, or not",
     )
     steps: int | None = Field(
         default=None,

@@ -48,10 +48,9 @@ def test_a_source_takes_the_place_of_the_configured_one_alone() -> None:
 
 
 def test_the_sensing_distance() -> None:
-    asked = {"sensing_distance_m": 3.0, "max_acceleration_m_s2": 6.0}
-    safe = environment_of(EnvironmentSpec(), **asked).safe_velocity
+    safe = environment_of(EnvironmentSpec(), sensing_distance_m=3.0).safe_velocity
     assert safe is not None
-    assert (safe.sensing_distance_m, safe.max_acceleration_m_s2) == (3.0, 6.0)
+    assert safe.sensing_distance_m == 3.0
 
 
 @pytest.mark.parametrize(
@@ -63,7 +62,6 @@ def test_the_sensing_distance() -> None:
             {"computer": "ras-pi-4", "workload": "template-5x32", "latency": ("150ms",)},
             "without computer",
         ),
-        ({"max_acceleration_m_s2": 4.0}, "with sensing_distance_m"),
         ({"seed": -1}, "seed -1"),
         ({"steps": 0}, "steps 0"),
         ({"sensing_distance_m": 0.0}, "safe_velocity.sensing_distance_m 0"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -72,7 +73,7 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
         if not shown:
             kind = "hidden behind something nearer" if view.hidden else "hit out of the picture"
         else:
-            kind = _seen(crash, view, flight.brake_m_s2)
+            kind = _seen(crash, view, flight.braking_m)
         if len(crash.seen) > 1:
             sentences.append(
                 f"It was in {sum(crash.seen)} of the last {len(crash.seen)} frames used."
@@ -90,17 +91,16 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
     return Cause(kind, tuple(sentences))
 
 
-def _seen(crash: Collision, view: ObstacleView, brake_m_s2: float | None) -> str:
+def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], float] | None) -> str:
     """Return what became of an obstacle in the picture: was there room to act, and to stop?"""
     if crash.lag_m is None or crash.lag_s is None or crash.before_s is None:
         return "seen and flown into"
     if crash.before_s - crash.lag_s < ACT_S:
         return "seen too late to act"
     room_m = max(0.0, view.distance_m - HALF_WIDTH_M - crash.lag_m)
-    if brake_m_s2 is None or crash.answer_m_s is None:
+    if braking_m is None or crash.answer_m_s is None:
         return "seen and flown into"
-    # Way to a stop from the speed at which the motors answered: v² / (2 a).
-    stops = crash.answer_m_s**2 <= 2.0 * brake_m_s2 * room_m
+    stops = braking_m(crash.answer_m_s) <= room_m
     return "seen and flown into" if stops else "seen too late to stop"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,8 +33,8 @@ class Evidence:
     """Its decisions by column; empty where there is none."""
     arena: Arena | None = None
     camera: PolicyCamera | None = None
-    brake_m_s2: float | None = None
-    """Greatest deceleration of the vehicle [m/s²]."""
+    braking_m: Callable[[float], float] | None = None
+    """The vehicle's way from a speed [m/s] to a stand [m]."""
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
+from airl_mav.envs.braking import braking_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.safe_velocity import max_acceleration
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.camera_view import PolicyCamera
@@ -90,7 +91,7 @@ def examine_worst(
     """
     usual = usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
-    brake = None if vehicle is None else max_acceleration(vehicle)
+    brake = None if vehicle is None else partial(_braking_m, vehicle)
     examined = []
     for record in ranked(run)[:EXAMINED]:
         path = flown_path(run, record)
@@ -105,6 +106,10 @@ def examine_worst(
         lost_s, excess = time_lost_s(record, usual), path_excess(record)
         examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
     return examined
+
+
+def _braking_m(vehicle: VehicleProfile, speed_m_s: float) -> float:
+    return braking_of(vehicle).distance_from_m(speed_m_s)
 
 
 def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:

@@ -1,0 +1,47 @@
+"""`airl roofline`: how fast a vehicle may fly on which computer, and what binds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.experiments.roofline import RooflineRequest, roofline
+from airl_mav.report.document import print_document
+
+
+class RooflineOptions(RooflineRequest):
+    """The F-1 roofline: safe velocity against reaction time, for a vehicle and its computers.
+
+    Each computer is carried and fed by the vehicle. The closed form stands beside the braking that
+    was measured on the vehicle, and beside the speed that was flown.
+
+    Examples:
+        airl roofline
+        airl roofline static-obstacles-ras-pi-4 --sensing-distance-m 8
+        airl roofline MINE --computers my-pi.toml my-jetson.toml --workload policy
+    """
+
+    policy: Annotated[str, POSITIONAL] = Field(
+        default=RooflineRequest.model_fields["policy"].default,
+        description=RooflineRequest.model_fields["policy"].description,
+    )
+    out: Path | None = Field(
+        default=None,
+        description="folder of roofline.json, roofline.html and roofline.png; by default"
+        " runs/<UTC time>-roofline-<vehicle>",
+    )
+
+
+OPTIONS = RooflineOptions
+
+
+def run(options: RooflineOptions, console: Console | None = None) -> int:
+    """Work out and fly the roofline, and show it; 0. Raises UsageError as `roofline`."""
+    asked = {name: getattr(options, name) for name in RooflineRequest.model_fields}
+    result = roofline(RooflineRequest(**asked), out=options.out)
+    print_document(result.document, console or Console(), result.page)
+    return 0

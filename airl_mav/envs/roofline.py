@@ -1,0 +1,176 @@
+"""The roofline of a vehicle: how fast it may fly for how often it decides, and computers on it.
+
+After the F-1 model (`latency.f1_model`), with the braking as measured, and as flown.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from airl_mav.core.constants import G_PER_KG, MS_PER_S, TICK_S
+from airl_mav.core.fields import ProfileModel
+from airl_mav.envs.braking import Braking, braking_of
+from airl_mav.envs.stopping import StoppingTask, greatest_speed
+from airl_mav.flight.energy import level_powers_w
+from airl_mav.latency.f1_model import f1_knee_hz, f1_velocity, max_acceleration
+from airl_mav.latency.injection import Injection
+from airl_mav.latency.source import longest_ms
+from airl_mav.profiles.computer import ComputerProfile
+
+Bound = Literal["body", "sensor", "computer", "hold", "link"]
+"""What a vehicle would have to be better at to fly faster."""
+
+
+class Shares(ProfileModel):
+    """What the longest reaction time is made of [s]."""
+
+    sensor: float
+    """Frame period and transport."""
+    computer: float
+    """Twice the longest t2."""
+    hold: float
+    """How long the policy's action is held."""
+    link: float
+    """Link, and a tick of the flight controller."""
+
+
+class RooflinePoint(ProfileModel):
+    """A computer on the roofline of the vehicle that carries it."""
+
+    computer: str
+    description: str
+    mass_g: float
+    """On board [g]."""
+    watts: float
+    """From the pack [W]."""
+    latency: str
+    """What its t2 is, in words."""
+    vehicle_kg: float
+    room_m: float
+    """Sensing distance but for the hull: d of the model [m]."""
+    reaction_s: float
+    """T: an obstacle comes up -> motors answer [s]."""
+    shares: Shares
+    max_acceleration_m_s2: float
+    """a of the F-1 model: tilt limit and thrust [m/s²]."""
+    f1_m_s: float
+    """Safe velocity by the F-1 model [m/s]."""
+    f1_roof_m_s: float
+    f1_knee_hz: float
+    braking: Braking
+    measured_m_s: float
+    """Safe velocity by the measured braking [m/s]."""
+    roof_m_s: float
+    """By the measured braking, at T = 0 [m/s]."""
+    knee_hz: float
+    """Rate 1 / T at which that reaches the knee's share of its roof [Hz]."""
+    flown_m_s: float
+    """Greatest speed at which no flight touched the obstacle [m/s]."""
+    binds: Bound
+    power_w: float
+    """Of level flight at the measured safe velocity, with the computer [W]."""
+    missions_per_charge: float
+
+    @property
+    def rate_hz(self) -> float:
+        """1 / T [Hz]."""
+        return 1.0 / self.reaction_s
+
+
+class LeftOut(ProfileModel):
+    """A computer that has no place on the roofline."""
+
+    computer: str
+    why: str
+
+
+class Roofline(ProfileModel):
+    """A vehicle and its computers."""
+
+    vehicle: str
+    policy: str
+    workload: str
+    sensing_distance_m: float
+    noticed_m: tuple[float, ...] = Field(description="depths at which the policy took notice")
+    """Empty where the sensing distance was given [m]."""
+    frame_rate_hz: float
+    hold_s: float
+    knee_share: float
+    mission_m: float
+    draws: int
+    seed: int
+    points: tuple[RooflinePoint, ...]
+    left_out: tuple[LeftOut, ...] = ()
+
+
+def roofline_point(
+    name: str,
+    computer: ComputerProfile,
+    task: StoppingTask,
+    injection: Injection,
+    *,
+    knee_share: float,
+    mission_m: float,
+    draws: int,
+    seed: int,
+) -> RooflinePoint:
+    """Put a computer on the roofline of the vehicle that carries it, and fly it there.
+
+    Args:
+        name: Of the computer's profile.
+        computer: The computer.
+        task: The vehicle as loaded with it, its decisions and its sensing distance.
+        injection: t2 as measured on the computer; it has a latency.
+        knee_share: Share of the roof at which the knee lies, 0 < q < 1.
+        mission_m: Length of a mission [m].
+        draws: Flights at each speed that is tried.
+        seed: Of their draws.
+
+    Raises:
+        ValueError: The injection has no latency.
+        FieldError: The sensing distance ends within the hull.
+    """
+    if injection.latency is None:
+        raise ValueError(f"{name}: no latency")
+    t2_s = longest_ms(injection.latency) / MS_PER_S
+    loop, vehicle = task.loop, task.vehicle
+    measured, reaction = task.safe_velocity(t2_s), loop.reaction_s(t2_s)
+    parts: dict[Bound, float] = {
+        "sensor": loop.frame_period_s + loop.transport_s,
+        "computer": 2.0 * t2_s,
+        "hold": loop.hold_s,
+        "link": loop.link_s + TICK_S,
+    }
+    braking, room, a = braking_of(vehicle), task.room_m, max_acceleration(vehicle)
+    roof = braking.safe_velocity(0.0, room)
+    at_knee = knee_share * roof
+    braked = braking.stopping_m(at_knee, 0.0)
+    knee_hz = (braking.stopping_m(at_knee, 1.0) - braked) / (room - braked)
+    power_w = float(level_powers_w(vehicle, np.array([measured]))[0]) + computer.onboard_watts
+    pack_j = vehicle.battery.energy_j(1.0)
+    return RooflinePoint(
+        computer=name,
+        description=computer.description,
+        mass_g=G_PER_KG * computer.onboard_mass_kg,
+        watts=computer.onboard_watts,
+        latency=injection.label,
+        vehicle_kg=vehicle.body.mass_kg,
+        room_m=room,
+        reaction_s=reaction,
+        shares=Shares(**parts),
+        max_acceleration_m_s2=a,
+        f1_m_s=f1_velocity(reaction, room, a),
+        f1_roof_m_s=f1_velocity(0.0, room, a),
+        f1_knee_hz=f1_knee_hz(knee_share, room, a),
+        braking=braking,
+        measured_m_s=measured,
+        roof_m_s=roof,
+        knee_hz=knee_hz,
+        flown_m_s=greatest_speed(task, injection, t2_s, draws, seed),
+        binds="body" if 1.0 / reaction >= knee_hz else max(parts, key=lambda part: parts[part]),
+        power_w=power_w,
+        missions_per_charge=pack_j * measured / (power_w * mission_m),
+    )
