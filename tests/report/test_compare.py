@@ -254,6 +254,7 @@ def test_the_command_prints_and_writes(runs: dict[str, Path], tmp_path: Path) ->
     text = ask(runs["fast"], runs["slow"], out=out, names=("desk", "drone"))
     assert "drone against desk" in text
     assert "drone and desk: 24 pairs." in text
+    assert "Deadlines and smoothness" in text
     assert (out / "compare.html").exists()
     # Once more into the same folder.
     ask(runs["fast"], runs["slow"], out=out, names=("desk", "drone"))

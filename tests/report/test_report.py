@@ -130,6 +130,14 @@ def test_the_real_time_table(demo: tuple[LoadedRun, dict[int, Arena]]) -> None:
     assert cells(view, "setpoints never accepted")["value"] == "1"
     flown = sum(e.ended_us - e.started_us for e in run.episodes) / 1e6
     wall = sum(e.wall_s or 0.0 for e in run.episodes)
+    # Five flights of 2, 3, 4, 5 and 6 s of processor time in 20 s each; the second knows no power.
+    spent = cells(view, "companion, processor time a flight")
+    assert (spent["value"], spent["n"]) == ("4.00 s, 0.20 cores", "5")
+    assert cells(view, "companion, greatest memory of any flight")["value"] == "94 MiB"
+    power = cells(view, "mean power of the machine")
+    assert (power["value"], power["n"]) == ("6.2 W (INA monitor: VDD_IN)", "4")
+    older = replace(run, episodes=tuple(replace(e, companion_use=None) for e in run.episodes))
+    assert len(real_time_table(older, summarize_run(run)).rows) == len(view.rows) - 3
     assert cells(view, "real-time factor")["value"] == f"{flown / wall:.3f} (asked 1)"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
+from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
@@ -44,6 +45,11 @@ def demo_setup() -> Setup:
 def demo_arena(seed: int, profile: str = "static-obstacles") -> Arena:
     spec = load_profile("arenas", profile, ArenaSpec)
     return generate(spec, seed, name=profile, vehicle_width_m=0.55)
+
+
+def demo_use(index: int) -> ProcessUse:
+    watts = 4.0 + index if index != 1 else None
+    return ProcessUse(20.0, 2.0 + index, (90 + index) << 20, "begin", watts, "INA monitor: VDD_IN")
 
 
 def demo_episode(
@@ -118,6 +124,7 @@ def demo_episode(
             hold_s=0.5,
         ),
         notes=("watchdog: a decision was 620 ms late",) if index == 2 else (),
+        companion_use=demo_use(index),
     )
     accepted = np.array(setpoints, np.int64).reshape(-1, 2)
     if index == 1:

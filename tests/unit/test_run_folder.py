@@ -248,6 +248,7 @@ def test_the_documentation_names_every_field(tmp_path: Path) -> None:
         *info["machine"],
         *line,
         *line["quality"],
+        *line["companion_use"],
         *run.latency[0],
     }
     names |= set(run.trajectories[0].arrays())
