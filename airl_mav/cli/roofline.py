@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL
 from airl_mav.experiments.roofline import RooflineRequest, roofline
 from airl_mav.report.document import print_document
 
@@ -21,14 +19,10 @@ class RooflineOptions(RooflineRequest):
 
     Examples:
         airl roofline
-        airl roofline static-obstacles-ras-pi-4 --sensing-distance-m 8
-        airl roofline MINE --computers my-pi.toml my-jetson.toml --workload policy
+        airl roofline --policy static-obstacles-ras-pi-4 --sensing-distance-m 8
+        airl roofline --policy MINE --computers my-pi.toml my-jetson.toml --workload policy
     """
 
-    policy: Annotated[str, POSITIONAL] = Field(
-        default=RooflineRequest.model_fields["policy"].default,
-        description=RooflineRequest.model_fields["policy"].description,
-    )
     out: Path | None = Field(
         default=None,
         description="folder of roofline.json, roofline.html and roofline.png; by default"

@@ -15,15 +15,18 @@ from airl_mav.envs.braking import Braking, braking_of, measure_braking
 from airl_mav.envs.delay import bounded, speed_bound
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.noticing import noticed_m
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask, fly_into, greatest_speed
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.latency.source import longest_ms, parse_latency
+from airl_mav.policy.learned import load_learned
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import loaded
-from airl_mav.profiles.loading import profile_digest
+from airl_mav.profiles.loading import load_profile, profile_digest, profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.training.config import TrainingConfig
 from tests.support.flight_rig import NAN, flight, velocity_setpoint
 
 QUAD = load_vehicle("quad")
@@ -202,3 +205,13 @@ def test_what_is_sensed_within_the_hull_gets_one_line() -> None:
     asked = {"delay": PI, "safe_velocity": {"sensing_distance_m": 0.1}}
     with pytest.raises(FieldError, match=r"sensing_distance_m 0\.1: accepted: value > 0\.155 m"):
         speed_bound(spec_of(None, asked))
+
+
+def test_the_shipped_policy_is_bounded_by_what_it_takes_notice_of() -> None:
+    name = "static-obstacles-ras-pi-4"
+    config = load_profile("training", name, TrainingConfig)
+    bound = speed_bound(config.environment)
+    assert bound is not None
+    policy = load_learned(profiles_dir() / "policies" / name)
+    assert policy.card.actions.max_speed_m_s == pytest.approx(bound.safe_velocity_m_s, rel=1e-4)
+    assert noticed_m(policy, QUAD).min() > bound.sensing_distance_m
