@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.core.constants import MS_PER_S, US_PER_S
+from airl_mav.core.constants import MS_PER_S
 from airl_mav.envs.spec import Delay, EnvironmentSpec
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.latency.injection import Injection, choose_injection
@@ -70,12 +70,7 @@ def speed_bound(spec: EnvironmentSpec) -> SpeedBound | None:
     low_high = spec.randomisation.extra_delay_ms
     t2_s = (t2_ms + low_high[1]) / MS_PER_S
     vehicle, _ = equipped(spec.vehicle, delay.computer, Payload())
-    loop = DecisionLoop(
-        frame_period_s=vehicle.camera.period_us / US_PER_S,
-        transport_s=delay.transport_ms / MS_PER_S,
-        hold_s=spec.episode.hold_s,
-        link_s=delay.link_ms / MS_PER_S,
-    )
+    loop = DecisionLoop.of(vehicle, spec.episode.hold_s, delay)
     return SpeedBound(
         reaction_s=loop.reaction_s(t2_s),
         sensing_distance_m=asked.sensing_distance_m,

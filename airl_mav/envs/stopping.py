@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
+from airl_mav.core.constants import MS_PER_S, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.envs.arenas import ArenaBatch
 from airl_mav.envs.braking import (
@@ -27,6 +27,7 @@ from airl_mav.envs.braking import (
 )
 from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.envs.flight import advance
+from airl_mav.envs.spec import Delay
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -52,6 +53,17 @@ class DecisionLoop:
     link_s: float
     """Setpoint sent -> motors follow it."""
 
+    @classmethod
+    def of(cls, vehicle: VehicleProfile, hold_s: float, delay: Delay | None = None) -> DecisionLoop:
+        """Return the loop of a vehicle's camera; without delays given, with the twin's own."""
+        delay = delay or Delay()
+        return cls(
+            frame_period_s=vehicle.camera.period_us / US_PER_S,
+            transport_s=delay.transport_ms / MS_PER_S,
+            hold_s=hold_s,
+            link_s=delay.link_ms / MS_PER_S,
+        )
+
     def reaction_s(self, t2_s: float) -> float:
         """Return the longest time from an obstacle's coming up to the motors' answer [s].
 
@@ -65,6 +77,10 @@ class DecisionLoop:
         """
         waited = self.frame_period_s + self.transport_s
         return waited + t2_s + self.hold_s + t2_s + self.link_s + TICK_S
+
+    def inference_s(self, reaction_s: float) -> float:
+        """Return the longest inference with that reaction time [s]; below 0: there is none."""
+        return 0.5 * (reaction_s - self.reaction_s(0.0))
 
 
 @dataclass(frozen=True)
@@ -105,6 +121,17 @@ class StoppingTask:
                 f"value > {hull_m:g} m, by which the hull stands out before the camera",
             )
         return braking_of(self.vehicle).safe_velocity(self.loop.reaction_s(t2_s), self.room_m)
+
+    def inference_budget_s(self, speed_m_s: float) -> float:
+        """Return the longest inference with which a speed is safe [s]; below 0: there is none.
+
+        Args:
+            speed_m_s: Of the setpoint, > 0 and at most what the autopilot flies [m/s].
+        """
+        braking = braking_of(self.vehicle)
+        braked_m = braking.stopping_m(speed_m_s, 0.0)
+        flown_m_s = braking.stopping_m(speed_m_s, 1.0) - braked_m
+        return self.loop.inference_s((self.room_m - braked_m) / flown_m_s)
 
 
 def fly_into(

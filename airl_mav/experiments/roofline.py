@@ -12,14 +12,12 @@ import numpy as np
 from pydantic import Field
 
 from airl_mav.core.clock import utc_now
-from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import write_json
 from airl_mav.core.provenance import provenance
 from airl_mav.envs.noticing import noticed_m
 from airl_mav.envs.roofline import LeftOut, Roofline, RooflinePoint, roofline_point
-from airl_mav.envs.spec import Delay
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE, DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection
@@ -144,13 +142,7 @@ def find_roofline(request: RooflineRequest) -> Roofline:
     hold_s = request.hold_s
     if hold_s is None:
         hold_s = PilotSettings().hold_s if policy.card is None else policy.card.hold_s
-    delay = Delay()
-    loop = DecisionLoop(
-        frame_period_s=bare.camera.period_us / US_PER_S,
-        transport_s=delay.transport_ms / MS_PER_S,
-        hold_s=hold_s,
-        link_s=delay.link_ms / MS_PER_S,
-    )
+    loop = DecisionLoop.of(bare, hold_s)
     points: list[RooflinePoint] = []
     left_out: list[LeftOut] = []
     for name in request.computers:

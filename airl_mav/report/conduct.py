@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from airl_mav.core.constants import MS_PER_S, US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.smoothness import BANDWIDTH_HZ, command_steps
 from airl_mav.flight.statistics import known, successful
+from airl_mav.latency.deadlines import deadline_miss_ratio
 from airl_mav.latency.percentiles import percentile
+from airl_mav.latency.stages import Samples
+from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.arenas import vehicle_of
 from airl_mav.report.measures import COMMAND_STEP, CONDUCT, DEADLINE_MISSES, JERK, Measure
 from airl_mav.report.run_summary import RunSummary
 from airl_mav.report.table import NONE, TOO_FEW_CELL, Column, TableView
@@ -19,6 +28,43 @@ CONDUCT_NOTE = (
     f"sampled at 50 Hz, Gaussian low-pass of {BANDWIDTH_HZ:g} Hz; that of the command is its steps "
     "seen through the same filter."
 )
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How late a policy may be that flies at its fastest action."""
+
+    t2_s: float
+    """The longest inference with which that speed is safe [s]; below 0: there is none."""
+    note: str
+
+    def row(self, t2_us: Samples) -> tuple[str, ...]:
+        """Return how many of all decisions (n,) [µs] were later than that."""
+        ratio = deadline_miss_ratio(t2_us, max(1.0, self.t2_s * US_PER_S))
+        told = NONE if ratio is None else f"{100.0 * ratio:.1f} %"
+        return "t2 beyond the safe velocity's", told, NONE, f"{t2_us.size:,}"
+
+
+def _budget(run: LoadedRun) -> Budget | None:
+    """Return the budget of a run's policy; None: nothing tells how far off it takes notice."""
+    try:
+        card = find_policy(run.info.config["policy"]).card
+        vehicle = vehicle_of(run.info)
+    except (KeyError, UsageError):
+        return None
+    trained = {} if card is None else card.training.config.get("environment", {})
+    bound, pilot = trained.get("safe_velocity"), run.info.config.get("pilot")
+    if not bound or not pilot:
+        return None
+    distance_m, speed_m_s = bound["sensing_distance_m"], pilot["max_speed_m_s"]
+    task = StoppingTask(vehicle, DecisionLoop.of(vehicle, pilot["hold_s"]), distance_m)
+    t2_s = task.inference_budget_s(speed_m_s)
+    allowed = f"{MS_PER_S * t2_s:.0f} ms" if t2_s > 0.0 else "none"
+    return Budget(
+        t2_s,
+        f"At {speed_m_s:.2f} m/s, its fastest action, the policy stops for what comes up "
+        f"{distance_m:g} m ahead (as on its card) with a t2 of at most: {allowed}.",
+    )
 
 
 def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
@@ -45,8 +91,10 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
         value = f"{max(peaks):,.1f} m/s³" if peaks else NONE
         return title, value, NONE, f"{len(peaks):,}"
 
+    budget = _budget(run)
     rows = (
         mean(DEADLINE_MISSES),
+        *(() if budget is None else (budget.row(summary.samples["t2"]),)),
         mean(JERK),
         greatest("jerk, flown, peak", "jerk_peak_m_s3"),
         (
@@ -76,7 +124,7 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
         Column("95 % interval"),
         Column("n"),
     )
-    notes = [CONDUCT_NOTE]
+    notes = [CONDUCT_NOTE, *(() if budget is None else (budget.note,))]
     if not summary.timed:
         notes.append(
             f"At level {run.info.setup.level} the companion is no process of its own: it has no "

@@ -66,7 +66,7 @@ def test_the_measured_way_is_that_of_the_autopilot_in_pybullet(measured: Braking
             rig.run(1.5)
 
 
-def test_a_stop_takes_what_the_issue_found_and_not_what_the_tilt_limit_gives(
+def test_a_stop_takes_three_times_what_the_tilt_limit_gives(
     measured: Braking,
 ) -> None:
     assert measured.distance_from_m(4.08) == pytest.approx(2.72, abs=0.08)
@@ -215,3 +215,13 @@ def test_the_shipped_policy_is_bounded_by_what_it_takes_notice_of() -> None:
     policy = load_learned(profiles_dir() / "policies" / name)
     assert policy.card.actions.max_speed_m_s == pytest.approx(bound.safe_velocity_m_s, rel=1e-4)
     assert noticed_m(policy, QUAD).min() > bound.sensing_distance_m
+
+
+@pytest.mark.parametrize("t2_s", [0.05, 0.3, 0.46])
+def test_the_budget_of_the_safe_velocity_is_the_inference_it_was_worked_out_for(
+    t2_s: float,
+) -> None:
+    task = StoppingTask(QUAD, DecisionLoop.of(QUAD, hold_s=0.25), 6.0)
+    speed = task.safe_velocity(t2_s)
+    assert task.inference_budget_s(speed) == pytest.approx(t2_s, abs=1e-6)
+    assert task.inference_budget_s(1.1 * speed) < t2_s
