@@ -41,3 +41,5 @@ class Setup:
     """What flew: the built-in autopilot, or the name of real firmware."""
     computer_on_ground: bool = False
     """The computer is ground equipment: the aircraft carries and feeds none."""
+    conditions: str = ""
+    """Wind, load, spread, noise and charge, where they are not the defaults: `wind.east_m_s 4`."""

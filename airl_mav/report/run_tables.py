@@ -55,6 +55,7 @@ def setup_rows(run: LoadedRun) -> tuple[tuple[str, str], ...]:
     rows = [
         ("vehicle", _part(setup.vehicle)),
         ("arena", _part(setup.arena)),
+        ("conditions", setup.conditions),
         ("policy", _part(setup.policy)),
         ("computer", f"{_part(setup.computer)}, {computer_power(setup)}"),
         ("decision latency t2", latency),

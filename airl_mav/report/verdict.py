@@ -130,9 +130,10 @@ def judge_run(
             f"{round(rate.value * rate.n):,} of {rate.n:,} goals reached,"
             f" {_percent(rate.scaled(100.0))}"
         )
+    conditions = f" ({setup.conditions})" if setup.conditions else ""
     sentence = (
-        f"{setup.policy.name} on {computer} in {Path(setup.arena.name).stem}, level {setup.level}:"
-        f" {reached}"
+        f"{setup.policy.name} on {computer} in {Path(setup.arena.name).stem}{conditions},"
+        f" level {setup.level}: {reached}"
     )
     if against is not None:
         sentence += _gap_words(against, reference)

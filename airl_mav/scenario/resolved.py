@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.loading import profile_digest
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.scenario.aircraft import FirmwareName
+from airl_mav.scenario.aircraft import Aircraft, FirmwareName
 from airl_mav.scenario.file import anchored
 from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator, load_asked_policy
@@ -168,6 +168,7 @@ class ResolvedScenario:
             injection=self.injection,
             speed=self.speed,
             between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
+            conditions=", ".join(_conditions(scenario)),
         )
 
     @property
@@ -214,3 +215,12 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
+
+
+def _conditions(scenario: Aircraft) -> Iterator[str]:
+    """Give what an aircraft flies with and in, where it is not the default: field and value."""
+    for table in ("payload", "wind", "spread", "sensors"):
+        for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
+            yield f"{table}.{name} {value:g}"
+    if scenario.battery_charge < 1.0:
+        yield f"battery_charge {scenario.battery_charge:g}"

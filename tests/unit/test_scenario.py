@@ -17,6 +17,7 @@ from airl_mav.cli import entry, sitl
 from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
+from airl_mav.profiles.conditions import Payload, WindSettings
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.file import anchored, read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
@@ -352,3 +353,13 @@ def test_old_options_work_and_say_their_new_name(
 
 def test_the_old_option_of_hovering_reaches_the_watchdog() -> None:
     assert options("--hover-after", "0.06").watchdog.hover_after_s == 0.06
+
+
+def test_the_facts_of_a_report_name_the_conditions_that_are_not_the_defaults() -> None:
+    plain = resolve(Scenario(level="gym")).setup
+    assert plain.conditions == ""
+    windy = Scenario(
+        level="gym", battery_charge=0.5, wind=WindSettings(east_m_s=4.0), payload=Payload(mass_g=50)
+    )
+    told = resolve(windy).setup.conditions
+    assert told == "payload.mass_g 50, wind.east_m_s 4, battery_charge 0.5"
