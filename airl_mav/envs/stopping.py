@@ -156,7 +156,8 @@ def fly_into(
     """
     rngs = [latency_generator(seed + i) for i in range(draws)]
     samplers = [latency.sampler(rng) or FixedSampler(_us(native_s)) for rng in rngs]
-    phases = np.array([np.random.default_rng((seed + i, draws)).random(2) for i in range(draws)])
+    others = [np.random.default_rng((seed + i, draws)) for i in range(draws)]
+    phases = np.array([rng.random(2) for rng in others])
     reaction_us = _reactions_us(task.loop, samplers, phases[:, 0])
     shared = twin_of(task.vehicle)
     moments = (phases[:, 1] * len(MOMENTS_S)).astype(np.int64)

@@ -39,7 +39,7 @@ from airl_mav.scenario.model import Lateness
 from airl_mav.scenario.piloting import select_latency
 from companion.mission import MissionResult
 from tests.support.ports import choose_ports
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, allow_interrupt
 from tests.unit.test_companion_light import BLOCK
 from tests.unit.test_machine_power import ORIN_NX
 from tests.unit.test_machine_state import write
@@ -316,6 +316,7 @@ def test_interrupted_profile_writes_nothing(tmp_path: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        preexec_fn=allow_interrupt,
     )
     assert process.stdout is not None
     assert "profile" in process.stdout.readline()
