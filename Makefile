@@ -53,8 +53,9 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 .PHONY: kernels
 kernels: $(ALL)
 	$(BIN)/python scripts/compile_kernels.py
+	$(BIN)/python -m pytest --collect-only --quiet --quiet > $(VENV)/.collected
 
-# mypy is one thread: the kernels compile beside it.
+# mypy is one thread: what every worker of the tests would compile for itself compiles beside it.
 .PHONY: test
 test: $(ALL)  ## Everything CI checks
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels

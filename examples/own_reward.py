@@ -18,7 +18,7 @@ from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
 from airl_mav.training.networks import policy_arguments
 
-STEPS = 128
+STEPS = 64
 
 
 class ShortAndCheap(gymnasium.Wrapper):
@@ -44,7 +44,7 @@ env = ShortAndCheap(gymnasium.make("airl/Navigation-v0", arena="no-obstacles", a
 model = PPO(
     "MultiInputPolicy",
     env,
-    n_steps=64,
+    n_steps=32,
     seed=1,
     policy_kwargs=policy_arguments(NetworkSpec(kind="small")),
 )

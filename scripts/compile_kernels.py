@@ -1,12 +1,9 @@
 """Compile every kernel of plant and batch twin, before many processes need them at once.
 
 numba's cache is shared, but has no lock: processes that start together compile the same code each.
-Also imports what trains and draws, so that Python's own compiled files are there.
 """
 
-import matplotlib.figure  # noqa: F401
 import numpy as np
-import stable_baselines3  # noqa: F401
 
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec
