@@ -247,29 +247,6 @@ def test_whoever_is_killed_whenever_every_seed_is_flown_once(
         assert kept <= told_of <= killed.count(name)
 
 
-def test_killed_while_a_flight_is_saved(tmp_path: Path) -> None:
-    windows = ("half a line", "a line")
-    campaign = Campaign(tmp_path, episodes=len(windows))
-    flown = []
-    for window in windows:
-        with campaign.flying(f"{KILLER}\n{WINDOWS[window]}") as run:
-            run.find_children("firmware", "companion")
-            campaign.look(run)
-            assert run.wait() == -signal.SIGKILL, run.text()
-        campaign.nobody_left()
-        flown.append(campaign.check_half_way())
-    assert flown == [0, 1]
-    with campaign.flying() as run:
-        run.find_children("firmware", "companion")
-        assert run.wait() == 0, run.text()
-        assert f"1 of {len(windows)} episodes are there" in run.text()
-    campaign.nobody_left()
-    campaign.check_whole()
-    # Finished: nothing flies any more.
-    with campaign.flying("from airl_mav.experiments import fly\nfly.Rehearsal = None") as run:
-        assert run.wait() == 0, run.text()
-
-
 FORKS = """
 import json, os, sys
 from airl_mav.cli import evaluate, main

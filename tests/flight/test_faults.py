@@ -251,17 +251,6 @@ def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
     nothing_half_written(tmp_path / "run")
 
 
-def test_interrupted_start(tmp_path: Path) -> None:
-    with sitl(tmp_path, choose_ports(), program=SITL) as run:
-        run.find_children("firmware", "companion")
-        run.interrupt()
-        assert run.wait(40.0) == 130
-        run.no_child_left()
-    assert "no episode was finished" in run.text()
-    assert "Traceback" not in run.text()
-    nothing_half_written(tmp_path / "run")
-
-
 def test_second_interrupt_kills_a_stopped_firmware(tmp_path: Path, ground: Ground) -> None:
     with sitl(tmp_path, choose_ports(ground.port)) as run:
         children = run.find_children("firmware", "companion")
@@ -719,7 +708,6 @@ def occupied(kind: socket.SocketKind) -> Iterator[int]:
     ("option", "kind", "named"),
     [
         ("--api-port", socket.SOCK_DGRAM, "--api-port"),
-        ("--gcs-local-port", socket.SOCK_DGRAM, "--gcs-local-port"),
         ("--camera-port", socket.SOCK_STREAM, "--camera-port"),
     ],
 )
