@@ -6,8 +6,8 @@ BIN   := $(VENV)/bin
 FLY   := $(VENV)/.installed-sim
 ALL   := $(VENV)/.installed-all
 
-# Two more than there are cores: tests that fly mostly wait.
-WORKERS := $(shell expr $$(nproc) + 2)
+# One more than there are cores: tests that fly mostly wait.
+WORKERS := $(shell expr $$(nproc) + 1)
 
 comma := ,
 
