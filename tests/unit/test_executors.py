@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
@@ -169,7 +170,9 @@ def test_a_worker_lives_on_over_the_runs_and_starts_each_anew(tmp_path: Path) ->
         assert [path.name for path in tmp_path.glob("start-*")] == [f"start-{first}"]
         # One that is lost without work is replaced when its turn comes, and no job's fault.
         os.kill(first, signal.SIGKILL)
-        wait_until(partial(has_ended, first), "a worker to end", 30.0)
+        # All of its threads: a zombie may still have some, and is not to be waited for then.
+        alive = multiprocessing.active_children
+        wait_until(lambda: first not in [child.pid for child in alive()], "a worker to end", 30.0)
         lost: list[str] = []
         ((_, (_, second)),) = executor.run([1], worker_jobs.doubles, lost=lost.append)
         assert second != first
