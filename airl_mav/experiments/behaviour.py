@@ -1,0 +1,228 @@
+"""The behaviour fingerprint: does this version fly as that one did?
+
+A small fixed set of flights, at level gym and in lockstep, and where each one was at stated times.
+What a change of the sources, of a package or of a shipped policy does to flights shows as a
+difference from samples that were written down earlier. The samples have a digest, and published
+results name it: the *behaviour* that they were flown with.
+
+Processors differ in the last bits of what they compute. So the samples are not compared bit by
+bit, but within `TOLERANCES`: flights that agree within them have the behaviour of the stored
+samples. The flights are short and their policies choose among discrete actions or are classical,
+which keeps differences of last bits far below a millimetre; a network with continuous actions is
+followed for three seconds only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, validated
+from airl_mav.core.files import read_json, write_json
+from airl_mav.experiments.gym_flier import GymFlier
+from airl_mav.lockstep.flight import fly
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.scenario.model import LevelName, Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import PlannedEpisode
+
+SCHEMA = 1
+"""Version of the file of samples."""
+
+ARENAS = ("no-obstacles", "static-obstacles", "dynamic-obstacles", "dense-obstacles", "crowded")
+LOCKSTEP_ARENAS = ("static-obstacles", "dynamic-obstacles")
+POLICIES = ("greedy", "static-obstacles")
+"""Classical, and a network that chooses among discrete actions."""
+
+LATENCIES: Mapping[str, str | None] = {"native": None, "late": "lognormal:396ms,20ms"}
+"""As fast as a workstation, and as late as the paper's Raspberry Pi, drawn anew each time."""
+
+LOCKSTEP_LIMIT_S, GYM_LIMIT_S, CONTINUOUS_LIMIT_S = 8.0, 20.0, 3.0
+"""Longest flights; a flight that ends earlier is sampled to its end."""
+
+GYM_SEEDS, LOCKSTEP_SEEDS = (1, 2, 3), (2,)
+
+CONDITIONS: dict[str, Any] = {
+    "policy": "static-obstacles-ras-pi-4",
+    "computer": "ras-pi-4",
+    "workload": "template-5x32",
+    "payload": {"mass_g": 150.0, "forward_m": 0.02},
+    "wind": {"east_m_s": 3.0, "gust_m_s": 1.0},
+    "spread": {"mass": 0.1, "thrust": 0.05, "drag": 0.1},
+    "sensors": {"navigation_noise": 1.5, "depth_noise": 0.02},
+}
+"""Everything at once that changes an aircraft and its air."""
+
+_FLIGHT: dict[str, Any] = {"episodes": 1}
+
+SAMPLE_EVERY_US = 1_000_000
+"""Time between the stated times, from the start of navigation."""
+
+DECIMALS = 3
+"""Samples are written down to a millimetre and a millisecond."""
+
+TOLERANCES = {"position_m": 0.01, "time_s": 0.021, "energy_share": 0.001}
+"""What still is the same behaviour: a centimetre at every stated time, one sample of a trajectory
+(20 ms) in the time that the flight took, a thousandth of its energy."""
+
+
+class FlightSample(ProfileModel):
+    """What is written down of one flight."""
+
+    outcome: str = Field(description="how it ended, in the referee's word")
+    time_s: float = Field(description="from the start of navigation to its end [s]")
+    energy_j: float = Field(description="drawn from the pack on that way, with the computer's [J]")
+    positions: tuple[tuple[float, float, float], ...] = Field(
+        description="NED [m] at the stated times, the first at the start of navigation"
+    )
+
+
+class Behaviour(ProfileModel):
+    """How a version flies."""
+
+    flights: dict[str, FlightSample] = Field(description="by level, arena, policy and latency")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the samples, its first 16 hexadecimal digits: the fingerprint."""
+        plain = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(plain.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A flight that is not the one that was written down."""
+
+    flight: str
+    what: str
+    """Of what, by how much, and what would have been the same."""
+
+    def __str__(self) -> str:
+        """Return one line."""
+        return f"{self.flight}: {self.what}"
+
+
+def scenarios() -> Iterator[tuple[str, Scenario]]:
+    """Yield the flights of the fingerprint: name and scenario of one episode each."""
+    levels: tuple[tuple[LevelName, tuple[str, ...], tuple[int, ...], float], ...] = (
+        ("gym", ARENAS, GYM_SEEDS, GYM_LIMIT_S),
+        ("lockstep", LOCKSTEP_ARENAS, LOCKSTEP_SEEDS, LOCKSTEP_LIMIT_S),
+    )
+    for level, arenas, seeds, limit_s in levels:
+        for arena, policy, seed, (late, t2) in product(arenas, POLICIES, seeds, LATENCIES.items()):
+            asked = {"arena": arena, "policy": policy, "latency": t2, "seed": seed}
+            name = f"{level}, {arena}, {policy}, {late}, seed {seed}"
+            yield name, Scenario(**_FLIGHT, level=level, time_limit_s=limit_s, **asked)
+        name = f"{level}, static-obstacles, wind, spread, noise and payload"
+        yield name, Scenario(**_FLIGHT, level=level, time_limit_s=limit_s, **CONDITIONS)
+    twin: dict[str, Any] = {**_FLIGHT, "level": "gym", "seed": 1}
+    name, hover = "gym, static-obstacles, hover after 60 ms", {"hover_after_s": 0.06}
+    t2 = LATENCIES["late"]
+    yield name, Scenario(**twin, time_limit_s=GYM_LIMIT_S, latency=t2, watchdog=hover)
+    for policy in ("dynamic-obstacles", "crowded"):
+        name = f"gym, {policy}, continuous actions"
+        asked = {"arena": policy, "policy": policy}
+        yield name, Scenario(**twin, time_limit_s=CONTINUOUS_LIMIT_S, **asked)
+
+
+def fly_behaviour(only: Sequence[str] = ()) -> Behaviour:
+    """Fly the flights of the fingerprint.
+
+    Args:
+        only: Names of flights; none given: all.
+    """
+    flown = {
+        name: sample(_fly(scenario)) for name, scenario in scenarios() if not only or name in only
+    }
+    return Behaviour(flights=flown)
+
+
+def _fly(scenario: Scenario) -> FlownEpisode:
+    resolved = resolve(scenario)
+    if scenario.level == "lockstep":
+        return fly(resolved, resolved.fresh_policy(scenario.seed), 0, scenario.seed)
+    episodes = [PlannedEpisode(0, scenario.seed)]
+    # The twin leaves no logs: its flier does not look at the folder.
+    (flown,) = GymFlier(resolved).start(RunFolder(Path()), lambda: False)(episodes)
+    return flown
+
+
+def sample(flown: FlownEpisode) -> FlightSample:
+    """Return what is written down of a flight: from the start of navigation to the verdict."""
+    record, path = flown.record, flown.trajectory
+    start_us = record.started_us if record.navigation_us is None else record.navigation_us
+    times_us = np.arange(start_us, record.ended_us + 1, SAMPLE_EVERY_US)
+    columns = [np.interp(times_us, path.time_us, column) for column in path.position.T]
+    energy_j = None if record.quality is None else record.quality.total_energy_j
+    return FlightSample(
+        outcome=record.outcome.value,
+        time_s=round((record.ended_us - start_us) / US_PER_S, DECIMALS),
+        energy_j=round(energy_j or 0.0, DECIMALS),
+        positions=tuple(
+            # No -0.0: it would make another digest.
+            (round(north, DECIMALS) + 0.0, round(east, DECIMALS) + 0.0, round(down, DECIMALS) + 0.0)
+            for north, east, down in zip(*(column.tolist() for column in columns), strict=True)
+        ),
+    )
+
+
+def differences(stored: Behaviour, flown: Behaviour) -> tuple[Difference, ...]:
+    """Return the flights that differ by more than the tolerances, in the order of the names."""
+    found = []
+    for name in sorted({*stored.flights, *flown.flights}):
+        if name not in stored.flights or name not in flown.flights:
+            where = "flown now" if name in flown.flights else "stored"
+            found.append(Difference(name, f"only {where}"))
+        elif what := _difference(stored.flights[name], flown.flights[name]):
+            found.append(Difference(name, what))
+    return tuple(found)
+
+
+def _difference(stored: FlightSample, flown: FlightSample) -> str:
+    """Return what differs first in a flight; empty: nothing."""
+    a, b = np.array(stored.positions), np.array(flown.positions)
+    n = min(len(a), len(b))
+    away = np.linalg.norm(a[:n] - b[:n], axis=1)
+    beyond = np.flatnonzero(away > TOLERANCES["position_m"])
+    if len(beyond):
+        first = int(beyond[0])
+        return (
+            f"{1e3 * away[first]:.0f} mm apart {first * SAMPLE_EVERY_US / US_PER_S:g} s after its "
+            f"start, {1e3 * away.max():.0f} mm at most; the same: 10 mm"
+        )
+    if stored.outcome != flown.outcome:
+        return f"outcome {flown.outcome}, was {stored.outcome}"
+    if abs(stored.time_s - flown.time_s) > TOLERANCES["time_s"]:
+        return f"{flown.time_s:.3f} s, was {stored.time_s:.3f} s; the same: 0.02 s"
+    if abs(stored.energy_j - flown.energy_j) > TOLERANCES["energy_share"] * stored.energy_j:
+        return f"{flown.energy_j:.1f} J, was {stored.energy_j:.1f} J; the same: 0.1 %"
+    return ""
+
+
+def read_behaviour(path: Path) -> Behaviour:
+    """Read the samples that were written down.
+
+    Raises:
+        UsageError: They are missing or damaged, or do not fit the digest beside them.
+    """
+    data = read_json(path, SCHEMA, "behaviour")
+    found = validated(Behaviour, {"flights": data.get("flights")}, path)
+    if data.get("digest") != found.digest:
+        raise UsageError(f"{path}: digest {data.get('digest')}: accepted: {found.digest}")
+    return found
+
+
+def write_behaviour(path: Path, behaviour: Behaviour) -> None:
+    """Write samples down, whole or not at all, with their digest."""
+    data = {"schema": SCHEMA, "digest": behaviour.digest, **behaviour.model_dump(mode="json")}
+    write_json(path, data)
