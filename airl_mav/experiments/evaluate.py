@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
@@ -123,9 +124,12 @@ def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
             episodes=len(episodes),
             seed=asked.seed,
             success_rate=quality.success_rate.value or 0.0,
+            success_low=quality.success_rate.low,
+            success_high=quality.success_rate.high,
             flight_time_s=quality.flight_time_s.value,
             distance_m=quality.distance_m.value,
             energy_j=quality.energy_j.value,
+            flown_utc=utc_now().date().isoformat(),
         ),
     )
 

@@ -61,9 +61,19 @@ class MeasuredResult(ProfileModel):
     episodes: int = quantity("episodes flown", "1", ge=1)
     seed: Count = Field(description="seed of the first episode; each has the next")
     success_rate: float = quantity("share of episodes that reached the goal", "1", ge=0, le=1)
+    success_low: float | None = quantity(
+        "lower end of its 95 % interval (Wilson)", "1", ge=0, le=1, default=None
+    )
+    success_high: float | None = quantity(
+        "upper end of its 95 % interval (Wilson)", "1", ge=0, le=1, default=None
+    )
     flight_time_s: float | None = quantity("flight time", "s", ge=0, default=None)
     distance_m: float | None = quantity("distance flown", "m", ge=0, default=None)
     energy_j: float | None = quantity("energy drawn", "J", ge=0, default=None)
+    flown_utc: str | None = Field(default=None, description="when it was flown, ISO 8601")
+    behaviour: str | None = Field(
+        default=None, description="fingerprint of the flight behaviour that it was flown with"
+    )
 
 
 class PolicyFacts(ProfileModel):
