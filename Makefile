@@ -19,7 +19,7 @@ INTERPRETER := $(shell PYTHON='$(PYTHON)' scripts/find-python)
 
 .PHONY: help
 help:  ## Show the targets
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 define install
 	@test -n "$(INTERPRETER)" || { PYTHON='$(PYTHON)' scripts/find-python --explain; exit 1; }
@@ -64,6 +64,14 @@ test: $(ALL)  ## Everything CI checks
 .PHONY: docs
 docs: $(ALL)  ## Build the documentation site into site/ (no network needed)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+
+.PHONY: results
+results: $(ALL)  ## Fly again what is published and out of date (QUICK=1: few flights, unpublished)
+	$(BIN)/python scripts/results.py fly $(if $(QUICK),--quick)
+
+.PHONY: results-docs
+results-docs: $(ALL)  ## Write the figures of pages and cards from results/*.json
+	$(BIN)/python scripts/results.py docs
 
 .PHONY: bench
 bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")

@@ -1,0 +1,1 @@
+"""Published results: figures with what made them (docs/how-to/results.md)."""

@@ -1,0 +1,49 @@
+"""What is published: `results/results.toml`, one entry for each result."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Literal
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+from pydantic import Field
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel, validated
+from published.record import RESULTS
+
+DECLARED_FILE = RESULTS / "results.toml"
+
+Kind = Literal["gap", "matrix", "ladder", "degradation", "compare", "run"]
+
+
+class Declared(ProfileModel):
+    """A result: the command that flies it, and where its figures stand in what that leaves."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9-]*$", description="of results/<name>.json")
+    what: str = Field(description="one line for people")
+    command: str = Field(description="as a person types it; --out is added")
+    quick: str = Field(default="--episodes 20", description="what --quick adds to the command")
+    kind: Kind = Field(description="file of the comparison, or run: the folder is a single run")
+    within: tuple[str, ...] = Field(default=(".",), description="folders of comparisons, in --out")
+    cards: bool = Field(default=False, description="its runs go onto the cards of their policies")
+    minutes: float = Field(gt=0, description="on two cores, about")
+
+
+def read_declared(path: Path = DECLARED_FILE) -> dict[str, Declared]:
+    """Return what is published, by name, in its order. Raises UsageError."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"{path}: {error}") from None
+    entries = [validated(Declared, entry, path) for entry in data.get("result", ())]
+    names = [entry.name for entry in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"{path}: result {name}: accepted: each name once")
+    return {entry.name: entry for entry in entries}

@@ -1,0 +1,133 @@
+"""Pages and cards, written from the results.
+
+A page marks what is written into it:
+
+    <!-- results: gap-short -->
+    ...
+    <!-- end of results -->
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.policy.card import MeasuredResult, read_card, write_card
+from published.declared import read_declared
+from published.record import ROOT, FlownRun, Record
+from published.tables import block_of
+from published.text import made_line
+
+END = "<!-- end of results -->"
+MARKED = re.compile(
+    r"^(?P<indent> *)<!-- results: (?P<name>[a-z0-9-]+) -->\n.*?^ *" + END + "$", re.M | re.S
+)
+ALONE = re.compile(r"^ *<!-- (?:results:|end of results)", re.M)
+
+POLICIES = ROOT / "profiles" / "policies"
+
+
+def pages() -> list[Path]:
+    """Return the pages that may have marks."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def rendered(text: str, records: dict[str, Record], page: object) -> str:
+    """Return a page with its blocks written from the results.
+
+    Raises:
+        UsageError: A block or a result that it shows does not exist; a mark has no end.
+    """
+
+    def write(match: re.Match[str]) -> str:
+        return f"<!-- results: {match['name']} -->\n\n{body(match['name'], records, page)}\n\n{END}"
+
+    if len(ALONE.findall(text)) != 2 * len(MARKED.findall(text)):
+        raise UsageError(f"{page}: a mark of results without its end, or in another form")
+    return MARKED.sub(write, text)
+
+
+def body(name: str, records: dict[str, Record], page: object) -> str:
+    """Return what stands between the marks of a block: the table, then what flew it."""
+    found = block_of(name, records)
+    if found is None:
+        raise UsageError(f"{page}: results: {name}: no such block")
+    for record in found.records:
+        if record not in records:
+            raise UsageError(f"{page}: results: {name}: no results/{record}.json")
+    lines = [made_line(each, records[each].made) for each in found.records]
+    return "\n\n".join([found.render(records), "<br>\n".join(lines)])
+
+
+def shown(records: dict[str, Record]) -> set[str]:
+    """Return the names of the results that a page or a card shows."""
+    names = {
+        match["name"] for page in pages() for match in MARKED.finditer(page.read_text("utf-8"))
+    }
+    blocks = [block_of(name, records) for name in names]
+    on_cards = {entry.name for entry in read_declared().values() if entry.cards}
+    return on_cards | {record for each in blocks if each is not None for record in each.records}
+
+
+# --- cards
+
+
+def card_results(records: dict[str, Record]) -> dict[str, tuple[MeasuredResult, ...]]:
+    """Return what belongs on the cards, by policy: flights under its own rules, in any arena."""
+    found: dict[str, dict[tuple[str, str, str], MeasuredResult]] = {}
+    for entry in read_declared().values():
+        if not entry.cards or entry.name not in records:
+            continue
+        record = records[entry.name]
+        for run in record.runs.values():
+            if (POLICIES / run.policy).is_dir():
+                result = _result(run, record)
+                key = result.level, result.arena, result.latency or ""
+                found.setdefault(run.policy, {}).setdefault(key, result)
+    return {name: tuple(each[key] for key in sorted(each)) for name, each in found.items()}
+
+
+def _result(run: FlownRun, record: Record) -> MeasuredResult:
+    return MeasuredResult(
+        arena=run.arena,
+        level=run.level,
+        latency=run.latency,
+        episodes=run.success_rate.n,
+        seed=run.seed,
+        success_rate=run.success_rate.value or 0.0,
+        success_low=run.success_rate.low,
+        success_high=run.success_rate.high,
+        flight_time_s=run.flight_time_s.value,
+        distance_m=run.distance_m.value,
+        energy_j=run.energy_j.value,
+        flown_utc=record.made.date,
+        behaviour=record.made.behaviour,
+    )
+
+
+def stale_cards(records: dict[str, Record]) -> Iterator[tuple[Path, tuple[MeasuredResult, ...]]]:
+    """Yield the folder of each policy whose card says something else, and what it should say."""
+    for name, results in card_results(records).items():
+        if read_card(POLICIES / name).results != results:
+            yield POLICIES / name, results
+
+
+# --- writing
+
+
+def write_all(records: dict[str, Record]) -> list[Path]:
+    """Write pages and cards anew where they differ; return those. Raises UsageError."""
+    written = []
+    for page in pages():
+        text = page.read_text(encoding="utf-8")
+        new = rendered(text, records, page.relative_to(ROOT))
+        if new != text:
+            replace_file(page, new.encode())
+            written.append(page)
+    for folder, results in list(stale_cards(records)):
+        write_card(folder, read_card(folder).model_copy(update={"results": results}))
+        written.append(folder / "card.json")
+    return written

@@ -1,0 +1,446 @@
+"""The blocks of the pages: which results each shows, and how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from airl_mav.policy.registry import find_policy
+from airl_mav.profiles.published import (
+    PublishedRun,
+    PublishedTable,
+    load_published,
+    published_gap,
+)
+from published.record import MEASURES, Figure, FlownRun, Gap, Record
+from published.text import NONE, both, change, energy_kj, number, percent, rate, table
+
+Records = Mapping[str, Record]
+Render = Callable[[Records], str]
+
+DEFAULT, LATE = "static-obstacles", "static-obstacles-ras-pi-4"
+
+
+@dataclass(frozen=True)
+class Block:
+    """What stands between two marks of a page."""
+
+    records: tuple[str, ...]
+    """Names of the results that it shows."""
+    render: Render
+    """From those to Markdown."""
+
+
+BLOCKS: dict[str, Block] = {}
+"""By the name that the marks of a page give."""
+
+
+def block(name: str, *records: str) -> Callable[[Render], Render]:
+    """Declare the function that writes a block."""
+
+    def declare(render: Render) -> Render:
+        BLOCKS[name] = Block(records, render)
+        return render
+
+    return declare
+
+
+def block_of(name: str, records: Records) -> Block | None:
+    """Return a block of the pages; `printed-NAME` shows a result that is kept as printed."""
+    if name in BLOCKS:
+        return BLOCKS[name]
+    result = name.removeprefix("printed-")
+    if result == name or result not in records or records[result].printed is None:
+        return None
+    return Block((result,), _printed(result))
+
+
+def _printed(name: str) -> Render:
+    def render(records: Records) -> str:
+        printed = records[name].printed
+        assert printed is not None
+        rows = [[*row] for row in printed.rows]
+        return table(printed.columns, rows)
+
+    return render
+
+
+# --- the shipped policies
+
+SHIPPED: dict[str, tuple[str, str]] = {
+    "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
+    "static-obstacles-ppo": ("static-obstacles-ppo", "run"),
+    "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
+    "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
+    "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
+    "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
+    "crowded": ("generalisation", "crowded-crowded"),
+}
+"""Where the flights of each policy stand: in its own arena, as late as in its training."""
+
+_MAKERS = {"dqn": "double DQN", "ppo": "PPO"}
+_ACTIONS = {"arc-25": "arcs", "velocity": "continuous"}
+
+
+def _shipped(records: Records) -> list[tuple[str, FlownRun]]:
+    return [(name, records[record].runs[run]) for name, (record, run) in SHIPPED.items()]
+
+
+@block("policies-short", "generalisation", "static-obstacles-ppo", "gap")
+def policies_short(records: Records) -> str:
+    rows = []
+    for name, run in _shipped(records):
+        card = find_policy(name).card
+        assert card is not None
+        maker = _MAKERS[card.algorithm]
+        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
+        title = f"`{name}`" + (" (default)" if name == DEFAULT else "")
+        cells = (title, maker, f"`{run.arena}`{late}", f"{rate(run)} %")
+        rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
+    return table(("policy", "algorithm", "flown in", "success", "flight time"), rows)
+
+
+@block("policies", "generalisation", "static-obstacles-ppo", "gap")
+def policies(records: Records) -> str:
+    rows = []
+    for name, run in _shipped(records):
+        card = find_policy(name).card
+        assert card is not None
+        maker = f"{_MAKERS[card.algorithm]}, {_ACTIONS[card.actions.set]}"
+        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
+        rows.append(
+            (
+                f"`{name}`" + (" (default)" if name == DEFAULT else ""),
+                maker,
+                f"{card.hold_s:g} s",
+                f"`{run.arena}`{late}",
+                f"{rate(run)} %",
+                f"{number(run.flight_time_s, 2)} s",
+                f"{number(run.distance_m, 1)} m",
+                f"{energy_kj(run)} kJ",
+            )
+        )
+    heads = ("policy", "algorithm", "decides every", "flown in", "success", "time", "distance")
+    return table((*heads, "energy"), rows)
+
+
+# --- generalisation
+
+
+@block("generalisation-paper", "generalisation")
+def generalisation_paper(records: Records) -> str:
+    arenas = ("no-obstacles", "static-obstacles", "dynamic-obstacles")
+    runs, rows = records["generalisation"].runs, []
+    for trained in ("no-obstacles", "dynamic-obstacles"):
+        told = load_published().generalisation[trained]
+        rows.append((trained, "the paper", *(f"{told[arena]:g}" for arena in arenas)))
+        rows.append(("", "ours", *(rate(runs[f"{trained}-{arena}"]) for arena in arenas)))
+    return table(("trained in", "", *arenas), rows, 3)
+
+
+@block("generalisation", "generalisation")
+def generalisation(records: Records) -> str:
+    runs = records["generalisation"].runs
+    arenas = tuple(dict.fromkeys(run.arena for run in runs.values()))
+    rows = []
+    for policy in dict.fromkeys(run.policy for run in runs.values()):
+        own = find_policy(policy).card
+        trained = None if own is None else own.training.arena
+        cells = [number(runs[f"{policy}-{a}"].success_rate, 1, scale=100.0) for a in arenas]
+        cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
+        rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
+    return table(("policy", *arenas), rows, len(arenas))
+
+
+# --- the gap
+
+
+def _letters(records: Records) -> dict[str, FlownRun]:
+    roles = ("reference", "target", "mitigated", "training", "mitigated-reference")
+    runs = records["gap"].runs
+    return {letter: runs[f"{DEFAULT}-{role}"] for letter, role in zip("abcde", roles, strict=True)}
+
+
+def _gap(record: Record, target: str, reference: str, arena: str = DEFAULT) -> Gap:
+    return record.gaps[f"{arena}-{target} against {arena}-{reference}"]
+
+
+@block("gap-short", "gap")
+def gap_short(records: Records) -> str:
+    runs, record = _letters(records), records["gap"]
+    a = runs["a"]
+    first = (
+        f"{rate(a)} %",
+        f"{number(a.flight_time_s, 2)} s",
+        f"{number(a.distance_m, 1)} m",
+        f"{energy_kj(a)} kJ",
+        "",
+    )
+    rows: list[tuple[str, ...]] = [("default policy, workstation", *first)]
+    for title, run, gap in (
+        ("default policy, Raspberry Pi", runs["b"], _gap(record, "target", "reference")),
+        ("mitigated policy, Raspberry Pi", runs["c"], _gap(record, "mitigated", "reference")),
+    ):
+        rows.append((title, f"{rate(run)} %", *_changes(gap)))
+    trained = _gap(record, "mitigated", "training")
+    points = f"{both(trained.success_rate, 1, '+')} points"
+    rows.append(("... against the conditions of its own training", points, *_changes(trained)))
+    return table(("", "success", "flight time", "distance", "energy", "pairs"), rows)
+
+
+def _changes(gap: Gap) -> tuple[str, ...]:
+    figures = (gap.flight_time_s, gap.distance_m, gap.energy_j)
+    return (*(percent(each) for each in figures), f"{gap.flight_time_s.n}")
+
+
+@block("mitigation-runs", "gap")
+def mitigation_runs(records: Records) -> str:
+    runs = _letters(records)
+    told = _mitigation_paper().columns
+    columns = [told[role] for role in ("reference", "target", "mitigated", "training")]
+    ours = tuple(runs.values())
+    shown: tuple[tuple[str, Callable[[FlownRun], str], Callable[[PublishedRun], str]], ...] = (
+        ("t2, mean [ms]", lambda run: f"{run.t2_ms:.1f}", lambda told: f"{told.latency_ms:g}"),
+        ("success [%]", rate, lambda told: f"{told.success_percent:g}"),
+        (
+            "flight time [s]",
+            lambda run: number(run.flight_time_s, 2),
+            lambda told: f"{told.flight_time_s:.2f}",
+        ),
+        (
+            "distance [m]",
+            lambda run: number(run.distance_m, 2),
+            lambda told: f"{told.distance_m:.2f}",
+        ),
+        ("energy, vehicle [kJ]", energy_kj, lambda told: f"{told.energy_kj:.2f}"),
+    )
+    rows = [(title, *map(mine, ours), *map(theirs, columns)) for title, mine, theirs in shown]
+    return table(("", *runs, "paper a", "b", "c", "d"), rows, 9)
+
+
+_GAPS = (
+    ("without mitigation, reference undelayed (b, a)", "target", "reference"),
+    ("with mitigation, reference undelayed (c, a)", "mitigated", "reference"),
+    ("without mitigation, reference delay-trained (b, d)", "target", "training"),
+    ("with mitigation, reference delay-trained (c, d)", "mitigated", "training"),
+    ("mitigated policy where nothing is late (e, a)", "mitigated-reference", "reference"),
+)
+
+
+def _mitigation_paper() -> PublishedTable:
+    return next(t for t in load_published().tables if {"mitigated", "training"} <= {*t.columns})
+
+
+def _told(target: str, reference: str) -> tuple[str, ...]:
+    """Return a gap of the paper: as printed where it prints one, else from its columns (◦)."""
+    paper = _mitigation_paper()
+    worked_out = published_gap(paper.columns[reference], paper.columns[target])
+    own = [getattr(worked_out, field) for field in _GAP_FIELDS]
+    if reference != "training":
+        return ("the paper ◦", *(f"{value:+.{0 if i == 0 else 1}f}" for i, value in enumerate(own)))
+    printed = [getattr(paper.printed[target], field) for field in _GAP_FIELDS]
+    cells = [f"{printed[0]:g} ({own[0]:+.0f} points ◦)"]
+    for said, value in zip(printed[1:], own[1:], strict=True):
+        same = abs(said - value) < SAME_PERCENT
+        cells.append(f"{said:g}" if same else f"{said:g} ({value:+.1f} ◦)")
+    return ("the paper", *cells)
+
+
+_GAP_FIELDS = ("success", "flight_time_percent", "distance_percent", "energy_percent")
+SAME_PERCENT = 0.05
+"""Gaps closer than this [%] are the same as printed."""
+
+
+@block("mitigation-gaps", "gap")
+def mitigation_gaps(records: Records) -> str:
+    rows = []
+    for title, target, reference in _GAPS:
+        gap = _gap(records["gap"], target, reference)
+        cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)
+        rows.append((title, "ours", *cells, f"{gap.flight_time_s.n}"))
+        if {target, reference} <= {*_mitigation_paper().columns}:
+            rows.append(("", *_told(target, reference), ""))
+    heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]", "pairs")
+    return table(("gap", "", *heads), rows, 5)
+
+
+# --- system evaluation
+
+
+def _system(arena: str) -> Render:
+    def render(records: Records) -> str:
+        record = records["system"]
+        runs = [record.runs[f"{arena}-{role}"] for role in ("reference", "target")]
+        gap = _gap(record, "target", "reference", arena)
+        # The table of a network; the other one of its arena is of mitigation.
+        told = next(t for t in load_published().tables if t.arena == arena and t.policy)
+        paper, printed = told.columns, told.printed["target"]
+        a, b = paper["reference"], paper["target"]
+        rows = [
+            (
+                "t2 [ms]",
+                *(f"{run.t2_ms:.1f}" for run in runs),
+                f"{gap.t2_percent:+,.0f} %",
+                *(f"{each.latency_ms:g}" for each in (a, b)),
+                f"{printed.latency_percent:g} %",
+            ),
+            (
+                "success [%]",
+                *(rate(run) for run in runs),
+                f"{both(gap.success_rate, 1, '+')} points",
+                *(f"{each.success_percent:g}" for each in (a, b)),
+                f"{printed.success:g} points",
+            ),
+        ]
+        for title, field, digits, scale, theirs, printed_field in (
+            ("flight time [s]", "flight_time_s", 2, 1.0, "flight_time_s", "flight_time_percent"),
+            ("distance [m]", "distance_m", 2, 1.0, "distance_m", "distance_percent"),
+            ("energy, vehicle [kJ]", "energy_j", 2, 1e-3, "energy_kj", "energy_percent"),
+        ):
+            rows.append(
+                (
+                    title,
+                    *(number(getattr(run, field), digits, scale=scale) for run in runs),
+                    percent(getattr(gap, field)),
+                    *(f"{getattr(each, theirs):.2f}" for each in (a, b)),
+                    f"{getattr(printed, printed_field):g} %",
+                )
+            )
+        rows.append(("pairs", "", "", f"{gap.flight_time_s.n}", "", "", ""))
+        heads = (arena, "workstation", "Ras-Pi 4", "gap", "the paper: i9", "Ras-Pi 4", "gap")
+        return table(heads, rows, 6)
+
+    return render
+
+
+for _arena in ("no-obstacles", "static-obstacles", "dynamic-obstacles"):
+    block(f"system-{_arena}", "system")(_system(_arena))
+
+
+@block("hover", "hover-static", "hover-dynamic", "gap", "system")
+def hover(records: Records) -> str:
+    rows = []
+    for title, record, arena, halt in (
+        ("static-obstacles, 396 ms", "gap", "static-obstacles", "hover-static"),
+        ("dynamic-obstacles, 949 ms", "system", "dynamic-obstacles", "hover-dynamic"),
+    ):
+        runs = records[record].runs
+        on, still = runs[f"{arena}-target"], records[halt].runs["run"]
+        undelayed = runs[f"{arena}-reference"]
+        rows.append((f"{title}: success", *(f"{rate(run)} %" for run in (on, still, undelayed))))
+        for name, field, unit in (
+            ("flight time", "flight_time_s", "s"),
+            ("distance", "distance_m", "m"),
+        ):
+            share = _share(getattr(still, field), getattr(undelayed, field))
+            rows.append(
+                (
+                    name,
+                    f"{number(getattr(on, field), 2)} {unit}",
+                    f"{number(getattr(still, field), 2)} {unit} ({share})",
+                    f"{number(getattr(undelayed, field), 2)} {unit}",
+                )
+            )
+    return table(("Ras-Pi 4", "last command flies on", "hover after 60 ms", "undelayed"), rows, 3)
+
+
+def _share(figure: Figure, reference: Figure) -> str:
+    if figure.value is None or not reference.value:
+        return NONE
+    return f"{100.0 * (figure.value - reference.value) / reference.value:+.0f} %"
+
+
+# --- degradation
+
+_LATENCIES = (
+    ("1 ms", "native"),
+    ("150 ms", "150ms"),
+    ("300 ms", "300ms"),
+    ("400 ms", "400ms"),
+    ("950 ms", "950ms"),
+)
+
+
+@block("degradation", "degradation")
+def degradation(records: Records) -> str:
+    record, paper = records["degradation"], load_published().degradation
+    told = {f"{each.latency_ms:g} ms": each for each in paper}
+    first, rows = paper[0], []
+    for late, name in _LATENCIES:
+        if late == "1 ms" or late in told:
+            theirs = first if late == "1 ms" else told[late]
+            rows.append((f"{theirs.latency_ms:g} ms", "the paper", "", *_theirs(theirs, first)))
+        run = record.runs[f"{DEFAULT}-{name}"]
+        figures = (
+            f"{number(run.flight_time_s, 2)} s",
+            f"{number(run.distance_m, 2)} m",
+            f"{energy_kj(run)} kJ",
+        )
+        if name == "native":
+            rows.append((late, "ours", f"{rate(run)} %", *figures, ""))
+            continue
+        gap = record.gaps[f"{DEFAULT}-{name} against {DEFAULT}-native"]
+        *changes, pairs = _changes(gap)
+        cells = (f"{f}, {c}" for f, c in zip(figures, changes, strict=True))
+        rows.append(("" if late in told else late, "ours", f"{rate(run)} %", *cells, pairs))
+    heads = ("success", "flight time", "distance", "energy", "pairs")
+    return table(("t2", "", *heads), rows, 5)
+
+
+def _theirs(each: PublishedRun, first: PublishedRun) -> tuple[str, ...]:
+    cells = []
+    for field, unit in (("flight_time_s", "s"), ("distance_m", "m"), ("energy_kj", "kJ")):
+        more = "" if each is first else f" ({change(each, first, field):+.0f} % ◦)"
+        cells.append(f"{getattr(each, field):.2f} {unit}{more}")
+    return (*cells, "")
+
+
+# --- levels
+
+
+@block("ladder", "ladder")
+def ladder(records: Records) -> str:
+    record = records["ladder"]
+    (gap,) = record.gaps.values()
+    return levels_table(record, (("", gap),))
+
+
+def levels_table(record: Record, parts: tuple[tuple[str, Gap], ...]) -> str:
+    """Return the runs of two levels side by side, and their differences."""
+    rows = []
+    for title, gap in parts:
+        reference, target = record.runs[gap.reference], record.runs[gap.target]
+        head = f"{title}: " if title else ""
+        rows.append(
+            (
+                f"{head}success",
+                *(f"{rate(run)} %" for run in (reference, target)),
+                f"{number(gap.success_rate, 1, '+')} points",
+                interval(gap.success_rate),
+            )
+        )
+        for name, field, unit, scale in (
+            ("flight time", "flight_time_s", "s", 1.0),
+            ("distance", "distance_m", "m", 1.0),
+            ("energy", "energy_j", "kJ", 1e-3),
+        ):
+            change_of: Figure = getattr(gap, field)
+            rows.append(
+                (
+                    name,
+                    *(
+                        f"{number(getattr(r, field), 2, scale=scale)} {unit}"
+                        for r in (reference, target)
+                    ),
+                    f"{number(change_of, 1, '+')} %",
+                    interval(change_of),
+                )
+            )
+    return table(("same seeds", "gym", "lockstep", "difference", "95 % interval"), rows)
+
+
+def interval(figure: Figure) -> str:
+    """Return an interval in a cell of its own."""
+    if figure.low is None or figure.high is None:
+        return NONE
+    return f"{figure.low:+.1f} … {figure.high:+.1f}"

@@ -1,0 +1,70 @@
+"""Figures as text, as the pages print them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+
+from airl_mav.profiles.published import PublishedRun
+from published.record import Figure, FlownRun, Made, out_of_date
+
+NONE = "–"
+
+
+def interval(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str:
+    """Return a figure's interval in brackets, after a space; empty where it has none."""
+    if figure.low is None or figure.high is None:
+        return ""
+    low, high = (_rounded(scale * end, digits, sign) for end in (figure.low, figure.high))
+    return f" [{low}, {high}]"
+
+
+def number(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str:
+    """Return a figure without its interval."""
+    return NONE if figure.value is None else _rounded(scale * figure.value, digits, sign)
+
+
+def both(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str:
+    """Return a figure with its interval in brackets."""
+    return number(figure, digits, sign, scale) + interval(figure, digits, sign, scale)
+
+
+def rate(run: FlownRun) -> str:
+    """Return a success rate in percent; every rate is printed with its interval."""
+    return both(run.success_rate, 1, scale=100.0)
+
+
+def percent(figure: Figure) -> str:
+    """Return a relative difference with its interval."""
+    return f"{both(figure, 1, '+')} %"
+
+
+def energy_kj(run: FlownRun) -> str:
+    """Return the vehicle's energy [kJ]."""
+    return number(run.energy_j, 2, scale=1e-3)
+
+
+def change(target: PublishedRun, reference: PublishedRun, field: str) -> float:
+    """Return by how much a figure of the paper differs [%]."""
+    first, second = getattr(reference, field), getattr(target, field)
+    return float(100.0 * (second - first) / first)
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 0) -> str:
+    """Return a table as Markdown; the last `numbers` columns are set right."""
+    rules = ["---"] * (len(columns) - numbers) + ["---:"] * numbers
+    lines = [columns, rules, *rows]
+    return "\n".join(re.sub(" +", " ", f"| {' | '.join(line)} |") for line in lines)
+
+
+def made_line(name: str, made: Made) -> str:
+    """Return the line under a table: what flew it, and whether today's code would fly it so."""
+    commit = f"commit {made.commit[:7]}" if made.commit else f"version {made.version}"
+    line = f"`{made.command}` · {made.date}, {commit}, {made.cpu} · `results/{name}.json`"
+    stale = out_of_date(made)
+    return f"{line} · **{stale}**" if stale else line
+
+
+def _rounded(value: float, digits: int, sign: str) -> str:
+    """Return a number in decimals; what was rounded to zero keeps its sign."""
+    return f"{value:{sign},.{digits}f}"

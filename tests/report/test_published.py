@@ -1,0 +1,184 @@
+"""Published figures are those of results/*.json, and say so when the code has moved on."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from airl_mav.core.errors import UsageError
+from airl_mav.experiments.evaluate import evaluate
+from airl_mav.experiments.fly import rehearse
+from airl_mav.flight.statistics import aggregate
+from airl_mav.policy.card import load_card
+from airl_mav.scenario.model import Scenario
+from published import coverage, flying, pages, record, tables
+from published.collect import collect
+from published.declared import Declared, read_declared
+from published.record import Made, Record
+from tests.support.processes import ROOT
+
+
+@pytest.fixture(scope="module")
+def records() -> dict[str, Record]:
+    return record.all_records()
+
+
+@pytest.mark.parametrize("page", pages.pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_are_written_from_the_results(page: Path, records: dict[str, Record]) -> None:
+    """Where one is not: make results-docs."""
+    text = page.read_text(encoding="utf-8")
+    assert pages.rendered(text, records, page) == text
+
+
+def test_cards_are_written_from_the_results(records: dict[str, Record]) -> None:
+    assert [folder.name for folder, _ in pages.stale_cards(records)] == []
+    for policy in record.shipped_policies():
+        card = load_card(pages.POLICIES / policy)
+        own = [each for each in card.results if each.arena == card.training.arena]
+        assert own, policy
+        assert all(each.success_low is not None for each in card.results), policy
+
+
+def test_results_are_shown_and_every_table_of_figures_is_known(
+    records: dict[str, Record],
+) -> None:
+    assert set(records) - pages.shown(records) == set()
+    assert coverage.unknown_tables() == []
+    assert coverage.listed_in_vain() == []
+
+
+def test_declared_results_are_there(records: dict[str, Record]) -> None:
+    for name, declared in read_declared().items():
+        assert records[name].runs, name
+        assert records[name].made.command == declared.command
+
+
+# --- what is older says so
+
+
+def test_an_older_behaviour_is_said_under_its_tables(records: dict[str, Record]) -> None:
+    today = records["gap"]
+    older = today.model_copy(update={"made": today.made.model_copy(update={"behaviour": "0" * 16})})
+    text = "<!-- results: gap-short -->\n<!-- end of results -->"
+    assert "before today" not in pages.rendered(text, records, "page")
+    said = pages.rendered(text, {**records, "gap": older}, "page")
+    assert "**Flown on 2026-11-22 with version 0.2.0, before today's flight behaviour.**" in said
+    # The figures are the same: only what is said of them differs.
+    assert said.split("`airl gap")[0] == pages.rendered(text, records, "page").split("`airl gap")[0]
+
+
+def test_another_file_of_a_policy_is_out_of_date(records: dict[str, Record]) -> None:
+    made = records["gap"].made
+    retrained = made.model_copy(update={"policies": {"static-obstacles": "0" * 64}})
+    assert record.out_of_date(made) == ""
+    assert "another file of `static-obstacles`" in record.out_of_date(retrained)
+
+
+def test_printed_tables_without_a_fingerprint_are_marked(records: dict[str, Record]) -> None:
+    without = [each for each in records.values() if each.made.behaviour is None]
+    assert without
+    for each in without:
+        assert "before today's flight behaviour" in record.out_of_date(each.made)
+
+
+# --- marks
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<!-- results: gap-short -->",
+        "<!-- results: no-such-block -->\n<!-- end of results -->",
+        "a word <!-- results: gap-short -->\n<!-- end of results -->",
+        "<!-- end of results -->",
+    ],
+)
+def test_marks_that_cannot_be_written_are_refused(text: str, records: dict[str, Record]) -> None:
+    with pytest.raises(UsageError, match="page"):
+        pages.rendered(text, records, "page")
+
+
+# --- flying
+
+
+@pytest.fixture(autouse=True)
+def _no_page(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    from airl_mav.report.comparison import show
+
+    with monkeypatch.context() as patch:
+        patch.setattr(show, "write_document", lambda made, folder: folder / f"{made.name}.html")
+        yield
+
+
+def declare(command: str, kind: str, **more: object) -> Declared:
+    return Declared.model_validate(
+        {"name": "x", "what": "a test", "command": command, "kind": kind, "minutes": 1, **more}
+    )
+
+
+def test_a_run_is_collected_as_it_was_flown(tmp_path: Path) -> None:
+    run = rehearse(Scenario(level="gym", episodes=8, latency="150ms"), out=tmp_path / "run")
+    found = collect(declare("airl evaluate", "run"), tmp_path / "run", "f" * 16)
+    flown, rate = found.runs["run"], aggregate(run.episodes).success_rate
+    assert (flown.policy, flown.arena, flown.latency) == (
+        "static-obstacles",
+        "static-obstacles",
+        "150ms",
+    )
+    assert flown.success_rate.n == 8
+    assert flown.success_rate.value == rate.value
+    assert flown.success_rate.low == pytest.approx(rate.low)
+    assert flown.t2_ms == pytest.approx(150.0)
+    assert set(found.made.policies) == {"static-obstacles"}
+    assert found.made.behaviour == "f" * 16
+    record.write_record(found, tmp_path)
+    assert record.read_record("x", tmp_path) == found
+
+
+def test_a_table_of_runs_is_collected_and_shown(tmp_path: Path) -> None:
+    result = evaluate(
+        Scenario(level="gym", episodes=6),
+        ["greedy", "static-obstacles"],
+        ["no-obstacles", "crowded"],
+        out=tmp_path / "matrix",
+    )
+    found = collect(declare("airl evaluate", "matrix"), tmp_path / "matrix", None)
+    assert list(found.runs) == list(result.runs)
+    shown = tables.generalisation({"generalisation": found})
+    assert "| `greedy` (classical) |" in shown
+    for name, run in result.runs.items():
+        assert found.runs[name].success_rate.value == pytest.approx(run.quality.success_rate.value)
+    with pytest.raises(UsageError, match="no hardware gap here"):
+        collect(declare("airl gap", "gap"), tmp_path / "matrix", None)
+
+
+def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flying, "RUNS", tmp_path / "runs")
+    monkeypatch.setattr(flying, "RESULTS", tmp_path / "results")
+    declared = declare(
+        "airl evaluate greedy --episodes 50 --arena no-obstacles", "run", quick="--episodes 4"
+    )
+    path = flying.fly_result(declared, quick=True)
+    assert path == tmp_path / "runs" / "quick" / "x.json"
+    assert record.read_record("x", path.parent).runs["run"].success_rate.n == 4
+    assert not (tmp_path / "results").exists()
+
+
+def test_what_must_be_flown_again_is_known(tmp_path: Path, records: dict[str, Record]) -> None:
+    declared = read_declared()["gap"]
+    assert flying.why_out_of_date(declared, tmp_path) == "Not flown yet."
+    shutil.copy(record.file_of("gap"), tmp_path)
+    assert flying.why_out_of_date(declared, tmp_path) == ""
+    other = declared.model_copy(update={"command": "airl gap --episodes 7"})
+    assert "another command" in flying.why_out_of_date(other, tmp_path)
+    older: Made = records["gap"].made.model_copy(update={"behaviour": None})
+    record.write_record(records["gap"].model_copy(update={"made": older}), tmp_path)
+    assert "before today" in flying.why_out_of_date(declared, tmp_path)
+
+
+def test_commands_of_other_programs_are_refused() -> None:
+    with pytest.raises(UsageError, match="accepted: airl"):
+        flying.fly_result(declare("rm -r x", "run"), quick=False)
