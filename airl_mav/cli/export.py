@@ -5,13 +5,17 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.policy.card import CARD_FILE, ONNX_FILE
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.quantisation import export_int8
+from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
+from airl_mav.policy.registry import find_policy
 from airl_mav.training.export_request import ExportRequest
 
 
@@ -25,6 +29,7 @@ class ExportOptions(ExportRequest):
 
     Examples:
         airl export model.zip --algorithm PPO --out policies/mine --image 32x24 --actions arc-25
+        airl export static-obstacles --int8 --out policies/static-obstacles-int8
     """
 
     model: Annotated[Path, POSITIONAL] = Field(
@@ -51,17 +56,45 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
     Nothing was written then.
     """
     console = console or Console()
-    facts = options.facts(shlex.join(["airl", *sys.argv[1:]]))
-    # Imported late: torch takes seconds, and a wrong option is found without it.
-    from airl_mav.training.export import export
-
-    card = export(
-        options.model, options.algorithm, facts, options.out, with_torch=options.with_torch
-    )
+    card = _export_int8(options) if options.int8 else _export(options, options.out)
     for line in (
         f"{options.out / ONNX_FILE}  {card.network}",
         f"{options.out / CARD_FILE}  {card.parameters:,} parameters, "
         f"{card.macs:,} multiply-accumulates, SHA-256 {card.sha256[:12]}...",
     ):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
+    if (made := card.quantisation) is not None:
+        same = "" if made.agreement is None else f"{100.0 * made.agreement:.1f} % of actions same, "
+        console.print(
+            f"8-bit integers: {same}outputs off by {100.0 * made.error:.1f} % of their spread, on "
+            f"{made.checked} frames; airl evaluate and airl profile say what that does in flight",
+            soft_wrap=True,
+            highlight=False,
+        )
     return 0
+
+
+def _export(options: ExportOptions, out: Path) -> PolicyCard:
+    """Export a model in floats."""
+    if options.algorithm is None:
+        raise FieldError("algorithm", accepted="the class that wrote the model: DQN, PPO, A2C, ...")
+    facts = options.facts(shlex.join(["airl", *sys.argv[1:]]))
+    # Imported late: torch takes seconds, and a wrong option is found without it.
+    from airl_mav.training.export import export
+
+    return export(options.model, options.algorithm, facts, out, with_torch=options.with_torch)
+
+
+def _export_int8(options: ExportOptions) -> PolicyCard:
+    """Export a model, or take a policy that is there, and write it in 8-bit integers."""
+    if options.with_torch:
+        raise FieldError("with_torch", problem="not with --int8: policy.pt2 would be in floats")
+    if options.model.is_file():
+        with TemporaryDirectory(prefix="airl-export-") as scratch:
+            folder = Path(scratch) / options.policy_name
+            _export(options, folder)
+            return export_int8(folder, options.out, name=options.policy_name)
+    found = find_policy(str(options.model))
+    if found.folder is None:
+        raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
+    return export_int8(found.folder, options.out, name=options.policy_name)

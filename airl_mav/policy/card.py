@@ -110,6 +110,28 @@ class PolicyFacts(ProfileModel):
         return self
 
 
+class Quantisation(ProfileModel):
+    """How a network in 8-bit integers was made from one in floats."""
+
+    method: str = Field(description="what was quantised, and how the ranges were found")
+    source_sha256: Digest = Field(description=f"SHA-256 digest of the {ONNX_FILE} in floats")
+    arena: str = Field(description="arena profile of the calibration's frames")
+    first_seed: Count = Field(description="first seed of those flights; no evaluation uses it")
+    last_seed: Count = Field(description="last seed of those flights")
+    frames: int = quantity("frames that the ranges come from", "1", ge=1)
+    checked: int = quantity("other frames on which both were compared", "1", ge=1)
+    agreement: float | None = quantity(
+        "share of those on which both choose the same action; none: continuous actions",
+        "1",
+        ge=0,
+        le=1,
+        default=None,
+    )
+    error: float = quantity(
+        "root mean square of the difference of the outputs, in shares of their spread", "1", ge=0
+    )
+
+
 class PolicyCard(PolicyFacts):
     """All of the card."""
 
@@ -120,6 +142,9 @@ class PolicyCard(PolicyFacts):
     network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
+    quantisation: Quantisation | None = Field(
+        default=None, description="of a network in 8-bit integers; none: one in floats"
+    )
 
 
 def digest(data: bytes) -> str:

@@ -21,9 +21,14 @@ from airl_mav.scenario.model import PilotSettings
 class ExportRequest(BaseModel):
     """A model, and what cannot be read from it."""
 
-    model: Path = Field(description="the .zip that the model's `save` wrote")
-    algorithm: str = Field(
-        description="class that wrote it, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C, ..."
+    model: Path = Field(
+        description="the .zip that the model's `save` wrote; with --int8 also a policy, by its"
+        " name or folder"
+    )
+    algorithm: str | None = Field(
+        default=None,
+        description="class that wrote it, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C, ...;"
+        " not for a policy",
     )
     out: Path = Field(description="folder to write policy.onnx and card.json to")
     name: str | None = Field(
@@ -66,6 +71,15 @@ class ExportRequest(BaseModel):
     with_torch: bool = Field(
         default=False, description="also write policy.pt2, for the torch runtime"
     )
+    int8: bool = Field(
+        default=False,
+        description="write a network in 8-bit integers, calibrated with frames of its own flights",
+    )
+
+    @property
+    def policy_name(self) -> str:
+        """Short name of the policy that is written."""
+        return self.name if self.name is not None else self.out.resolve().name
 
     def facts(self, command: str) -> PolicyFacts:
         """Return what is said about the policy; `command` made it. Raises UsageError."""
@@ -79,7 +93,7 @@ class ExportRequest(BaseModel):
             include={"description", "hold_s", "goal_radius_m", "altitude_m", "hover_after_s"}
             | {"algorithm", "epsilon"}
         ) | {
-            "name": self.name if self.name is not None else self.out.resolve().name,
+            "name": self.policy_name,
             "observation": _observation(self.image, image | camera),
             "actions": validated(ActionSpec, speed),
             "training": Training(

@@ -1,0 +1,173 @@
+"""A policy in 8-bit integers: calibrated with frames of its own flights, compared, and its card."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.core.streams import Stream, stream
+from airl_mav.envs.evaluation import LearnedPilots, fly_seeds
+from airl_mav.envs.navigation import Navigation
+from airl_mav.experiments.gap import training_environment
+from airl_mav.experiments.gym_flier import environment_of
+from airl_mav.policy.action_sets import discrete_actions
+from airl_mav.policy.card import (
+    ONNX_FILE,
+    TORCH_FILE,
+    PolicyCard,
+    Quantisation,
+    digest,
+    load_card,
+    open_model,
+    read_model,
+    write_card,
+)
+from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.observation import Observation
+from airl_mav.policy.quantised import METHOD, quantised, relative_error
+from airl_mav.policy.runtime import OnnxRuntime
+from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
+from airl_mav.scenario.piloting import action_generator
+from airl_mav.scenario.resolve import resolve
+
+FIRST_SEED = 900_000
+"""Evaluations fly from 1 on, the choice of the best weights from 500,000 on, training from
+1,000,000 on."""
+
+FLIGHTS = 200
+FRAMES, CHECKED = 512, 512
+"""Drawn from all frames of the flights: for the ranges, and for the comparison."""
+
+
+@dataclass
+class _Witness:
+    """A network that decides for all vehicles, and keeps what it saw. Implements `Pilots`."""
+
+    pilots: LearnedPilots
+    policy: LearnedPolicy
+    seen: list[Encoded] = field(default_factory=list)
+
+    def begin(self, slot: int, seed: int) -> None:
+        self.pilots.begin(slot, seed)
+
+    def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
+        encoded = encode_layout(self.policy.card.observation, seen)
+        self.seen.append({key: array[flying].copy() for key, array in encoded.items()})
+        return self.pilots.decide(seen, flying)
+
+
+def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
+    """Fly a policy in the arena of its training, on seeds that no evaluation uses.
+
+    Args:
+        folder: The policy.
+        flights: Number of flights, in the batch twin.
+
+    Returns:
+        All that its network saw, (n, ...) each; the arena; the last seed.
+
+    Raises:
+        UsageError: The policy cannot be flown there.
+    """
+    card = load_card(folder)
+    arena = card.training.arena or DEFAULT_ARENA
+    environment = training_environment(card) or {}
+    asked: dict[str, Any] = {"arena": arena, "seed": FIRST_SEED, "episodes": flights}
+    if "vehicle" in environment:
+        # Its camera fits the network.
+        asked["vehicle"] = environment["vehicle"]
+    scenario = resolve(Scenario(level="gym", policy=str(folder), **asked))
+    loaded = scenario.fresh_policy(FIRST_SEED)
+    assert isinstance(loaded, LearnedPolicy)  # noqa: S101 (it has a card)
+    witness = _Witness(LearnedPilots(loaded, action_generator), loaded)
+    navigation = Navigation(
+        environment_of(scenario),
+        min(scenario.scenario.slots, flights),
+        vehicle=scenario.vehicle,
+        arena=scenario.arena,
+        injection=scenario.injection,
+        computer_w=scenario.computer.onboard_watts,
+    )
+    for _ in fly_seeds(navigation, witness, list(scenario.seeds)):
+        pass
+    keys = witness.seen[0]
+    frames = {key: np.concatenate([each[key] for each in witness.seen]) for key in keys}
+    return frames, Path(arena).stem, scenario.seeds[-1]
+
+
+def export_int8(
+    source: Path, out: Path, *, name: str | None = None, flights: int = FLIGHTS
+) -> PolicyCard:
+    """Write a policy in 8-bit integers, with its card, and return the card.
+
+    The results of the policy in floats are not its own: the card has none until it is evaluated.
+
+    Args:
+        source: Folder of the policy in floats.
+        out: Folder to write policy.onnx and card.json to; made if need be.
+        name: Short name of the policy; None: that of the source with `-int8`.
+        flights: Number of flights that the frames are drawn from.
+
+    Raises:
+        UsageError: The policy is one in integers already, cannot be flown or quantised, or `out`
+            is the source or cannot be written. Nothing usable was written then.
+    """
+    card = load_card(source)
+    if card.quantisation is not None:
+        raise UsageError(f"{source}: accepted: a policy in floats; this one is in 8-bit integers")
+    if out.resolve() == source.resolve():
+        raise UsageError(f"{out}: accepted: another folder than that of the policy in floats")
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: not a folder")
+    frames, arena, last_seed = frames_of(source, flights=flights)
+    chosen = stream(FIRST_SEED, Stream.CAMERA).permutation(len(next(iter(frames.values()))))
+    ranges, checked = chosen[:FRAMES], chosen[FRAMES : FRAMES + CHECKED]
+    if not len(checked):
+        raise UsageError(f"{len(chosen)} frames in {flights} flights; accepted: more than {FRAMES}")
+    model = quantised(read_model(source, card), _at(frames, ranges))
+    wanted = open_model(source, card).infer(_at(frames, checked))
+    try:
+        found = OnnxRuntime(model, card.observation, card.actions).infer(_at(frames, checked))
+    except ValueError as error:
+        raise UsageError(f"the network in integers: {error}") from None
+    same = None
+    if discrete_actions(card.actions) is not None:
+        same = float(np.mean(found.argmax(axis=1) == wanted.argmax(axis=1)))
+    facts: dict[str, Any] = {
+        "name": name or f"{card.name}-int8",
+        "description": f"{card.description or card.name}, in 8-bit integers",
+        "results": (),
+        "sha256": digest(model),
+        "torch_sha256": None,
+        "quantisation": Quantisation(
+            method=METHOD,
+            source_sha256=card.sha256,
+            arena=arena,
+            first_seed=FIRST_SEED,
+            last_seed=last_seed,
+            frames=len(ranges),
+            checked=len(checked),
+            agreement=same,
+            error=relative_error(found, wanted),
+        ),
+    }
+    card = PolicyCard.model_validate({**dict(card), **facts})
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        replace_file(out / ONNX_FILE, model)
+        write_card(out, card)
+        (out / TORCH_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}") from None
+    return card
+
+
+def _at(frames: Encoded, rows: NDArray[np.int64]) -> Encoded:
+    return {key: array[rows] for key, array in frames.items()}

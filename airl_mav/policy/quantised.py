@@ -1,0 +1,110 @@
+"""Networks in 8-bit integers: static quantisation of an ONNX model by ONNX Runtime's own tool."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.errors import UsageError
+from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.runtime import first_line
+
+METHOD = (
+    "static, QDQ: activations uint8, weights int8 by channel, ranges by least and greatest value; "
+    "the last layer in floats"
+)
+"""What a card says of it."""
+
+
+_DENSE = ("Gemm", "MatMul")
+"""Operators of dense layers."""
+
+
+def quantised(model: bytes, frames: Encoded) -> bytes:
+    """Return a network whose convolutions and dense layers compute in 8-bit integers.
+
+    Inputs and outputs stay what they are. The last dense layer stays in floats: it is small, and
+    with it in integers scores that lie close together change places. The graph has a pair of
+    QuantizeLinear and DequantizeLinear around each tensor (QDQ), which ONNX Runtime fuses where
+    the processor has integer kernels.
+
+    Args:
+        model: The bytes of an .onnx file that holds its weights.
+        frames: The arrays of the layout, with the rows that the ranges are found with.
+
+    Raises:
+        UsageError: onnx is not installed, or its tools cannot quantise the network.
+    """
+    try:
+        import onnx
+        from onnxruntime import quantization
+        from onnxruntime.quantization.shape_inference import quant_pre_process
+    except ImportError:
+        raise UsageError("onnx is not installed; pip install 'airl-mav[profile]'") from None
+
+    class Rows(quantization.CalibrationDataReader):  # type: ignore[misc] # untyped
+        """Gives the frames one by one: the least memory, and any number of rows."""
+
+        def __init__(self) -> None:
+            self._rows = _rows(frames)
+
+        def get_next(self) -> Mapping[str, NDArray[Any]] | None:
+            return next(self._rows, None)
+
+    with tempfile.TemporaryDirectory(prefix="airl-int8-") as scratch, _quiet():
+        floats, shaped, written = (
+            Path(scratch) / f"{name}.onnx" for name in ("floats", "shaped", "int8")
+        )
+        floats.write_bytes(model)
+        try:
+            quant_pre_process(floats, shaped, skip_symbolic_shape=True)
+            dense = [node.name for node in onnx.load(shaped).graph.node if node.op_type in _DENSE]
+            quantization.quantize_static(
+                shaped,
+                written,
+                Rows(),
+                quant_format=quantization.QuantFormat.QDQ,
+                activation_type=quantization.QuantType.QUInt8,
+                weight_type=quantization.QuantType.QInt8,
+                per_channel=True,
+                nodes_to_exclude=dense[-1:],
+                calibrate_method=quantization.CalibrationMethod.MinMax,
+            )
+            data: bytes = onnx.load(written).SerializeToString(deterministic=True)
+        except Exception as error:  # Anything, from an unknown operator to a model that is broken.
+            raise UsageError(f"the network cannot be quantised: {first_line(error)}") from error
+    return data
+
+
+def relative_error(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
+    """Return the root mean square of the differences of outputs (n, k), in shares of their spread.
+
+    The spread is the standard deviation of all that is wanted; outputs that are all the same have
+    none, and any difference of theirs is infinitely large.
+    """
+    away = float(np.sqrt(np.mean((found - wanted) ** 2)))
+    spread = float(wanted.std())
+    return away / spread if spread else (np.inf if away else 0.0)
+
+
+def _rows(frames: Encoded) -> Iterator[Mapping[str, NDArray[Any]]]:
+    for i in range(len(next(iter(frames.values())))):
+        yield {key: array[i : i + 1] for key, array in frames.items()}
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence the tool's advice on models that were not prepared."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
