@@ -16,9 +16,10 @@ from pathlib import Path
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import MeasuredResult, read_card, write_card
+from published import tables_gap, tables_levels, tables_policies
+from published.blocks import block_of
 from published.declared import read_declared
 from published.record import ROOT, FlownRun, Record
-from published.tables import block_of
 from published.text import made_line
 
 END = "<!-- end of results -->"
@@ -28,6 +29,9 @@ MARKED = re.compile(
 ALONE = re.compile(r"^ *<!-- (?:results:|end of results)", re.M)
 
 POLICIES = ROOT / "profiles" / "policies"
+
+TABLES = (tables_gap, tables_levels, tables_policies)
+"""Imported, they have declared their blocks."""
 
 
 def pages() -> list[Path]:

@@ -14,7 +14,7 @@ from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import load_card
 from airl_mav.scenario.model import Scenario
-from published import coverage, flying, pages, record, tables
+from published import coverage, flying, pages, record, tables_policies
 from published.collect import collect
 from published.declared import Declared, read_declared
 from published.record import Made, Record
@@ -147,7 +147,7 @@ def test_a_table_of_runs_is_collected_and_shown(tmp_path: Path) -> None:
     )
     found = collect(declare("airl evaluate", "matrix"), tmp_path / "matrix", None)
     assert list(found.runs) == list(result.runs)
-    shown = tables.generalisation({"generalisation": found})
+    shown = tables_policies.generalisation({"generalisation": found})
     assert "| `greedy` (classical) |" in shown
     for name, run in result.runs.items():
         assert found.runs[name].success_rate.value == pytest.approx(run.quality.success_rate.value)

@@ -1,156 +1,18 @@
-"""The blocks of the pages: which results each shows, and how."""
+"""Tables of the hardware gap: with mitigation, in three arenas, by growing latency."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 
-from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import (
     PublishedRun,
     PublishedTable,
     load_published,
     published_gap,
 )
+from published.blocks import DEFAULT, Records, Render, block
 from published.record import MEASURES, Figure, FlownRun, Gap, Record
 from published.text import NONE, both, change, energy_kj, number, percent, rate, table
-
-Records = Mapping[str, Record]
-Render = Callable[[Records], str]
-
-DEFAULT, LATE = "static-obstacles", "static-obstacles-ras-pi-4"
-
-
-@dataclass(frozen=True)
-class Block:
-    """What stands between two marks of a page."""
-
-    records: tuple[str, ...]
-    """Names of the results that it shows."""
-    render: Render
-    """From those to Markdown."""
-
-
-BLOCKS: dict[str, Block] = {}
-"""By the name that the marks of a page give."""
-
-
-def block(name: str, *records: str) -> Callable[[Render], Render]:
-    """Declare the function that writes a block."""
-
-    def declare(render: Render) -> Render:
-        BLOCKS[name] = Block(records, render)
-        return render
-
-    return declare
-
-
-def block_of(name: str, records: Records) -> Block | None:
-    """Return a block of the pages; `printed-NAME` shows a result that is kept as printed."""
-    if name in BLOCKS:
-        return BLOCKS[name]
-    result = name.removeprefix("printed-")
-    if result == name or result not in records or records[result].printed is None:
-        return None
-    return Block((result,), _printed(result))
-
-
-def _printed(name: str) -> Render:
-    def render(records: Records) -> str:
-        printed = records[name].printed
-        assert printed is not None
-        rows = [[*row] for row in printed.rows]
-        return table(printed.columns, rows)
-
-    return render
-
-
-# --- the shipped policies
-
-SHIPPED: dict[str, tuple[str, str]] = {
-    "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
-    "static-obstacles-ppo": ("static-obstacles-ppo", "run"),
-    "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
-    "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
-    "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
-    "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
-    "crowded": ("generalisation", "crowded-crowded"),
-}
-"""Where the flights of each policy stand: in its own arena, as late as in its training."""
-
-_MAKERS = {"dqn": "double DQN", "ppo": "PPO"}
-_ACTIONS = {"arc-25": "arcs", "velocity": "continuous"}
-
-
-def _shipped(records: Records) -> list[tuple[str, FlownRun]]:
-    return [(name, records[record].runs[run]) for name, (record, run) in SHIPPED.items()]
-
-
-@block("policies-short", "generalisation", "static-obstacles-ppo", "gap")
-def policies_short(records: Records) -> str:
-    rows = []
-    for name, run in _shipped(records):
-        card = find_policy(name).card
-        assert card is not None
-        maker = _MAKERS[card.algorithm]
-        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
-        title = f"`{name}`" + (" (default)" if name == DEFAULT else "")
-        cells = (title, maker, f"`{run.arena}`{late}", f"{rate(run)} %")
-        rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
-    return table(("policy", "algorithm", "flown in", "success", "flight time"), rows)
-
-
-@block("policies", "generalisation", "static-obstacles-ppo", "gap")
-def policies(records: Records) -> str:
-    rows = []
-    for name, run in _shipped(records):
-        card = find_policy(name).card
-        assert card is not None
-        maker = f"{_MAKERS[card.algorithm]}, {_ACTIONS[card.actions.set]}"
-        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
-        rows.append(
-            (
-                f"`{name}`" + (" (default)" if name == DEFAULT else ""),
-                maker,
-                f"{card.hold_s:g} s",
-                f"`{run.arena}`{late}",
-                f"{rate(run)} %",
-                f"{number(run.flight_time_s, 2)} s",
-                f"{number(run.distance_m, 1)} m",
-                f"{energy_kj(run)} kJ",
-            )
-        )
-    heads = ("policy", "algorithm", "decides every", "flown in", "success", "time", "distance")
-    return table((*heads, "energy"), rows)
-
-
-# --- generalisation
-
-
-@block("generalisation-paper", "generalisation")
-def generalisation_paper(records: Records) -> str:
-    arenas = ("no-obstacles", "static-obstacles", "dynamic-obstacles")
-    runs, rows = records["generalisation"].runs, []
-    for trained in ("no-obstacles", "dynamic-obstacles"):
-        told = load_published().generalisation[trained]
-        rows.append((trained, "the paper", *(f"{told[arena]:g}" for arena in arenas)))
-        rows.append(("", "ours", *(rate(runs[f"{trained}-{arena}"]) for arena in arenas)))
-    return table(("trained in", "", *arenas), rows, 3)
-
-
-@block("generalisation", "generalisation")
-def generalisation(records: Records) -> str:
-    runs = records["generalisation"].runs
-    arenas = tuple(dict.fromkeys(run.arena for run in runs.values()))
-    rows = []
-    for policy in dict.fromkeys(run.policy for run in runs.values()):
-        own = find_policy(policy).card
-        trained = None if own is None else own.training.arena
-        cells = [number(runs[f"{policy}-{a}"].success_rate, 1, scale=100.0) for a in arenas]
-        cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
-        rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
-    return table(("policy", *arenas), rows, len(arenas))
-
 
 # --- the gap
 
@@ -249,6 +111,17 @@ def _told(target: str, reference: str) -> tuple[str, ...]:
 _GAP_FIELDS = ("success", "flight_time_percent", "distance_percent", "energy_percent")
 SAME_PERCENT = 0.05
 """Gaps closer than this [%] are the same as printed."""
+
+
+@block("gap-lockstep", "gap-lockstep")
+def gap_lockstep(records: Records) -> str:
+    rows = []
+    for title, target, reference in _GAPS[:4]:
+        gap = _gap(records["gap-lockstep"], target, reference)
+        cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)
+        rows.append((title.rpartition(" (")[0], *cells, f"{gap.flight_time_s.n}"))
+    heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]", "pairs")
+    return table(("gap at `lockstep`", *heads), rows, 5)
 
 
 @block("mitigation-gaps", "gap")
@@ -393,54 +266,3 @@ def _theirs(each: PublishedRun, first: PublishedRun) -> tuple[str, ...]:
         more = "" if each is first else f" ({change(each, first, field):+.0f} % ◦)"
         cells.append(f"{getattr(each, field):.2f} {unit}{more}")
     return (*cells, "")
-
-
-# --- levels
-
-
-@block("ladder", "ladder")
-def ladder(records: Records) -> str:
-    record = records["ladder"]
-    (gap,) = record.gaps.values()
-    return levels_table(record, (("", gap),))
-
-
-def levels_table(record: Record, parts: tuple[tuple[str, Gap], ...]) -> str:
-    """Return the runs of two levels side by side, and their differences."""
-    rows = []
-    for title, gap in parts:
-        reference, target = record.runs[gap.reference], record.runs[gap.target]
-        head = f"{title}: " if title else ""
-        rows.append(
-            (
-                f"{head}success",
-                *(f"{rate(run)} %" for run in (reference, target)),
-                f"{number(gap.success_rate, 1, '+')} points",
-                interval(gap.success_rate),
-            )
-        )
-        for name, field, unit, scale in (
-            ("flight time", "flight_time_s", "s", 1.0),
-            ("distance", "distance_m", "m", 1.0),
-            ("energy", "energy_j", "kJ", 1e-3),
-        ):
-            change_of: Figure = getattr(gap, field)
-            rows.append(
-                (
-                    name,
-                    *(
-                        f"{number(getattr(r, field), 2, scale=scale)} {unit}"
-                        for r in (reference, target)
-                    ),
-                    f"{number(change_of, 1, '+')} %",
-                    interval(change_of),
-                )
-            )
-    return table(("same seeds", "gym", "lockstep", "difference", "95 % interval"), rows)
-
-
-def interval(figure: Figure) -> str:
-    """Return an interval in a cell of its own."""
-    if figure.low is None or figure.high is None:
-        return NONE
-    return f"{figure.low:+.1f} … {figure.high:+.1f}"

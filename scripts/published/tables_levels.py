@@ -1,0 +1,97 @@
+"""Tables that compare two levels, or two networks, on the same seeds."""
+
+from __future__ import annotations
+
+from published.blocks import Records, block
+from published.record import MEASURES, Figure, Record
+from published.text import NONE, both, number, percent, rate, table
+
+# --- levels
+
+
+@block("ladder", "ladder")
+def ladder(records: Records) -> str:
+    return _levels((("", records["ladder"]),))
+
+
+@block("ladder-conditions", "ladder-wind", "ladder-spread", "ladder-dense")
+def ladder_conditions(records: Records) -> str:
+    parts = (
+        ("wind, 200 seeds", "ladder-wind"),
+        ("spread and depth noise, 100 seeds", "ladder-spread"),
+        ("all of it, in `dense-obstacles`, 160 seeds", "ladder-dense"),
+    )
+    return _levels(tuple((title, records[name]) for title, name in parts))
+
+
+@block("ladder-late", "ladder-late", "ladder-mitigated")
+def ladder_late(records: Records) -> str:
+    rows = []
+    for title, name in (
+        ("default policy", "ladder-late"),
+        ("mitigated policy", "ladder-mitigated"),
+    ):
+        (gap,) = records[name].gaps.values()
+        cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)
+        rows.append((f"{title}, {gap.success_rate.n} seeds", *cells))
+    heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]")
+    return table(("gym to lockstep, 396 ms", *heads), rows, 4)
+
+
+@block("quantisation", "quantisation")
+def quantisation(records: Records) -> str:
+    record, rows = records["quantisation"], []
+    for gap in record.gaps.values():
+        floats, integers = record.runs[gap.reference], record.runs[gap.target]
+        rows.append(
+            (
+                f"`{floats.policy}`",
+                *(f"{rate(run)} %" for run in (floats, integers)),
+                f"{both(gap.success_rate, 1, '+')} points",
+                *(percent(each) for each in (gap.flight_time_s, gap.distance_m, gap.energy_j)),
+            )
+        )
+    heads = ("success, floats", "success, int8", "difference", "flight time", "distance", "energy")
+    return table(("policy", *heads), rows, 6)
+
+
+def _levels(parts: tuple[tuple[str, Record], ...]) -> str:
+    """Return the runs of two levels side by side, and their differences over the pairs."""
+    rows = []
+    for title, record in parts:
+        (gap,) = record.gaps.values()
+        reference, target = record.runs[gap.reference], record.runs[gap.target]
+        head = f"{title}: " if title else ""
+        rows.append(
+            (
+                f"{head}success",
+                *(f"{rate(run)} %" for run in (reference, target)),
+                f"{number(gap.success_rate, 1, '+')} points",
+                interval(gap.success_rate),
+            )
+        )
+        for name, field, unit, scale in (
+            ("flight time", "flight_time_s", "s", 1.0),
+            ("distance", "distance_m", "m", 1.0),
+            ("energy", "energy_j", "kJ", 1e-3),
+        ):
+            change_of: Figure = getattr(gap, field)
+            rows.append(
+                (
+                    name,
+                    *(
+                        f"{number(getattr(r, field), 2, scale=scale)} {unit}"
+                        for r in (reference, target)
+                    ),
+                    f"{number(change_of, 1, '+')} %",
+                    interval(change_of),
+                )
+            )
+    return table(("same seeds", "gym", "lockstep", "difference", "95 % interval"), rows)
+
+
+def interval(figure: Figure) -> str:
+    """Return an interval in a cell of its own."""
+    if figure.low is None or figure.high is None:
+        return NONE
+    return f"{figure.low:+.1f} … {figure.high:+.1f}"

@@ -1,0 +1,95 @@
+"""Tables of the shipped policies, in their own arenas and in others."""
+
+from __future__ import annotations
+
+from airl_mav.policy.registry import find_policy
+from airl_mav.profiles.published import load_published
+from published.blocks import DEFAULT, Records, block
+from published.record import FlownRun
+from published.text import energy_kj, number, rate, table
+
+# --- the shipped policies
+
+SHIPPED: dict[str, tuple[str, str]] = {
+    "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
+    "static-obstacles-ppo": ("static-obstacles-ppo", "run"),
+    "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
+    "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
+    "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
+    "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
+    "crowded": ("generalisation", "crowded-crowded"),
+}
+"""Where the flights of each policy stand: in its own arena, as late as in its training."""
+
+_MAKERS = {"dqn": "double DQN", "ppo": "PPO"}
+_ACTIONS = {"arc-25": "arcs", "velocity": "continuous"}
+
+
+def _shipped(records: Records) -> list[tuple[str, FlownRun]]:
+    return [(name, records[record].runs[run]) for name, (record, run) in SHIPPED.items()]
+
+
+@block("policies-short", "generalisation", "static-obstacles-ppo", "gap")
+def policies_short(records: Records) -> str:
+    rows = []
+    for name, run in _shipped(records):
+        card = find_policy(name).card
+        assert card is not None
+        maker = _MAKERS[card.algorithm]
+        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
+        title = f"`{name}`" + (" (default)" if name == DEFAULT else "")
+        cells = (title, maker, f"`{run.arena}`{late}", f"{rate(run)} %")
+        rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
+    return table(("policy", "algorithm", "flown in", "success", "flight time"), rows)
+
+
+@block("policies", "generalisation", "static-obstacles-ppo", "gap")
+def policies(records: Records) -> str:
+    rows = []
+    for name, run in _shipped(records):
+        card = find_policy(name).card
+        assert card is not None
+        maker = f"{_MAKERS[card.algorithm]}, {_ACTIONS[card.actions.set]}"
+        late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
+        rows.append(
+            (
+                f"`{name}`" + (" (default)" if name == DEFAULT else ""),
+                maker,
+                f"{card.hold_s:g} s",
+                f"`{run.arena}`{late}",
+                f"{rate(run)} %",
+                f"{number(run.flight_time_s, 2)} s",
+                f"{number(run.distance_m, 1)} m",
+                f"{energy_kj(run)} kJ",
+            )
+        )
+    heads = ("policy", "algorithm", "decides every", "flown in", "success", "time", "distance")
+    return table((*heads, "energy"), rows)
+
+
+# --- generalisation
+
+
+@block("generalisation-paper", "generalisation")
+def generalisation_paper(records: Records) -> str:
+    arenas = ("no-obstacles", "static-obstacles", "dynamic-obstacles")
+    runs, rows = records["generalisation"].runs, []
+    for trained in ("no-obstacles", "dynamic-obstacles"):
+        told = load_published().generalisation[trained]
+        rows.append((trained, "the paper", *(f"{told[arena]:g}" for arena in arenas)))
+        rows.append(("", "ours", *(rate(runs[f"{trained}-{arena}"]) for arena in arenas)))
+    return table(("trained in", "", *arenas), rows, 3)
+
+
+@block("generalisation", "generalisation")
+def generalisation(records: Records) -> str:
+    runs = records["generalisation"].runs
+    arenas = tuple(dict.fromkeys(run.arena for run in runs.values()))
+    rows = []
+    for policy in dict.fromkeys(run.policy for run in runs.values()):
+        own = find_policy(policy).card
+        trained = None if own is None else own.training.arena
+        cells = [number(runs[f"{policy}-{a}"].success_rate, 1, scale=100.0) for a in arenas]
+        cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
+        rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
+    return table(("policy", *arenas), rows, len(arenas))
