@@ -51,7 +51,7 @@ def fly_result(declared: Declared, *, quick: bool) -> Path:
         UsageError: Its command failed, or left something else.
         KeyboardInterrupt: Ctrl-C; what was flown is kept.
     """
-    out = RUNS / (f"{declared.name}-quick" if quick else f"{declared.name}-{behaviour_today()}")
+    out = RUNS / f"{declared.name}-{behaviour_today()}{'-quick' if quick else ''}"
     words = [*_program(declared.command), *(shlex.split(declared.quick) if quick else ())]
     # The checkout's own package, whatever is installed.
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
