@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -59,19 +58,31 @@ def test_declared_results_are_there(records: dict[str, Record]) -> None:
 # --- what is older says so
 
 
-def test_an_older_behaviour_is_said_under_its_tables(records: dict[str, Record]) -> None:
-    today = records["gap"]
+@pytest.fixture
+def fresh(records: dict[str, Record]) -> Record:
+    """A result as if today's code had flown it, whatever has been accepted since."""
+    made = {"behaviour": record.behaviour_today(), "policies": dict(record.shipped_policies())}
+    gap = records["gap"]
+    return gap.model_copy(update={"made": gap.made.model_copy(update=made)})
+
+
+def test_an_older_behaviour_is_said_under_its_tables(
+    records: dict[str, Record], fresh: Record
+) -> None:
+    today, records = fresh, {**records, "gap": fresh}
     older = today.model_copy(update={"made": today.made.model_copy(update={"behaviour": "0" * 16})})
     text = "<!-- results: gap-short -->\n<!-- end of results -->"
     assert "before today" not in pages.rendered(text, records, "page")
     said = pages.rendered(text, {**records, "gap": older}, "page")
-    assert "**Flown on 2026-11-22 with version 0.2.0, before today's flight behaviour.**" in said
+    made = today.made
+    flown = f"Flown on {made.date} with version {made.version}"
+    assert f"**{flown}, before today's flight behaviour.**" in said
     # The figures are the same: only what is said of them differs.
     assert said.split("`airl gap")[0] == pages.rendered(text, records, "page").split("`airl gap")[0]
 
 
-def test_another_file_of_a_policy_is_out_of_date(records: dict[str, Record]) -> None:
-    made = records["gap"].made
+def test_another_file_of_a_policy_is_out_of_date(fresh: Record) -> None:
+    made = fresh.made
     retrained = made.model_copy(update={"policies": {"static-obstacles": "0" * 64}})
     assert record.out_of_date(made) == ""
     assert "another file of `static-obstacles`" in record.out_of_date(retrained)
@@ -167,15 +178,15 @@ def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.M
     assert not (tmp_path / "results").exists()
 
 
-def test_what_must_be_flown_again_is_known(tmp_path: Path, records: dict[str, Record]) -> None:
+def test_what_must_be_flown_again_is_known(tmp_path: Path, fresh: Record) -> None:
     declared = read_declared()["gap"]
     assert flying.why_out_of_date(declared, tmp_path) == "Not flown yet."
-    shutil.copy(record.file_of("gap"), tmp_path)
+    record.write_record(fresh, tmp_path)
     assert flying.why_out_of_date(declared, tmp_path) == ""
     other = declared.model_copy(update={"command": "airl gap --episodes 7"})
     assert "another command" in flying.why_out_of_date(other, tmp_path)
-    older: Made = records["gap"].made.model_copy(update={"behaviour": None})
-    record.write_record(records["gap"].model_copy(update={"made": older}), tmp_path)
+    older: Made = fresh.made.model_copy(update={"behaviour": None})
+    record.write_record(fresh.model_copy(update={"made": older}), tmp_path)
     assert "before today" in flying.why_out_of_date(declared, tmp_path)
 
 
