@@ -59,6 +59,10 @@ kernels: $(ALL)
 .PHONY: test
 test: $(ALL)  ## Everything CI checks
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not nightly"
+
+.PHONY: nightly
+nightly: $(ALL)  ## All tests, with the long ones of stops and kills
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 .PHONY: docs

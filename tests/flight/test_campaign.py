@@ -249,6 +249,7 @@ def test_a_policy_that_may_know_its_episodes_is_named_once(tmp_path: Path) -> No
     assert notes.lines[1].startswith("the cell a: 1 ")
 
 
+@pytest.mark.nightly
 def test_a_second_ctrl_c_is_not_waited_for_and_nothing_is_lost(
     tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -195,6 +195,7 @@ def check_log(path: Path, time_us: np.ndarray) -> None:
     assert max(times) - min(times) == pytest.approx((time_us[-1] - time_us[0]) / 1e6, abs=1.5)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("chance", [random.Random(11)], ids=["seed-11"])
 def test_whoever_is_killed_whenever_every_seed_is_flown_once(
     tmp_path: Path, chance: random.Random
@@ -301,6 +302,7 @@ def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     assert not list(out.glob(".*"))
 
 
+@pytest.mark.nightly
 def test_two_do_not_fly_into_one_folder(tmp_path: Path) -> None:
     campaign = Campaign(tmp_path, episodes=2)
     impatient = "from airl_mav.rehearsal import lock\nlock.WAIT_S = 0.2"

@@ -441,7 +441,14 @@ def start(out: Path) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGKILL,
+        pytest.param(signal.SIGINT, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, marks=pytest.mark.nightly),
+    ],
+)
 def test_an_interrupted_run_goes_on_and_ends_as_if_nothing_had_been(
     number: signal.Signals, reference: LoadedRun, tmp_path: Path
 ) -> None:

@@ -237,6 +237,7 @@ def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     nothing_half_written(folder)
 
 
+@pytest.mark.nightly
 def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
     """SIGTERM, from a batch system or a service manager, is Ctrl-C."""
     with sitl(tmp_path, choose_ports(ground.port), program=SITL) as run:
@@ -251,6 +252,7 @@ def test_terminated_flight(tmp_path: Path, ground: Ground) -> None:
     nothing_half_written(tmp_path / "run")
 
 
+@pytest.mark.nightly
 def test_second_interrupt_kills_a_stopped_firmware(tmp_path: Path, ground: Ground) -> None:
     with sitl(tmp_path, choose_ports(ground.port)) as run:
         children = run.find_children("firmware", "companion")
@@ -601,6 +603,7 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     assert np.diff(done.trajectories[0].time_us).max() <= 20_000
 
 
+@pytest.mark.nightly
 def test_long_stopped_firmware_ends_in_a_defined_way(tmp_path: Path, ground: Ground) -> None:
     """3 s is what MAVSDK allows between heartbeats; the watchdog may be first. Flown again."""
     ports = choose_ports(ground.port)
@@ -750,6 +753,7 @@ def test_companion_interrupted_in_flight_lands(tmp_path: Path, ground: Ground) -
         assert not ground.heard("Failsafe")
 
 
+@pytest.mark.nightly
 def test_companion_interrupted_while_nobody_is_there(tmp_path: Path) -> None:
     with companion(tmp_path, choose_ports()) as pilot:
         pilot.wait_for_text("waiting for a flight controller on udpin://")

@@ -146,6 +146,7 @@ def test_px4_does_not_outlive_a_killed_rehearsal(tmp_path: Path) -> None:
         wait_until(lambda: not is_running(program), "PX4 to end", 60.0)
 
 
+@pytest.mark.nightly
 def test_a_px4_that_never_comes_is_waited_for_in_vain(tmp_path: Path) -> None:
     instance = free_instance()
     words = sitl("px4", "--px4-connect", "--instance", str(instance), "--firmware-timeout", "2")

@@ -142,6 +142,7 @@ def test_started_again_it_shows_what_it_has_and_trains_nothing(undisturbed: Path
     assert outcome(undisturbed) == before
 
 
+@pytest.mark.nightly
 def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
     tmp_path: Path, undisturbed: Path
 ) -> None:
@@ -171,6 +172,7 @@ def test_interrupted_and_killed_it_goes_on_as_if_nothing_had_happened(
     assert outcome(tmp_path) == outcome(undisturbed)
 
 
+@pytest.mark.nightly
 def test_two_at_once_are_refused(tmp_path: Path) -> None:
     with running(sweep(tmp_path, "--workers", "1"), tmp_path) as first:
         wait_until(lambda: (tmp_path / "out" / "sweep.json").exists(), "the first")

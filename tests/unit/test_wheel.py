@@ -93,6 +93,7 @@ def test_the_base_install_is_light(unpacked: Path) -> None:
         assert any(heavy in line for line in required)
 
 
+@pytest.mark.nightly
 def test_it_flies_from_anywhere(unpacked: Path, tmp_path: Path) -> None:
     """Only the wheel on the path, another working folder, the shipped profiles."""
     words = ["-m", "airl_mav.cli.sitl", "--episodes", "1", "--speed", "3", "--no-validity"]
@@ -104,7 +105,9 @@ def test_it_flies_from_anywhere(unpacked: Path, tmp_path: Path) -> None:
     assert json.loads(line)["outcome"] == "success"
     assert json.loads((run / "run.json").read_text(encoding="utf-8"))["git"] is None
     assert (run / "report.html").exists()
-    # The profiles came from the wheel.
+
+
+def test_its_profiles_come_from_the_wheel(unpacked: Path, tmp_path: Path) -> None:
     where = "from airl_mav.profiles.loading import profiles_dir; print(profiles_dir())"
     with running(["-c", where], tmp_path, path=unpacked) as process:
         assert process.wait() == 0
