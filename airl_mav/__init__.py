@@ -5,12 +5,15 @@
 >>> run.quality.success_rate.value, run.latency["t2"].mean()
 
 Everything is imported when it is first used, so that a companion computer loads no simulator.
+`gymnasium.make("airl_mav:airl/Navigation-v0")` finds the environment as soon as this is imported.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
+
+from airl_mav.core.after_import import after_import as _after_import
 
 __version__ = "0.2.0"
 
@@ -71,3 +74,7 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     """Return the public names."""
     return sorted([*globals(), *_EXPORTS])
+
+
+# Not imported here: it takes more than all the rest, and a light installation has none.
+_after_import("gymnasium", "airl_mav.envs.registration")

@@ -109,9 +109,11 @@ def measure_ours() -> list[Result]:
 
     def measure_whole(arena: str) -> Result:
         """The vector environment as a learner sees it: delays, images, rewards, new arenas."""
+        from airl_mav.envs.spec import spec_of
         from airl_mav.envs.vector import NavigationVectorEnv
 
-        env = NavigationVectorEnv(N, arena=arena, episode={"hold_s": CAMERA_STEP_S})
+        spec = spec_of(None, {"arena": arena, "episode": {"hold_s": CAMERA_STEP_S}})
+        env = NavigationVectorEnv(N, spec)
         env.reset(seed=1)
         rng = np.random.default_rng(0)
 

@@ -5,9 +5,7 @@ Needs the extra `train`.
 
 import gymnasium
 
-import airl_mav.envs.registration  # noqa: F401 (registers the id)
-
-env = gymnasium.make("airl/Navigation-v0", arena="dynamic-obstacles", actions="velocity")
+env = gymnasium.make("airl_mav:airl/Navigation-v0", arena="dynamic-obstacles", actions="velocity")
 env.action_space.seed(1)
 
 for seed in range(1, 4):

@@ -15,7 +15,7 @@ from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import rewards
-from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, boxes
 
@@ -43,8 +43,12 @@ class Decisions:
     """The flights of n vehicles, decision by decision; a base of the environments."""
 
     def __init__(self, spec: EnvironmentSpec | None, knobs: Mapping[str, Any], n: int) -> None:
-        """Take the specification, or its fields. Raises UsageError as `spec_of`, `Navigation`."""
-        self.environment = bounded(spec_of(spec, knobs))
+        """Take the specification, or its fields.
+
+        Raises:
+            UsageError: As `gymnasium_spec` and `Navigation`.
+        """
+        self.environment = bounded(gymnasium_spec(spec, knobs))
         self.navigation = Navigation(self.environment, n)
         self.curriculum: CurriculumState | None = None
         if self.environment.curriculum is not None:

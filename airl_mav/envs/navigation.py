@@ -109,9 +109,7 @@ class Navigation(Stateful):
             computer_w = computer.onboard_watts
         self.vehicle: VehicleProfile = vehicle
         self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
-        self.camera: Camera = self.vehicle.camera.model_copy(
-            update=spec.camera.model_dump(exclude_none=True)
-        )
+        self.camera: Camera = spec.camera.of(self.vehicle.camera)
         self.observation = ObservationSpec(
             layout=spec.layout,
             height_px=spec.image_height_px,

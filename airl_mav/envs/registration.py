@@ -1,9 +1,11 @@
-"""Importing this registers `airl/Navigation-v0` with Gymnasium.
+"""Registers `airl/Navigation-v0` with Gymnasium.
 
-`gymnasium.make("airl_mav.envs.registration:airl/Navigation-v0", arena="dense-obstacles")` does both
-at once. `gymnasium.make_vec` gives n at a time on the compiled kernels. Keyword arguments are the
-fields of `airl_mav.envs.spec.EnvironmentSpec`, its tables as dicts. (Gymnasium has had no plugins
-that register themselves since 1.0.)
+`import airl_mav` sees to it that this is imported once Gymnasium is, so that
+`gymnasium.make("airl_mav:airl/Navigation-v0", arena="dense-obstacles")` needs no other import.
+`gymnasium.make_vec` gives n at a time on the compiled kernels. Keyword arguments are the fields of
+`airl_mav.envs.spec.EnvironmentSpec`, its tables as dicts; where neither size of the image is given,
+the network sees the camera's own. (Gymnasium has had no plugins that register themselves since
+1.0.)
 """
 
 from __future__ import annotations

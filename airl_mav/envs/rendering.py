@@ -6,6 +6,8 @@ What stays the same over an episode is drawn once; a frame adds the moving parts
 from __future__ import annotations
 
 import math
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -134,6 +136,13 @@ class EpisodeRenderer:
             f"height {-position[2]:7.2f} m\n"
             f"energy {now.energy_j[0] / 1000.0:7.2f} kJ"
         )
+
+
+def display_found() -> bool:
+    """Return whether this machine has a display that a window may open on."""
+    if not sys.platform.startswith("linux"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 class Window:

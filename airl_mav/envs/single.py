@@ -19,7 +19,7 @@ from airl_mav.envs.decisions import (
 )
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
-from airl_mav.envs.rendering import EpisodeRenderer, Window
+from airl_mav.envs.rendering import EpisodeRenderer, Window, display_found
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.layouts import DEPTH, Encoded
 
@@ -42,7 +42,8 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
 
         Args:
             spec: What it is made of; or
-            render_mode: None, `rgb_array` or `human` (a window, which needs a display).
+            render_mode: None, `rgb_array` or `human` (a window, which needs a display; without one
+                `metadata` does not offer it).
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
@@ -58,6 +59,9 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         # A picture a decision: shown so often, a video of them runs in the time of the flight.
         fps = 1.0 / self.environment.episode.hold_s
         self.metadata = self.metadata | {"render_fps": fps}
+        if not display_found():
+            # Gymnasium's checker opens every mode that is offered.
+            self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
         self._depth = np.zeros((0, 0), np.uint8)
         self._trail: list[NDArray[np.float64]] = []
         self._renderer: EpisodeRenderer | None = None

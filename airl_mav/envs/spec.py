@@ -11,9 +11,10 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
-from airl_mav.policy.layouts import LayoutName
+from airl_mav.policy.layouts import STRIP_ROWS, LayoutName
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
+from airl_mav.profiles.vehicle import Camera, load_vehicle
 
 RewardName = Literal["shaped", "paper-scaled", "paper"]
 """See `envs.rewards`."""
@@ -51,6 +52,10 @@ class CameraChange(ProfileModel):
         "horizontal field of view", "deg", gt=10, lt=170, default=None
     )
     range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
+
+    def of(self, camera: Camera) -> Camera:
+        """Return a vehicle's camera with the changes."""
+        return camera.model_copy(update=self.model_dump(exclude_none=True))
 
 
 class Delay(ProfileModel):
@@ -180,3 +185,21 @@ def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> Environme
             raise UsageError(f"spec and {', '.join(knobs)}: accepted: one or the other")
         return spec
     return validated(EnvironmentSpec, dict(knobs))
+
+
+def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:
+    """Return the specification that the environments of Gymnasium's API are made from.
+
+    As `spec_of`, but with knobs that say nothing of the image's size the network sees the camera's
+    own image, which other people's image networks have room for: stable-baselines3's needs 36 px
+    each way. (A training file's image is smaller by default: its networks are made for that.)
+
+    Raises:
+        UsageError: As `spec_of`, or the vehicle's profile cannot be used.
+    """
+    made = spec_of(spec, knobs)
+    if spec is not None or {"image_width_px", "image_height_px"} & knobs.keys():
+        return made
+    camera = made.camera.of(load_vehicle(made.vehicle).camera)
+    rows = camera.height_px + (STRIP_ROWS if made.layout == "paper" else 0)
+    return spec_of(None, {**knobs, "image_width_px": camera.width_px, "image_height_px": rows})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import types
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,13 +11,15 @@ import gymnasium as gym
 import matplotlib as mpl
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from matplotlib import pyplot
 from matplotlib.backend_bases import FigureManagerBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-import airl_mav.envs.registration
+import airl_mav.envs.single
 from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED
@@ -29,9 +30,6 @@ from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 
-LARGE = {"image_width_px": 64, "image_height_px": 48}
-"""An image that SB3's own convolutions have room for."""
-
 PAPER: dict[str, Any] = {
     "layout": "paper",
     "image_width_px": 256,
@@ -40,6 +38,9 @@ PAPER: dict[str, Any] = {
     "actions": "paper-25",
     "reward": "paper",
 }
+DOOR = f"airl_mav:{NAVIGATION}"
+"""What a user asks Gymnasium for."""
+
 FORWARD = 22
 """`arc-25`: full speed ahead."""
 
@@ -63,6 +64,7 @@ def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
     backend: Any = types.ModuleType("pretended_display")
     backend.FigureCanvas = _Canvas
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
+    monkeypatch.setattr(airl_mav.envs.single, "display_found", lambda: True)
     _Canvas.shown.clear()
     with mpl.rc_context():
         pyplot.switch_backend(f"module://{backend.__name__}")
@@ -73,10 +75,10 @@ def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
 @pytest.mark.parametrize(
     "knobs",
     [
-        LARGE,
-        {"actions": "velocity", "arena": "dynamic-obstacles", **LARGE},
+        {},
+        {"actions": "velocity", "arena": "dynamic-obstacles"},
         PAPER,
-        {"curriculum": {"window": 5}, "delay": {"computer": "ras-pi-4"}, **LARGE},
+        {"curriculum": {"window": 5}, "delay": {"computer": "ras-pi-4"}},
     ],
     ids=["default", "continuous", "paper", "curriculum"],
 )
@@ -88,17 +90,51 @@ def test_both_checkers_are_content(knobs: dict[str, Any], window: list[np.ndarra
     assert window, "check_env looked at render_mode='human' too"
 
 
-def test_sb3_s_only_complaint_about_the_small_image_is_its_size() -> None:
-    """24 rows are too few for NatureCNN; `airl train` has its own networks."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_env_for_sb3(NavigationEnv())
-    assert ["36x36" in str(w.message) for w in caught] == [True]
+def test_both_checkers_are_content_without_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    env = gym.make(DOOR, render_mode="rgb_array").unwrapped
+    check_env(env)
+    check_env_for_sb3(env, skip_render_check=False)
+    assert env.metadata["render_modes"] == ["rgb_array"], "there is nothing to open a window on"
+    assert NavigationEnv.metadata["render_modes"] == ["rgb_array", "human"]
+
+
+def test_sb3_trains_on_the_environment_s_name_alone() -> None:
+    """With its own image network, which has no room in the 32x24 px of the training files."""
+    torch.set_num_threads(1)
+    model = PPO("MultiInputPolicy", DOOR, n_steps=128, batch_size=64, n_epochs=2, seed=1)
+    before = model.policy.state_dict()["action_net.weight"].clone()
+    model.learn(256)
+    assert model.num_timesteps == 256
+    assert not before.equal(model.policy.state_dict()["action_net.weight"])
+
+
+@pytest.mark.parametrize(
+    ("knobs", "shape"),
+    [
+        ({}, (1, 48, 64)),
+        ({"layout": "paper"}, (1, 58, 64)),
+        ({"vehicle": "quad-256x144"}, (1, 144, 256)),
+        ({"camera": {"width_px": 128, "height_px": 96}}, (1, 96, 128)),
+        ({"image_width_px": 32}, (1, 24, 32)),
+        ({"spec": EnvironmentSpec()}, (1, 24, 32)),
+    ],
+)
+def test_the_network_sees_the_camera_s_image_unless_told(
+    knobs: dict[str, Any], shape: tuple[int, ...]
+) -> None:
+    spaces: tuple[Any, Any] = (
+        NavigationEnv(**knobs).observation_space,
+        NavigationVectorEnv(2, **knobs).single_observation_space,
+    )
+    for space in spaces:
+        assert space["depth"].shape == shape
 
 
 def test_make_takes_the_knobs_and_leaves_no_wrapper_in_the_way() -> None:
     env = gym.make(
-        f"{airl_mav.envs.registration.__name__}:{NAVIGATION}",
+        DOOR,
         arena="dynamic-obstacles",
         episode={"hold_s": 0.3, "time_limit_s": 60},
         randomisation={"mass": 0.2},
@@ -117,7 +153,7 @@ def test_make_takes_the_knobs_and_leaves_no_wrapper_in_the_way() -> None:
 
 
 def test_make_vec_is_the_compiled_one() -> None:
-    env = gym.make_vec(NAVIGATION, num_envs=3, reward="paper-scaled")
+    env = gym.make_vec(DOOR, num_envs=3, reward="paper-scaled")
     assert isinstance(env, NavigationVectorEnv)
     assert env.environment.reward == "paper-scaled"
     env.reset(seed=1)
@@ -294,7 +330,12 @@ def _near(picture: np.ndarray, colour: str, tolerance: int = 12) -> np.ndarray:
 
 
 def test_the_picture_shows_vehicle_goal_movers_and_depth() -> None:
-    env = NavigationEnv(arena="dynamic-obstacles", render_mode="rgb_array")
+    env = NavigationEnv(
+        arena="dynamic-obstacles",
+        render_mode="rgb_array",
+        image_width_px=32,
+        image_height_px=24,
+    )
     seen, _ = env.reset(seed=3)
     first = env.render()
     assert first is not None

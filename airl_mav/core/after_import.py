@@ -1,0 +1,58 @@
+"""Code of ours that runs once another package is imported, without importing that package."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+
+def after_import(package: str, ours: str) -> None:
+    """Import a module of ours as soon as a package is imported: now, if it has been already.
+
+    Args:
+        package: Name of the package. It need not be installed.
+        ours: The module. It is imported when the package is there whole.
+    """
+    if package in sys.modules:
+        importlib.import_module(ours)
+    else:
+        sys.meta_path.insert(0, _Watcher(package, ours))
+
+
+class _Watcher:
+    """A finder that finds nothing by itself, and sees that a package is being imported."""
+
+    def __init__(self, package: str, ours: str) -> None:
+        self._package = package
+        self._ours = ours
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """Return what the finders behind this one find, with our module's import put after it."""
+        if name != self._package:
+            return None
+        for finder in sys.meta_path:
+            if isinstance(finder, _Watcher) or not hasattr(finder, "find_spec"):
+                continue
+            if (spec := finder.find_spec(name, path, target)) is not None:
+                self._watch(spec)
+                return spec
+        return None
+
+    def _watch(self, spec: ModuleSpec) -> None:
+        """Let the package's loader import our module when it is done."""
+        loader: Any = spec.loader
+        execute = getattr(loader, "exec_module", None)
+        if execute is None:
+            return
+
+        def then(module: ModuleType) -> None:
+            execute(module)
+            if self in sys.meta_path:
+                sys.meta_path.remove(self)
+            importlib.import_module(self._ours)
+
+        # On this one object: the package's spec and all that its loader is asked for stay its own.
+        loader.exec_module = then
