@@ -14,7 +14,7 @@ from airl_mav.envs.curriculum import CurriculumState
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.rewards import rewards
+from airl_mav.envs.rewards import Step, reward_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
 from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, boxes
@@ -49,6 +49,7 @@ class Decisions:
             UsageError: As `gymnasium_spec` and `Navigation`.
         """
         self.environment = bounded(gymnasium_spec(spec, knobs))
+        self._reward = reward_of(self.environment.reward)
         self.navigation = Navigation(self.environment, n)
         self.curriculum: CurriculumState | None = None
         if self.environment.curriculum is not None:
@@ -73,7 +74,8 @@ class Decisions:
         before, spec = self._before, self.environment
         if before is None:
             raise gym.error.ResetNeeded("step() before reset()")
-        self.navigation.fly(commands(spec.action_spec, actions))
+        flown = commands(spec.action_spec, actions)
+        self.navigation.fly(flown)
         now = self._before = self.navigation.flights()
         truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
         terminated = (now.verdict != Verdict.FLYING) & ~truncated
@@ -81,7 +83,7 @@ class Decisions:
             for i in np.flatnonzero(terminated | truncated):
                 success = bool(now.verdict[i] == Verdict.SUCCESS)
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
-        reward = rewards(spec.reward, before, now, spec.episode.hold_s)
+        reward = self._reward(Step(before, now, flown, spec.episode.hold_s))
         return Decided(now, reward, terminated, truncated)
 
     def _quality(self, flights: Flights) -> dict[str, NDArray[Any]]:

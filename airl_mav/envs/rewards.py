@@ -2,17 +2,23 @@
 
 `shaped` is the default. `paper` is the paper's equation 2 to the letter: it does not train, its
 terms being a thousand times too large for any learner with a usual scale. `paper-scaled` is the
-same divided by 1000.
+same divided by 1000. Any other is the user's: a function of a `Step`, or a class, made without
+arguments, whose object is one.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core import plugins
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
-from airl_mav.envs.spec import RewardName
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S
 
 PROGRESS_1_M = 0.02
@@ -24,30 +30,106 @@ DECISION_COST = 0.005
 PAPER_BONUS = 1000.0
 
 
-def rewards(name: RewardName, before: Flights, now: Flights, hold_s: float) -> NDArray[np.float64]:
-    """Return the rewards (n,) of a decision.
+@dataclass(frozen=True)
+class Step:
+    """A decision of n vehicles, as it was flown: all that a reward may depend on."""
 
-    `paper` is r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
+    before: Flights
+    """At the decision."""
+    now: Flights
+    """At its end."""
+    commands: NDArray[np.float64]
+    """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]."""
+    hold_s: float
+    """How long an action is held [s]."""
+
+    @property
+    def success(self) -> NDArray[np.bool_]:
+        """(n,) the goal is reached."""
+        reached: NDArray[np.bool_] = self.now.verdict == Verdict.SUCCESS
+        return reached
+
+    @property
+    def failure(self) -> NDArray[np.bool_]:
+        """(n,) a collision, or an empty battery. A timeout is no failure."""
+        verdict = self.now.verdict
+        failed: NDArray[np.bool_] = (verdict == Verdict.COLLISION) | (verdict == Verdict.BATTERY)
+        return failed
+
+    @property
+    def progress_m(self) -> NDArray[np.float64]:
+        """(n,) how much nearer the goal has come [m]."""
+        return self.before.goal_distance_m - self.now.goal_distance_m
+
+
+Reward = Callable[[Step], NDArray[np.float64]]
+"""Returns the rewards (n,) of a decision, of each vehicle from its own row alone."""
+
+
+def shaped(step: Step) -> NDArray[np.float64]:
+    """Return 1 for the goal, -1 for a failure, a little for progress, less for the time."""
+    return _ended(step) + PROGRESS_1_M * step.progress_m - DECISION_COST
+
+
+def paper(step: Step) -> NDArray[np.float64]:
+    """Return r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
+
     a: goal reached, b: collision, D_g: distance to the goal, D_c = (V_max - V_now) t_max with
     t_max the time an action is held, g: 1 when closer to the goal than before.
 
     As printed, D_c is added, and only on the way to the goal: it pays slowness there, although
     the text calls it a penalty on speeding away. V_max is 5 m/s whatever the action set; who is
     faster pays. Running out of time costs nothing, and every decision costs its distance.
-
-    Args:
-        name: Which reward.
-        before: The flights at the decision.
-        now: The flights at its end.
-        hold_s: How long an action is held [s].
     """
-    success = now.verdict == Verdict.SUCCESS
-    # A timeout is no failure.
-    failure = (now.verdict == Verdict.COLLISION) | (now.verdict == Verdict.BATTERY)
-    ended: NDArray[np.float64] = success.astype(np.float64) - failure
-    before_m, now_m = before.goal_distance_m, now.goal_distance_m
-    if name == "shaped":
-        return ended + PROGRESS_1_M * (before_m - now_m) - DECISION_COST
-    correction = (PAPER_SPEED_M_S - now.speed_m_s) * hold_s
-    paper = PAPER_BONUS * ended - now_m + (now_m < before_m) * correction
-    return paper / PAPER_BONUS if name == "paper-scaled" else paper
+    before_m, now_m = step.before.goal_distance_m, step.now.goal_distance_m
+    correction = (PAPER_SPEED_M_S - step.now.speed_m_s) * step.hold_s
+    paid: NDArray[np.float64] = PAPER_BONUS * _ended(step) - now_m + (now_m < before_m) * correction
+    return paid
+
+
+def paper_scaled(step: Step) -> NDArray[np.float64]:
+    """Return `paper`, divided by 1000."""
+    return paper(step) / PAPER_BONUS
+
+
+def _ended(step: Step) -> NDArray[np.float64]:
+    return step.success.astype(np.float64) - step.failure
+
+
+SHIPPED: dict[str, Reward] = {"shaped": shaped, "paper-scaled": paper_scaled, "paper": paper}
+
+
+def reward_of(name: str) -> Reward:
+    """Return a reward by its name; one of the user's is loaded, and held to give (n,) numbers.
+
+    Raises:
+        FieldError: There is no such reward, or it cannot be made.
+    """
+    if name in SHIPPED:
+        return SHIPPED[name]
+    found = plugins.load_part(plugins.REWARDS, name)
+    try:
+        own = found() if isinstance(found, type) else found
+    except Exception as error:
+        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
+        raise FieldError(plugins.REWARDS.field, name, problem=problem) from error
+    if not callable(own):
+        raise FieldError(plugins.REWARDS.field, name, plugins.REWARDS.wanted)
+    return _Checked(name, own)
+
+
+class _Checked:
+    """A reward of the user's whose numbers a learner can take."""
+
+    def __init__(self, name: str, own: Callable[[Step], Any]) -> None:
+        self._name = name
+        self._own = own
+
+    def __call__(self, step: Step) -> NDArray[np.float64]:
+        """Return the rewards (n,). Raises UsageError for anything else."""
+        n = len(step.now.verdict)
+        paid = np.asarray(self._own(step), np.float64)
+        if paid.shape != (n,) or not np.isfinite(paid).all():
+            found = f"an array {paid.shape}" if paid.shape != (n,) else "what is no number"
+            raise UsageError(f"reward {self._name!r}: gives {found}; accepted: ({n},) numbers")
+        return paid

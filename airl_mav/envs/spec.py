@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.layouts import STRIP_ROWS, LayoutName
@@ -16,8 +17,10 @@ from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.vehicle import Camera, load_vehicle
 
-RewardName = Literal["shaped", "paper-scaled", "paper"]
+SHIPPED_REWARDS = ("shaped", "paper-scaled", "paper")
 """See `envs.rewards`."""
+
+RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
 
 
 class EpisodeRules(ProfileModel):
@@ -144,7 +147,11 @@ class EnvironmentSpec(ProfileModel):
     image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
     actions: ActionSetName = Field(default="arc-25", description="action set")
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
-    reward: RewardName = Field(default="shaped", description="reward")
+    reward: RewardName = Field(
+        default="shaped",
+        description="reward: shaped, paper-scaled, paper, or your own as MODULE:NAME or"
+        " FILE.py:NAME",
+    )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
     delay: Delay = Field(default_factory=Delay, description="how late decisions are")

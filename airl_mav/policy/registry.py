@@ -1,19 +1,21 @@
-"""Policies by name: built in, shipped with a card, any folder with one, or a class in a file."""
+"""Policies by name: built in, shipped with a card, any folder with one, or a Python class."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.plugins import POLICIES as DOOR
+from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, digest, load_card
+from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
-from airl_mav.policy.python_policy import names_python, python_class, python_file
 from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
 
@@ -38,13 +40,13 @@ class PolicyInfo:
     folder: Path | None = None
     """Where a learned one lies."""
     program: str | None = None
-    """FILE.py:CLASS of one that is written in Python."""
+    """FILE.py:CLASS or MODULE:CLASS of one that is written in Python."""
 
     @property
     def sha256(self) -> str | None:
         """Digest of the policy's file; None for a built-in one."""
         if self.program is not None:
-            return digest(python_file(self.program).read_bytes())
+            return digest_of(self.program)
         return None if self.card is None else self.card.sha256
 
     @property
@@ -59,17 +61,18 @@ def policy_names() -> list[str]:
 
 
 def find_policy(name: str) -> PolicyInfo:
-    """Return what is known of a policy, by name, by the path of its folder, or by FILE.py:CLASS.
+    """Return what is known of a policy: by name, by its folder's path, or by its Python class.
 
     Raises:
         UsageError: There is no such policy (lists those that exist), or its card does not fit it.
     """
-    if names_python(name):
-        summary = (python_class(name).__doc__ or "").strip().partition("\n")[0]
-        return PolicyInfo(name.rpartition(":")[2], summary, program=name)
+    if names_code(name):
+        return PolicyInfo(name.rpartition(":")[2], _summary(name), program=name)
+    if name in POLICIES:
+        return PolicyInfo(name, POLICIES[name][0])
     folder = _folder(name)
     if folder is None:
-        return PolicyInfo(name, POLICIES[name][0])
+        return PolicyInfo(name, _summary(name), program=announced(DOOR)[name])
     card = load_card(folder)
     return PolicyInfo(card.name, card.description, card, folder)
 
@@ -108,7 +111,8 @@ def load_policy(
         if value is not None:
             raise FieldError(field, value, f"for a learned policy; {known.name} is none")
     if known.program is not None:
-        return python_class(known.program)()
+        made: Policy = _policy_class(known.program)()
+        return made
     return POLICIES[known.name][1](hold_s)
 
 
@@ -118,15 +122,30 @@ def _shipped() -> list[str]:
 
 
 def _folder(name: str) -> Path | None:
-    """Return the folder of a policy; None for a built-in one. Raises UsageError for neither."""
-    if name in POLICIES:
-        return None
+    """Return the folder of a policy; None for one that an installed package announces.
+
+    Raises:
+        UsageError: Neither.
+    """
     if name in _shipped():
         return profiles_dir() / "policies" / name
     path = Path(name)
     if path.is_dir():
         return path
+    if reference(DOOR, name) is not None:
+        return None
+    known = ", ".join([*policy_names(), *announced(DOOR)])
     raise UsageError(
-        f"--policy {name!r}: no such policy; known: {', '.join(policy_names())} "
-        f"(or a path to a folder with {ONNX_FILE} and {CARD_FILE}, or FILE.py:CLASS)"
+        f"--policy {name!r}: no such policy; known: {known}"
+        f" (or a path to a folder with {ONNX_FILE} and {CARD_FILE}, FILE.py:CLASS or MODULE:CLASS)"
     )
+
+
+def _policy_class(name: str) -> Any:
+    """Return a policy's class by FILE.py:CLASS, MODULE:CLASS or its announced name."""
+    return load_part(DOOR, name, lambda made: callable(getattr(made, "act", None)))
+
+
+def _summary(name: str) -> str:
+    """Return the first line of what a policy's class says of itself."""
+    return (_policy_class(name).__doc__ or "").strip().partition("\n")[0]

@@ -10,7 +10,7 @@ import tomli_w
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.policy.python_policy import names_python
+from airl_mav.core.plugins import names_file
 from airl_mav.policy.registry import policy_names
 from airl_mav.scenario.model import Scenario
 
@@ -44,7 +44,7 @@ def anchored(scenario: Scenario) -> Scenario:
     policy, latency = scenario.policy, scenario.latency or ""
     named = {name: getattr(scenario, name) for name in ("vehicle", "arena", "computer")}
     paths = {name: value for name, value in named.items() if value.endswith(".toml")}
-    if names_python(policy) or (policy not in policy_names() and Path(policy).is_dir()):
+    if names_file(policy) or (policy not in policy_names() and Path(policy).is_dir()):
         paths["policy"] = policy
     if ".toml/" in latency or Path(latency).is_file():
         paths["latency"] = latency

@@ -20,7 +20,7 @@ PolicyName = Annotated[
     str,
     Field(
         description="policy that decides: a name, a path to a folder with policy.onnx and"
-        " card.json, or a Python class as FILE.py:CLASS"
+        " card.json, or a Python class as FILE.py:CLASS or MODULE:CLASS"
     ),
 ]
 

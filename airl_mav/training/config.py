@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.computer import load_computer
 
@@ -15,7 +16,8 @@ SELECTION_SEED = 500_000
 """First seed of the selection episodes; those of training begin at a million, those of evaluation
 at one."""
 
-NetworkKind = Literal["small", "appendix", "template"]
+SHIPPED_NETWORKS = ("small", "appendix", "template")
+NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
 Precision = Literal["float32", "bfloat16"]
 Option = bool | int | float | str | list[int | float | str]
 
@@ -26,10 +28,11 @@ class NetworkSpec(ProfileModel):
     `small`: convolutions 16-32-32-32 (3x3), dense 128x2; the fastest that learns well.
     `appendix`: Air Learning's network: convolutions 32 (4x4), 64 (4x4), 128 (2x2), 64 (1x1),
     dense 256x3. `template`: Air Learning's sweep: `layers` convolutions of `filters` 3x3 filters,
-    stride 1, and as many dense layers of as many units.
+    stride 1, and as many dense layers of as many units. Any other is a features extractor of
+    stable-baselines3 of your own, as MODULE:CLASS or FILE.py:CLASS, which sees all inputs.
     """
 
-    kind: NetworkKind = "small"
+    kind: NetworkKind = Field(default="small", description="network")
     strides: tuple[int, int, int, int] | None = Field(
         default=None,
         description="strides of the four convolutions of small and appendix; "
@@ -46,8 +49,24 @@ class NetworkSpec(ProfileModel):
         default=None,
     )
 
+    dense: tuple[Annotated[int, Field(ge=1, le=65536)], ...] | None = Field(
+        default=None,
+        description="units of each dense layer behind an extractor of your own; left out: 128, 128",
+    )
+    options: dict[str, Option] = Field(
+        default_factory=dict, description="arguments of an extractor of your own"
+    )
+
+    @property
+    def own(self) -> bool:
+        """Whether the extractor is the user's."""
+        return self.kind not in SHIPPED_NETWORKS
+
     @model_validator(mode="after")
     def _fields_fit_kind(self) -> NetworkSpec:
+        for name in ("strides",) if self.own else ("dense", "options"):
+            if getattr(self, name):
+                raise ValueError(f"{name}: kind {self.kind!r} has no such field")
         template = self.kind == "template"
         for name in ("layers", "filters"):
             if template == (getattr(self, name) is None):

@@ -14,11 +14,15 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.plugins import NETWORKS, load_part
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY
 from airl_mav.training.config import NetworkSpec
 
 VECTORS = (VELOCITY, GOAL)
 VECTOR_INPUTS = 6
+
+OWN_DENSE = (128, 128)
+"""Units of the dense layers behind an extractor of the user's, where none are given."""
 
 
 class Convolution(NamedTuple):
@@ -96,13 +100,28 @@ class DepthExtractor(BaseFeaturesExtractor):
 
 
 def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
-    """Return the `policy_kwargs` with which a MultiInputPolicy builds a network."""
+    """Return the `policy_kwargs` with which a MultiInputPolicy builds a network.
+
+    Raises:
+        FieldError: An extractor of the user's cannot be loaded.
+    """
+    if spec.own:
+        return {
+            "features_extractor_class": load_part(NETWORKS, spec.kind, _is_extractor),
+            "features_extractor_kwargs": dict(spec.options),
+            "net_arch": list(spec.dense or OWN_DENSE),
+            "activation_fn": nn.ReLU,
+        }
     return {
         "features_extractor_class": DepthExtractor,
         "features_extractor_kwargs": {"spec": spec},
         "net_arch": dense_units(spec),
         "activation_fn": nn.ReLU,
     }
+
+
+def _is_extractor(found: Any) -> bool:
+    return isinstance(found, type) and issubclass(found, BaseFeaturesExtractor)
 
 
 def to_channels_last(policy: nn.Module) -> None:

@@ -61,7 +61,7 @@ def test_own_arena(tmp_path: Path) -> None:
 
 def test_own_reward(tmp_path: Path) -> None:
     text = output_of("own_reward.py", tmp_path)
-    assert (tmp_path / "short-and-cheap" / "card.json").is_file()
+    assert (tmp_path / "short-and-cheap/policy/card.json").is_file()
     assert re.search(r"^(success|collision|timeout): ", text, re.M)
 
 

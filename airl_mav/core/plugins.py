@@ -1,0 +1,157 @@
+"""Parts that users write: put in by name, where a shipped part would stand.
+
+A part is named as `FILE.py:NAME`, as `MODULE:NAME`, or by the name under which an installed package
+announces it (an entry point of the part's group). Naming a part runs its module, as an import does,
+so a name may come from a command line or from a file of the user's, never from what was downloaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import re
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pydantic import AfterValidator
+from pydantic_core import PydanticCustomError
+
+from airl_mav.core.errors import FieldError
+
+_FILE = re.compile(r"(?P<file>.+\.py):(?P<name>[^:/\\]*)", re.DOTALL)
+_MODULE = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*)")
+
+
+@dataclass(frozen=True)
+class Door:
+    """A kind of part that can be put in."""
+
+    field: str
+    """What names it, as messages call it."""
+    group: str
+    """Entry points under which installed packages announce theirs."""
+    wanted: str
+    """What it must be: "a class with a method act"."""
+
+
+POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
+REWARDS = Door("reward", "airl_mav.rewards", "a function, or a class whose objects can be called")
+NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
+
+DOORS = (POLICIES, REWARDS, NETWORKS)
+
+
+def names_code(name: str) -> bool:
+    """Return whether a name is FILE.py:NAME or MODULE:NAME."""
+    return names_file(name) or _MODULE.fullmatch(name) is not None
+
+
+def names_file(name: str) -> bool:
+    """Return whether a name is FILE.py:NAME."""
+    return _FILE.fullmatch(name) is not None
+
+
+def announced(door: Door) -> dict[str, str]:
+    """Return what installed packages announce: name to MODULE:NAME. Nothing is imported."""
+    return {each.name: f"{each.module}:{each.attr}" for each in entry_points(group=door.group)}
+
+
+def reference(door: Door, name: str) -> str | None:
+    """Return a part's FILE.py:NAME or MODULE:NAME by any of its names; None: there is no such."""
+    return name if names_code(name) else announced(door).get(name)
+
+
+def accepted(door: Door, shipped: Sequence[str]) -> str:
+    """Return which names are accepted, as a message says it."""
+    known = [repr(name) for name in (*shipped, *announced(door))]
+    return f"{', '.join(known)}, FILE.py:NAME or MODULE:NAME"
+
+
+def part_name(door: Door, shipped: Sequence[str]) -> AfterValidator:
+    """Return the check of a text field that names a shipped part or one that is put in.
+
+    The part itself is not looked for: reading a file runs no code.
+    """
+
+    def check(name: str) -> str:
+        if name in shipped or reference(door, name) is not None:
+            return name
+        listed = accepted(door, shipped)
+        raise PydanticCustomError("literal_error", "unknown part", {"expected": listed})
+
+    return AfterValidator(check)
+
+
+def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> Any:
+    """Return a part by any of its names. Its file or module is run, once in a process.
+
+    Args:
+        door: What kind of part.
+        name: FILE.py:NAME, MODULE:NAME, or a name of an installed package's.
+        fits: Whether what was found can be one.
+
+    Raises:
+        FieldError: There is no such file, module or part, its module raises, or it does not fit.
+    """
+    found = reference(door, name)
+    if found is None:
+        raise FieldError(door.field, name, accepted(door, ()))
+    where, _, attribute = found.rpartition(":")
+    if names_file(found) and not Path(where).is_file():
+        raise FieldError(door.field, name, problem=f"{where}: no such file")
+    try:
+        module = _file_module(Path(where).resolve()) if names_file(found) else _module(where)
+    except Exception as error:
+        told = " ".join(f"{type(error).__name__}: {error}".split())
+        raise FieldError(door.field, name, problem=told) from error
+    part = getattr(module, attribute, None)
+    if part is None or not fits(part):
+        raise FieldError(door.field, name, f"{door.wanted}; {where} has none of this name")
+    return part
+
+
+def digest_of(found: str) -> str | None:
+    """Return the SHA-256 of the file that a FILE.py:NAME or MODULE:NAME lies in; None: in no file.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    where = found.rpartition(":")[0]
+    file: str | None = where
+    if not names_file(found):
+        file = getattr(_module(where), "__file__", None)
+    return None if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()
+
+
+def _module(name: str) -> ModuleType:
+    """Import a module, from the present folder too, behind all that is installed."""
+    here = str(Path.cwd())
+    if here not in sys.path and "" not in sys.path:
+        # A console script's path has its own folder in this place.
+        sys.path.append(here)
+    return importlib.import_module(name)
+
+
+@cache
+def _file_module(file: Path) -> ModuleType:
+    """Return the module of a file, run once in a process."""
+    # With the folder in its name: dataclasses and pickles look their module up, and two files of
+    # one name are two modules.
+    folder = hashlib.sha256(str(file.parent).encode()).hexdigest()[:8]
+    spec = importlib.util.spec_from_file_location(f"airl_mav_plugin_{file.stem}_{folder}", file)
+    assert spec is not None and spec.loader is not None  # noqa: S101 (a file that ends in .py)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[module.__name__] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[module.__name__]
+        raise
+    return module
