@@ -1,4 +1,4 @@
-"""`airl export`: turn a Stable-Baselines3 model into a policy that flies."""
+"""`airl export`: turn a trained model into a policy that flies."""
 
 from __future__ import annotations
 
@@ -20,19 +20,21 @@ from airl_mav.training.export_request import ExportRequest
 
 
 class ExportOptions(ExportRequest):
-    """Export a Stable-Baselines3 .zip to ONNX with a policy card.
+    """Export a stable-baselines3 .zip, or a torch module of your own, to ONNX with a policy card.
 
     The model must take a Dict of `depth` (uint8), `velocity` and `goal`, as `--layout` and
-    `--image` say, and give the actions of `--actions`. What a VecNormalize around the training
-    environment did is not in the .zip: such models do not fly right. A .zip holds pickled Python
-    objects: export only those of people you trust.
+    `--image` say, and give the actions of `--actions`; a module of your own may take the three as
+    arguments. What a VecNormalize around the training environment did is not in a .zip: such models
+    do not fly right. A .zip holds pickled Python objects, and a module is code: export only those
+    of people you trust.
 
     Examples:
-        airl export model.zip --algorithm PPO --out policies/mine --image 32x24 --actions arc-25
+        airl export model.zip --algorithm PPO --out policies/mine
+        airl export mypackage.nets:make_net --weights net.pt --like my.toml --out policies/mine
         airl export static-obstacles --int8 --out policies/static-obstacles-int8
     """
 
-    model: Annotated[Path, POSITIONAL] = Field(
+    model: Annotated[str, POSITIONAL] = Field(
         description=ExportRequest.model_fields["model"].description
     )
 
@@ -56,7 +58,7 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
     Nothing was written then.
     """
     console = console or Console()
-    card = _export_int8(options) if options.int8 else _export(options, options.out)
+    card = _export_int8(options) if options.int8 else _export(options)
     for line in (
         f"{options.out / ONNX_FILE}  {card.network}",
         f"{options.out / CARD_FILE}  {card.parameters:,} parameters, "
@@ -74,27 +76,27 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
     return 0
 
 
-def _export(options: ExportOptions, out: Path) -> PolicyCard:
+def _export(options: ExportOptions) -> PolicyCard:
     """Export a model in floats."""
-    if options.algorithm is None:
-        raise FieldError("algorithm", accepted="the class that wrote the model: DQN, PPO, A2C, ...")
-    facts = options.facts(shlex.join(["airl", *sys.argv[1:]]))
+    command = shlex.join(["airl", *sys.argv[1:]])
+    options.facts(command)
     # Imported late: torch takes seconds, and a wrong option is found without it.
     from airl_mav.training.export import export
 
-    return export(options.model, options.algorithm, facts, out, with_torch=options.with_torch)
+    return export(options, command)
 
 
 def _export_int8(options: ExportOptions) -> PolicyCard:
     """Export a model, or take a policy that is there, and write it in 8-bit integers."""
     if options.with_torch:
         raise FieldError("with_torch", problem="not with --int8: policy.pt2 would be in floats")
-    if options.model.is_file():
+    name = options.policy_name
+    if options.own_module or Path(options.model).is_file():
         with TemporaryDirectory(prefix="airl-export-") as scratch:
-            folder = Path(scratch) / options.policy_name
-            _export(options, folder)
-            return export_int8(folder, options.out, name=options.policy_name)
-    found = find_policy(str(options.model))
+            folder = Path(scratch) / name
+            _export(options.model_copy(update={"out": folder}))
+            return export_int8(folder, options.out, name=name)
+    found = find_policy(options.model)
     if found.folder is None:
         raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
-    return export_int8(found.folder, options.out, name=options.policy_name)
+    return export_int8(found.folder, options.out, name=name)

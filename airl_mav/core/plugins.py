@@ -44,8 +44,9 @@ class Door:
 POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
 REWARDS = Door("reward", "airl_mav.rewards", "a function, or a class whose objects can be called")
 NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
+MODELS = Door("model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments")
 
-DOORS = (POLICIES, REWARDS, NETWORKS)
+DOORS = (POLICIES, REWARDS, NETWORKS, MODELS)
 
 
 def names_code(name: str) -> bool:

@@ -16,9 +16,10 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
-from airl_mav.core.files import read_json, write_json
+from airl_mav.core.files import read_json, replace_file, write_json
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
+from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.vehicle import Camera
 
@@ -202,6 +203,8 @@ def open_model(folder: Path, card: PolicyCard, threads: int = 1) -> OnnxRuntime:
 def write_card(folder: Path, card: PolicyCard) -> None:
     """Write the card beside the policy that it is for; the old card stays until the new is whole.
 
+    Its page for people, `README.md`, is written after it, unless somebody else's has that name.
+
     Raises:
         UsageError: The folder holds another policy, or none.
     """
@@ -210,6 +213,14 @@ def write_card(folder: Path, card: PolicyCard) -> None:
         read_torch_program(folder, card)
     plain = {"schema": SCHEMA, **card.model_dump(mode="json")}
     write_json(folder / CARD_FILE, plain)
+    write_model_card(folder, card)
+
+
+def write_model_card(folder: Path, card: PolicyCard) -> None:
+    """Write a card's page for people, unless the folder has one that was not made so."""
+    page = folder / MODEL_CARD_FILE
+    if not page.exists() or MARK.encode() in page.read_bytes():
+        replace_file(page, model_card(card).encode())
 
 
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:

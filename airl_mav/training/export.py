@@ -1,10 +1,12 @@
-"""Exports Stable-Baselines3 models, our own or foreign, to policy folders."""
+"""Exports models to policy folders: of stable-baselines3, ours or foreign, and plain modules."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
 import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,11 +17,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import preprocess_obs
 from torch import nn
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.plugins import MODELS, load_part
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
 from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
+from airl_mav.training.export_request import ExportRequest, Taken
 from airl_mav.training.onnx_export import TOLERANCE, export_network, random_inputs
 
 CHECKED = 64
@@ -136,34 +140,90 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
         )
 
 
-def export(
-    model: Path, algorithm: str, facts: PolicyFacts, out: Path, *, with_torch: bool = False
-) -> PolicyCard:
-    """Turn the .zip of a Stable-Baselines3 model into a policy folder that flies.
+def export(asked: ExportRequest, command: str) -> PolicyCard:
+    """Turn the .zip of a stable-baselines3 model, or a plain module, into a policy that flies.
+
+    A .zip holds pickled Python objects, and a module is code: export only those of people you
+    trust.
 
     Args:
-        model: The .zip. It holds pickled Python objects: export only those of people you trust.
-        algorithm: Name of the class that wrote it, of stable-baselines3 or sb3-contrib.
-        facts: What the card says beyond the network.
-        out: Folder to write policy.onnx and card.json to; made if need be.
-        with_torch: Also write policy.pt2, for the torch runtime.
+        asked: The model, the folder, and what the card says beyond the network.
+        command: What the card says was the command.
 
     Returns:
         The card.
 
     Raises:
-        UsageError: The model cannot be loaded, does not fit the facts or cannot be exported, or
-            `out` cannot be written. Nothing usable was written then.
+        UsageError: The model cannot be loaded, does not fit what is said of it or cannot be
+            exported, or the folder cannot be written. Nothing usable was written then.
     """
+    out = asked.out
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: not a folder")
-    learner = load_sb3(model, algorithm)
+    write: Callable[[PolicyFacts], PolicyCard]
+    if asked.own_module:
+        facts = asked.facts(command)
+        module = load_module(asked.model, asked.weights)
+        write = partial(export_network, module, folder=out, with_torch=asked.with_torch)
+    else:
+        learner = load_sb3(Path(asked.model), asked.algorithm or "")
+        facts = asked.facts(command, taken_by(learner))
+        write = partial(export_sb3, learner, folder=out, with_torch=asked.with_torch)
     try:
-        return export_sb3(learner, facts, out, with_torch=with_torch)
+        return write(facts)
     except UsageError as error:
-        raise UsageError(f"{model}: {error}") from error
+        raise UsageError(f"{asked.model}: {error}") from error
     except OSError as error:
         raise UsageError(f"{out}: {error.strerror}") from None
+
+
+def taken_by(model: BaseAlgorithm) -> Taken:
+    """Return what a model's spaces say of the image and the action set."""
+    seen, space = model.observation_space, model.action_space
+    depth = seen.spaces.get(DEPTH) if isinstance(seen, spaces.Dict) else None
+    shape = None if depth is None else depth.shape
+    image = f"{shape[2]}x{shape[1]}" if shape is not None and len(shape) == 3 else None
+    return Taken(image, "velocity" if isinstance(space, spaces.Box) else None)
+
+
+def load_module(name: str, weights: Path | None) -> nn.Module:
+    """Return a module of the user's, in the form that `export_network` takes.
+
+    Args:
+        name: The module, its class, or a function that makes it, as `core.plugins` names code.
+        weights: Its `state_dict`, as `torch.save` wrote it; None: it comes with its weights.
+
+    Raises:
+        UsageError: It cannot be made, or the weights are not its.
+    """
+    found = load_part(MODELS, name)
+    try:
+        module = found if isinstance(found, nn.Module) else found()
+    except Exception as error:
+        problem = f"cannot be made without arguments: {first_line(error)}"
+        raise FieldError(MODELS.field, name, problem=problem) from error
+    if not isinstance(module, nn.Module):
+        raise FieldError(MODELS.field, name, MODELS.wanted)
+    if weights is not None:
+        _load_weights(module, weights)
+    taken = [
+        each
+        for each in inspect.signature(module.forward).parameters.values()
+        if each.default is each.empty and each.kind is not each.VAR_KEYWORD
+    ]
+    # One argument: the Dict of observations, as in a training loop on the environment itself.
+    return _Network(module) if len(taken) == 1 else module
+
+
+def _load_weights(module: nn.Module, path: Path) -> None:
+    """Load a module's weights; nothing is unpickled but tensors. Raises FieldError."""
+    if not path.is_file():
+        raise FieldError("weights", path, problem="no such file")
+    try:
+        module.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:  # Anything, from a bad archive to another network's weights.
+        told = " ".join(str(error).split())
+        raise FieldError("weights", path, problem=f"not the module's: {told[:200]}") from None
 
 
 def export_sb3(

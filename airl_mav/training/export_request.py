@@ -4,60 +4,110 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, Field
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
+from airl_mav.core.plugins import names_code
 from airl_mav.core.provenance import package_versions
+from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.layouts import LayoutName, ObservationSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
+
+FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
+"""How a policy is flown: fields of the request, of a card and of an environment's episodes."""
+
+DEFAULTS: dict[str, Any] = {
+    "layout": "body",
+    "image": "32x24",
+    "horizontal_fov_deg": 90.0,
+    "range_m": 20.0,
+    "actions": "arc-25",
+    "max_speed_m_s": PAPER_SPEED_M_S,
+    "hold_s": PilotSettings.hold_s,
+    "goal_radius_m": GOAL_RADIUS_M,
+    "altitude_m": PilotSettings.altitude_m,
+    "hover_after_s": None,
+}
+"""What is said of a model where nobody says anything else."""
+
+
+class Taken(NamedTuple):
+    """What can be read from a model: the size of its image, and its action set."""
+
+    image: str | None = None
+    actions: ActionSetName | None = None
 
 
 class ExportRequest(BaseModel):
     """A model, and what cannot be read from it."""
 
-    model: Path = Field(
-        description="the .zip that the model's `save` wrote; with --int8 also a policy, by its"
-        " name or folder"
+    model: str = Field(
+        description="the .zip that the model's `save` wrote, or a torch.nn.Module of your own, or a"
+        " function that makes one, as MODULE:NAME or FILE.py:NAME; with --int8 also a policy, by"
+        " its name or folder"
     )
     algorithm: str | None = Field(
         default=None,
-        description="class that wrote it, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C, ...;"
-        " not for a policy",
+        description="class that wrote a .zip, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C,"
+        " ...; of a module of your own only a note on the card",
+    )
+    weights: Path | None = Field(
+        default=None, description="state_dict of a module of your own, as torch.save wrote it"
+    )
+    like: str | None = Field(
+        default=None,
+        description="training configuration whose environment the model was made for, a shipped"
+        " name or a path to a .toml: says all that follows and is left out",
     )
     out: Path = Field(description="folder to write policy.onnx and card.json to")
     name: str | None = Field(
         default=None, description="short name of the policy; by default that of the folder"
     )
     description: str = Field(default="", description="one line about the policy")
-    layout: LayoutName = Field(
-        default="body", description="observation layout that the model was trained with"
+    layout: LayoutName | None = Field(
+        default=None,
+        description="observation layout that the model was trained with; by default body",
     )
-    image: str = Field(
-        default="32x24",
+    image: str | None = Field(
+        default=None,
         description="width x height of the image that the network sees, px; `paper`: with its"
-        " strip",
+        " strip; by default as the .zip says, or 32x24",
     )
-    horizontal_fov_deg: float = Field(
-        default=90.0, description="horizontal field of view of the camera, deg"
+    horizontal_fov_deg: float | None = Field(
+        default=None, description="horizontal field of view of the camera, deg; by default 90"
     )
-    range_m: float = Field(default=20.0, description="depth from which on everything looks far, m")
-    actions: ActionSetName = Field(
-        default="arc-25", description="action set that the model was trained with"
+    range_m: float | None = Field(
+        default=None, description="depth from which on everything looks far, m; by default 20"
     )
-    max_speed_m_s: float = Field(default=PAPER_SPEED_M_S, description="fastest action, m/s")
-    hold_s: float = Field(
-        default=PilotSettings.hold_s,
-        description="t3: how long an action is held before the next observation, s",
+    actions: ActionSetName | None = Field(
+        default=None,
+        description="action set that the model was trained with; by default arc-25, or velocity"
+        " where a .zip has continuous actions",
     )
-    goal_radius_m: float = Field(default=GOAL_RADIUS_M, description="radius of the goal, m")
-    altitude_m: float = Field(
-        default=PilotSettings.altitude_m, description="height above the start that is flown, m"
+    max_speed_m_s: float | None = Field(
+        default=None, description=f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}"
+    )
+    hold_s: float | None = Field(
+        default=None,
+        description="t3: how long an action is held before the next observation, s; by default"
+        f" {PilotSettings.hold_s:g}",
+    )
+    goal_radius_m: float | None = Field(
+        default=None, description=f"radius of the goal, m; by default {GOAL_RADIUS_M:g}"
+    )
+    altitude_m: float | None = Field(
+        default=None,
+        description="height above the start that is flown, m; by default"
+        f" {PilotSettings.altitude_m:g}",
     )
     hover_after_s: float | None = Field(
         default=None,
@@ -81,28 +131,83 @@ class ExportRequest(BaseModel):
         """Short name of the policy that is written."""
         return self.name if self.name is not None else self.out.resolve().name
 
-    def facts(self, command: str) -> PolicyFacts:
-        """Return what is said about the policy; `command` made it. Raises UsageError."""
-        size = re.fullmatch(r"(\d{1,4})x(\d{1,4})", self.image)
+    @property
+    def own_module(self) -> bool:
+        """Whether the model is a module of the user's."""
+        return names_code(self.model)
+
+    def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
+        """Return what is said about the policy.
+
+        Args:
+            command: What made it.
+            taken: What the model says of itself, once it is loaded.
+
+        Raises:
+            UsageError: A field is missing, contradicts another or is out of range.
+        """
+        if self.algorithm is None and not self.own_module:
+            raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")
+        if self.weights is not None and not self.own_module:
+            raise FieldError("weights", self.weights, "with a module of your own")
+        known: dict[str, Any] = {**DEFAULTS, **{k: v for k, v in _given(taken).items() if v}}
+        environment = None if self.like is None else _environment(self.like)
+        if environment is not None:
+            known |= _known_of(environment)
+        known |= {name: value for name in known if (value := getattr(self, name)) is not None}
+        image: str = known["image"]
+        size = re.fullmatch(r"(\d{1,4})x(\d{1,4})", image)
         if size is None:
-            raise FieldError("image", self.image, "WIDTHxHEIGHT in px, as 32x24")
-        image = {"layout": self.layout, "width_px": int(size[1]), "height_px": int(size[2])}
-        camera = self.model_dump(include={"horizontal_fov_deg", "range_m"})
-        speed = {"set": self.actions, "max_speed_m_s": self.max_speed_m_s}
-        facts = self.model_dump(
-            include={"description", "hold_s", "goal_radius_m", "altitude_m", "hover_after_s"}
-            | {"algorithm", "epsilon"}
-        ) | {
+            raise FieldError("image", image, "WIDTHxHEIGHT in px, as 32x24")
+        seen = {name: known[name] for name in ("layout", "horizontal_fov_deg", "range_m")}
+        seen |= {"width_px": int(size[1]), "height_px": int(size[2])}
+        speed = {"set": known["actions"], "max_speed_m_s": known["max_speed_m_s"]}
+        facts = {name: known[name] for name in FLOWN} | {
             "name": self.policy_name,
-            "observation": _observation(self.image, image | camera),
+            "description": self.description,
+            "algorithm": self.algorithm or "",
+            "epsilon": self.epsilon,
+            "observation": _observation(image, seen),
             "actions": validated(ActionSpec, speed),
             "training": Training(
+                arena=None if environment is None else environment.arena,
                 command=command,
                 versions=package_versions(),
                 date_utc=utc_now().isoformat(timespec="seconds"),
             ),
         }
         return validated(PolicyFacts, facts)
+
+
+def _given(taken: Taken | None) -> dict[str, Any]:
+    return {} if taken is None else taken._asdict()
+
+
+def _environment(name: str) -> EnvironmentSpec:
+    """Return the environment of a training configuration, its speed bounded if it asks."""
+    # Imported here: few exports need them.
+    from airl_mav.training.config import TrainingConfig
+
+    environment = load_profile("training", name, TrainingConfig).environment
+    if environment.safe_velocity is None:
+        return environment
+    from airl_mav.envs.delay import bounded
+
+    return bounded(environment)
+
+
+def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
+    """Return what an environment says of the policies that are made in it."""
+    camera = spec.camera.of(load_vehicle(spec.vehicle).camera)
+    return {
+        "layout": spec.layout,
+        "image": f"{spec.image_width_px}x{spec.image_height_px}",
+        "horizontal_fov_deg": camera.horizontal_fov_deg,
+        "range_m": camera.range_m,
+        "actions": spec.actions,
+        "max_speed_m_s": spec.max_speed_m_s,
+        **{name: getattr(spec.episode, name) for name in FLOWN},
+    }
 
 
 def _observation(image: str, data: dict[str, object]) -> ObservationSpec:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 import warnings
 import zipfile
@@ -222,7 +223,11 @@ def test_exports_are_equal_and_name_no_path_of_this_machine(tmp_path: Path) -> N
 def test_a_second_export_replaces_all_of_the_first(tmp_path: Path) -> None:
     export_tiny(tmp_path, with_torch=True)
     export_tiny(tmp_path, "PPO", name="other")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["card.json", "policy.onnx"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "README.md",
+        "card.json",
+        "policy.onnx",
+    ]
     assert load_card(tmp_path).name == "other"
 
 
@@ -360,6 +365,112 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *layout) == 0
     )
     assert load_card(tmp_path / "p").observation == paper
+
+
+def test_a_zip_says_its_image_and_kind_of_actions_itself(
+    zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("export", zips / "sac.zip", "--algorithm", "SAC", "--out", tmp_path / "p")
+    assert airl(monkeypatch, *words) == 0
+    card = read_card(tmp_path / "p")
+    assert (card.observation.width_px, card.observation.height_px) == (32, 24)
+    assert card.actions.set == "velocity"
+
+
+NETS = """
+import torch
+from torch import nn
+
+class Net(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.dense = nn.Linear(6, 2)
+
+    def forward(self, depth, velocity, goal):
+        nearest = depth.flatten(1).amin(dim=1, keepdim=True) / 255.0
+        return torch.tanh(self.dense(torch.cat([velocity, goal], dim=1))) * nearest
+
+class OfADict(Net):
+    def forward(self, seen):
+        return super().forward(seen["depth"], seen["velocity"], seen["goal"])
+
+def make_net():
+    return Net()
+
+number = 3
+
+def make_number():
+    return number
+
+class Needy(Net):
+    def __init__(self, width):
+        super().__init__()
+
+class Narrow(Net):
+    def forward(self, depth, velocity, goal):
+        return super().forward(depth, velocity, goal)[:, :1]
+"""
+
+
+@pytest.mark.parametrize("name", ["make_net", "OfADict"])
+def test_a_module_of_one_s_own_flies_as_it_decides(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "nets.py").write_text(NETS)
+    torch.manual_seed(3)
+    trained = nn.Linear(6, 2)
+    weights = {f"dense.{key}": value for key, value in trained.state_dict().items()}
+    torch.save(weights, tmp_path / "net.pt")
+    words = ("--weights", tmp_path / "net.pt", "--like", "dynamic-obstacles", "--hold-s", "0.3")
+    source, out = f"{tmp_path / 'nets.py'}:{name}", tmp_path / "mine"
+    assert airl(monkeypatch, "export", source, "--out", out, *words) == 0
+    card = load_card(out)
+    # Of the configuration, but for what was said.
+    assert (card.actions.set, card.hold_s, card.training.arena) == (
+        "velocity",
+        0.3,
+        "dynamic-obstacles",
+    )
+    assert card.observation == SPEC
+    seen = noise(20)
+    both = np.concatenate([seen["velocity"], seen["goal"]], axis=1)
+    with torch.no_grad():
+        wanted = torch.tanh(trained(torch.from_numpy(both))).numpy()
+    wanted *= seen["depth"].reshape(20, -1).min(axis=1, keepdims=True) / np.float32(255.0)
+    np.testing.assert_allclose(open_model(out, card).infer(seen), wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "words"),
+    [
+        ("nets.py:absent", [], "accepted: a torch.nn.Module, or what makes one"),
+        ("nets.py:make_number", [], "accepted: a torch.nn.Module, or what makes one"),
+        ("nets.py:Needy", [], "cannot be made without arguments: .* missing 1 required"),
+        ("absent.py:Net", [], "absent.py: no such file"),
+        ("nets.py:Net", ["--weights", "none.pt"], "--weights none.pt: no such file"),
+        ("nets.py:Net", ["--weights", "nets.py"], "--weights nets.py: not the module's: "),
+        ("nets.py:Net", ["--weights", "other.pt"], "not the module's: .*[Mm]issing key"),
+        ("nets.py:Net", ["--like", "nowhere"], "no training profile 'nowhere'; shipped: crowded"),
+        ("nets.py:Narrow", ["--actions", "velocity"], "outputs action .*accepted: action"),
+        ("model.zip", [], "algorithm: accepted: the class that wrote the .zip"),
+        ("model.zip", ["--algorithm", "PPO", "--weights", "o.pt"], "with a module of your own"),
+    ],
+)
+def test_a_module_that_cannot_be_exported_is_refused_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    options: list[str],
+    words: str,
+) -> None:
+    (tmp_path / "nets.py").write_text(NETS)
+    torch.save({"other.weight": torch.zeros(2)}, tmp_path / "other.pt")
+    monkeypatch.chdir(tmp_path)
+    assert airl(monkeypatch, "export", model, "--out", "out", *options) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(words, line)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

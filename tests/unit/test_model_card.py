@@ -1,0 +1,73 @@
+"""The page of a policy: what its card says, in the form that model hubs read."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from airl_mav.policy.card import MeasuredResult, add_result, read_card, write_card
+from airl_mav.policy.model_card import MODEL_CARD_FILE, QUALITIES, model_card
+from airl_mav.profiles.loading import profiles_dir
+
+yaml = pytest.importorskip("yaml", reason="needs the [docs] extra")
+
+SHIPPED = sorted(path.parent for path in (profiles_dir() / "policies").glob("*/card.json"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A copy of a shipped policy, without its page."""
+    copied = shutil.copytree(profiles_dir() / "policies/no-obstacles", tmp_path / "mine")
+    (copied / MODEL_CARD_FILE).unlink()
+    return Path(copied)
+
+
+@pytest.mark.parametrize("shipped", SHIPPED, ids=lambda path: path.name)
+def test_the_shipped_pages_say_what_their_cards_say(shipped: Path) -> None:
+    card = read_card(shipped)
+    page = (shipped / MODEL_CARD_FILE).read_text(encoding="utf-8")
+    assert page == model_card(card), "written by airl_mav.policy.card.write_model_card"
+    _, front, body = page.split("---\n", 2)
+    told = yaml.safe_load(front)
+    assert told["library_name"] == "airl-mav"
+    assert {"reinforcement-learning", "airl/Navigation-v0", card.algorithm} <= set(told["tags"])
+    (entry,) = told["model-index"]
+    assert entry["name"] == card.name
+    assert len(entry["results"]) == len(card.results)
+    for found, result in zip(entry["results"], card.results, strict=True):
+        assert result.arena in found["dataset"]["name"]
+        values = {metric["type"]: metric["value"] for metric in found["metrics"]}
+        wanted = {field: getattr(result, field) for field, _, _ in QUALITIES}
+        assert values == pytest.approx(wanted, abs=1e-4)
+    assert f"{card.parameters:,} parameters" in body
+
+
+def test_a_result_that_is_added_appears_on_the_page(folder: Path) -> None:
+    result = MeasuredResult(
+        arena='odd "arena": #1', level="lockstep", episodes=20, seed=5, success_rate=0.25
+    )
+    card = add_result(folder, result)
+    page = (folder / MODEL_CARD_FILE).read_text(encoding="utf-8")
+    assert page == model_card(card)
+    names = [
+        each["dataset"]["name"]
+        for each in yaml.safe_load(page.split("---\n")[1])["model-index"][0]["results"]
+    ]
+    assert 'arena odd "arena": #1, level lockstep, seeds 5 to 24' in names
+    assert "| 20 | 25.0% | - | - | - |" in page
+
+
+def test_a_page_of_somebody_s_own_stays(folder: Path) -> None:
+    (folder / MODEL_CARD_FILE).write_text("my own words")
+    write_card(folder, read_card(folder))
+    assert (folder / MODEL_CARD_FILE).read_text() == "my own words"
+
+
+def test_a_policy_without_results_has_none_on_its_page(folder: Path) -> None:
+    card = read_card(folder).model_copy(update={"results": (), "algorithm": "", "description": ""})
+    page = model_card(card)
+    assert "model-index" not in page
+    assert "## Results" not in page
+    assert yaml.safe_load(page.split("---\n")[1])["library_name"] == "airl-mav"
