@@ -9,21 +9,21 @@ import numpy as np
 from airl_mav.arena.footprints import Boxes, Floats, inner, outside_all
 from airl_mav.arena.geometry import Bounds
 from airl_mav.arena.placement import BATCH, BATCHES
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.profiles.arena import ArenaSpec
 
 
 def zone_radius_m(spec: ArenaSpec, zone: int | None) -> float:
     """Return how far [m] from the start a goal of a zone may be; None means the largest zone.
 
-    Raises UsageError when there is no such zone.
+    Raises FieldError when there is no such zone.
     """
     if zone is None:
         return spec.zones_m[-1]
     if not 0 <= zone < len(spec.zones_m):
-        raise UsageError(
-            f"zone = {zone}: accepted: 0 <= value <= {len(spec.zones_m) - 1} "
-            f"(zones_m {[f'{radius:g}' for radius in spec.zones_m]} m)".replace("'", "")
+        radii = ", ".join(f"{radius:g}" for radius in spec.zones_m)
+        raise FieldError(
+            "zone", zone, f"0 <= value <= {len(spec.zones_m) - 1} (zones_m [{radii}] m)"
         )
     return spec.zones_m[zone]
 

@@ -15,12 +15,15 @@ from airl_mav.policy.card import MeasuredResult, add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 
-SHARED = ("level", "vehicle", "computer", "workload", "latency", "ablate", "episodes", "seed")
+SHARED = (
+    *("level", "vehicle", "computer", "workload", "latency", "ablate", "zone", "episodes", "seed"),
+)
 """Fields that head a table: the same for all of it."""
 
 NOT_THE_POLICYS_OWN = (
     "ablate",
     "arena_seed",
+    "zone",
     "goal_radius_m",
     "hold_s",
     "altitude_m",

@@ -116,7 +116,8 @@ class GymFlier:
                 computer_w=scenario.computer.onboard_watts,
                 battery_charge=scenario.scenario.battery_charge,
             )
-            for slot, flown in fly_seeds(navigation, pilots, list(index_of), stop=stop):
+            zone = scenario.scenario.zone
+            for slot, flown in fly_seeds(navigation, pilots, list(index_of), zone=zone, stop=stop):
                 yield self._episode(navigation, trace, slot, flown, index_of[flown.seed])
 
         return fly
@@ -136,6 +137,7 @@ class GymFlier:
             seed=flown.seed,
             arena=self.scenario.scenario.arena,
             arena_seed=self.scenario.scenario.arena_seed_of(flown.seed),
+            zone=self.scenario.scenario.zone,
             outcome=outcome,
             reason=_reason(outcome, flights, slot, arena, rules.time_limit_s),
             goal=(float(arena.goal[0]), float(arena.goal[1])),

@@ -56,6 +56,8 @@ class EpisodeRecord:
     companion_use: ProcessUse | None = None
     """What the companion process took of its machine for the flight, from arming to the ground;
     None where it is no process of its own (gym, lockstep), and in older records."""
+    zone: int | None = None
+    """Curriculum zone that the goal was drawn in; None: the whole arena."""
     sha256: dict[str, str] | None = None
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA

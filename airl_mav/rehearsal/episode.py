@@ -168,6 +168,7 @@ def judged_record(
         seed=seed,
         arena=scenario.scenario.arena,
         arena_seed=scenario.scenario.arena_seed_of(seed),
+        zone=scenario.scenario.zone,
         outcome=verdict.outcome,
         reason=verdict.reason,
         goal_radius_m=referee.task.goal_radius_m,

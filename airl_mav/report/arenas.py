@@ -41,6 +41,7 @@ def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict
                 record.arena_seed,
                 name=record.arena,
                 vehicle_width_m=vehicle.body.width_m,
+                zone=record.zone,
             )
     return arenas
 

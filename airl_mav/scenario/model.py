@@ -31,6 +31,7 @@ GREATEST_SEED = 2**31
 GREATEST_EPISODES = 100_000
 GREATEST_WORKERS = 256
 GREATEST_SLOTS = 4096
+GREATEST_ZONE = 100
 
 LevelName = Literal["gym", "lockstep", "sitl"]
 RuntimeName = Literal["onnx", "torch"]
@@ -206,6 +207,14 @@ class Flights(Workers):
     arena_seed: int | None = _seed(
         "every episode in the arena, and with the goal, of this one seed; by default of its own",
         None,
+    )
+    zone: int | None = quantity(
+        "curriculum zone of the arena that every goal is drawn in: 0 is the smallest, around the"
+        " start; by default the largest, the whole arena",
+        "1",
+        ge=0,
+        le=GREATEST_ZONE,
+        default=None,
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
     speed: Annotated[float | None, FREE, NO_TWIN] = quantity(

@@ -136,6 +136,7 @@ class ResolvedScenario:
             self.scenario.arena_seed_of(seed),
             name=self.scenario.arena,
             vehicle_width_m=self.vehicle.body.width_m,
+            zone=self.scenario.zone,
         )
 
     def task(self, goal: tuple[float, float]) -> Task:
@@ -168,8 +169,13 @@ class ResolvedScenario:
             injection=self.injection,
             speed=self.speed,
             between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
-            conditions=", ".join(_conditions(scenario)),
+            conditions=", ".join([*_conditions(scenario), *self._zone()]),
         )
+
+    def _zone(self) -> Iterator[str]:
+        """Give the curriculum zone of the goals, where one was asked for."""
+        if (zone := self.scenario.zone) is not None:
+            yield f"zone {zone} (goals within {self.arena.zones_m[zone]:g} m)"
 
     @property
     def pack_j(self) -> float:

@@ -35,6 +35,7 @@ from airl_mav.rehearsal import episode_saver, run_folder
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, RunFolder, load
 from airl_mav.report import run_page
+from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison import show
 from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
@@ -110,6 +111,28 @@ def test_episodes_are_those_of_the_seeds(greedy: tuple[LoadedRun, str]) -> None:
         assert episode.goal == tuple(arena.goal)
         assert episode.arena == "dense-obstacles"
         assert episode.goal_radius_m == 3.0
+
+
+@pytest.mark.parametrize("level", ["gym", "lockstep"])
+def test_goals_of_a_zone(level: str, tmp_path: Path) -> None:
+    """The curriculum's zones: the same arenas, and goals no farther than the zone's radius."""
+    zone = {"zone": 0, "level": level, "episodes": 3, "seed": 20, "arena": ("static-obstacles",)}
+    code, _ = evaluate("greedy", out=tmp_path / "run", **zone)
+    assert code == 0
+    run_ = load(tmp_path / "run")
+    spec = load_profile("arenas", "static-obstacles", ArenaSpec)
+    for episode in run_.episodes:
+        asked = {"name": "again", "vehicle_width_m": 0.55}
+        whole = generate(spec, episode.arena_seed, **asked)
+        small = generate(spec, episode.arena_seed, zone=0, **asked)
+        assert episode.goal == tuple(small.goal)
+        assert math.hypot(*episode.goal) <= spec.zones_m[0] == 16.0
+        redrawn = arena_of(run_, episode)
+        assert redrawn is not None
+        assert tuple(redrawn.goal) == episode.goal, "the report draws what was flown"
+        assert np.array_equal(redrawn.obstacles.center, whole.obstacles.center)
+    assert any(np.hypot(*generate(spec, 20 + i, **asked).goal) > 16.0 for i in range(3))
+    assert "zone 0 (goals within 16 m)" in run_.info.setup.conditions
 
 
 def test_the_referee_of_the_rehearsal_says_the_same(greedy: tuple[LoadedRun, str]) -> None:
@@ -618,6 +641,9 @@ def test_a_changed_arena_file_is_another_run(tmp_path: Path) -> None:
         (("greedy",), {"arena": "moon"} | LOCKSTEP, "moon"),
         (("greedy",), {"hold_s": 11.0} | LOCKSTEP, "--hold-s 11"),
         (("greedy",), {"time_limit_s": 0.5} | LOCKSTEP, "--time-limit-s 0.5"),
+        (("greedy",), {"zone": 3}, "--zone 3: accepted: 0 <= value <= 2 (zones_m [16, 32, 48] m)"),
+        (("greedy",), {"zone": -1}, "--zone -1: accepted: 0 <= value"),
+        (("static-obstacles",), {"on_card": True, "zone": 0}, "--zone 0: accepted: without on-c"),
         (("greedy",), {"on_card": True}, "greedy has no card"),
         (("static-obstacles",), {"on_card": True, "hold_s": 0.7}, "--hold-s 0.7"),
     ],

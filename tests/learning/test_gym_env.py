@@ -246,7 +246,7 @@ def test_zones_bound_the_goal_until_a_seed_or_options_come() -> None:
     assert env.reset(seed=2)[1]["zone"] == -1
     assert env.reset(options={"zone": 1})[1]["zone"] == 1
     for options, message in (
-        ({"zone": 3}, "zone = 3: accepted: 0 <= value <= 2"),
+        ({"zone": 3}, "zone 3: accepted: 0 <= value <= 2"),
         ({"zone": 1.5}, "zone = 1.5: accepted: a whole number"),
         ({"zone": True}, "zone = True: accepted: a whole number"),
         ({"zon": 1}, "options: zon; accepted: zone"),

@@ -545,7 +545,7 @@ def test_a_hold_must_leave_time_for_setpoint_and_frame(
 
 def test_zones_and_seeds_are_checked() -> None:
     navigation = Navigation(spec_with(), 2)
-    with pytest.raises(UsageError, match="zone = 3: accepted: 0 <= value <= 2"):
+    with pytest.raises(UsageError, match="zone 3: accepted: 0 <= value <= 2"):
         navigation.begin([0], [1], 3)
     with pytest.raises(UsageError, match="seed = -1"):
         navigation.begin([0], [-1])
