@@ -6,8 +6,15 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
+from airl_mav.policy.action_sets import discrete_actions
+from airl_mav.policy.layouts import boxes
+from airl_mav.training.export import load_module
+from airl_mav.training.export_request import ExportRequest
+from airl_mav.training.onnx_export import random_inputs
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ROOT, running
 
@@ -63,6 +70,19 @@ def test_own_reward(tmp_path: Path) -> None:
     text = output_of("own_reward.py", tmp_path)
     assert (tmp_path / "short-and-cheap/policy/card.json").is_file()
     assert re.search(r"^(success|collision|timeout): ", text, re.M)
+
+
+def test_cleanrl_ppo_learns_by_itself_and_its_agent_can_be_exported(tmp_path: Path) -> None:
+    text = output_of("cleanrl_ppo.py", tmp_path)
+    assert len(re.findall(r"^ *\d+ steps: \d+ of \d+ flights", text, re.M)) == 3
+    weights = torch.load(tmp_path / "agent.pt", weights_only=True)
+    agent = load_module(f"{EXAMPLES / 'cleanrl_ppo.py'}:Agent", tmp_path / "agent.pt")
+    torch.testing.assert_close(dict(agent.state_dict()), dict(weights))
+    # In the form that the export takes, with the image that it takes by default.
+    facts = ExportRequest(model="cleanrl_ppo.py:Agent", out=tmp_path / "agent").facts("test")
+    seen = random_inputs(facts.observation, 3, np.random.default_rng(0))
+    scores = agent(*(torch.from_numpy(seen[key]) for key in boxes(facts.observation)))
+    assert scores.shape == (3, discrete_actions(facts.actions))
 
 
 def test_latency_curve_rises(tmp_path: Path) -> None:

@@ -24,11 +24,13 @@ from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED
 from airl_mav.envs.registration import NAVIGATION
+from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.single import NavigationEnv
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from tests.support.processes import ROOT
 
 PAPER: dict[str, Any] = {
     "layout": "paper",
@@ -108,6 +110,20 @@ def test_sb3_trains_on_the_environment_s_name_alone() -> None:
     model.learn(256)
     assert model.num_timesteps == 256
     assert not before.equal(model.policy.state_dict()["action_net.weight"])
+
+
+def test_the_hyper_parameters_for_rl_zoo_are_such_as_sb3_takes() -> None:
+    """As rl-zoo3 reads its files: by the id, and all but three are the learner's arguments."""
+    yaml = pytest.importorskip("yaml", reason="needs the [docs] extra")
+    asked = yaml.safe_load((ROOT / "examples/rl_zoo3_ppo.yml").read_text())[NAVIGATION]
+    flights, steps = asked.pop("n_envs"), asked.pop("n_timesteps")
+    env = NavigationVecEnv(NavigationVectorEnv(flights, arena="no-obstacles"))
+    model = PPO(env=env, **asked)
+    assert steps >= flights * model.n_steps, "at least one rollout"
+    assert flights * model.n_steps % model.batch_size == 0, "whole batches"
+    # One short rollout is enough to see that the network fits what it sees.
+    torch.set_num_threads(1)
+    PPO(env=env, **(asked | {"n_steps": 32})).learn(flights * 32)
 
 
 @pytest.mark.parametrize(
