@@ -1,4 +1,4 @@
-"""`airl list`: what is shipped."""
+"""`airl list`: what is shipped, and the policies of installed packages."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.plugins import POLICIES, announced
 from airl_mav.policy.registry import find_policy, policy_names
 from airl_mav.profiles.loading import Kind, describe_profile, list_profiles
 
@@ -21,7 +22,11 @@ def _profiles(kind: Kind) -> list[tuple[str, str]]:
 
 PROFILES: tuple[Kind, ...] = ("vehicles", "arenas", "computers", "training", "sweeps")
 KINDS: dict[str, Callable[[], list[tuple[str, str]]]] = {
-    "policies": lambda: [(name, find_policy(name).description) for name in policy_names()],
+    "policies": lambda: [
+        *((name, find_policy(name).description) for name in policy_names()),
+        # Not loaded: that would run their code.
+        *((name, f"installed: {where}") for name, where in announced(POLICIES).items()),
+    ],
     **{kind: partial(_profiles, kind) for kind in PROFILES},
 }
 

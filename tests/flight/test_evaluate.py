@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -116,22 +117,27 @@ def test_episodes_are_those_of_the_seeds(greedy: tuple[LoadedRun, str]) -> None:
 @pytest.mark.parametrize("level", ["gym", "lockstep"])
 def test_goals_of_a_zone(level: str, tmp_path: Path) -> None:
     """The curriculum's zones: the same arenas, and goals no farther than the zone's radius."""
-    zone = {"zone": 0, "level": level, "episodes": 3, "seed": 20, "arena": ("static-obstacles",)}
-    code, _ = evaluate("greedy", out=tmp_path / "run", **zone)
+    asked: dict[str, Any] = {
+        "zone": 0,
+        "level": level,
+        "episodes": 3,
+        "seed": 20,
+        "arena": ("static-obstacles",),
+    }
+    code, _ = evaluate("greedy", out=tmp_path / "run", **asked)
     assert code == 0
     run_ = load(tmp_path / "run")
     spec = load_profile("arenas", "static-obstacles", ArenaSpec)
+    again = partial(generate, spec, name="again", vehicle_width_m=0.55)
     for episode in run_.episodes:
-        asked = {"name": "again", "vehicle_width_m": 0.55}
-        whole = generate(spec, episode.arena_seed, **asked)
-        small = generate(spec, episode.arena_seed, zone=0, **asked)
+        whole, small = again(episode.arena_seed), again(episode.arena_seed, zone=0)
         assert episode.goal == tuple(small.goal)
         assert math.hypot(*episode.goal) <= spec.zones_m[0] == 16.0
         redrawn = arena_of(run_, episode)
         assert redrawn is not None
         assert tuple(redrawn.goal) == episode.goal, "the report draws what was flown"
         assert np.array_equal(redrawn.obstacles.center, whole.obstacles.center)
-    assert any(np.hypot(*generate(spec, 20 + i, **asked).goal) > 16.0 for i in range(3))
+    assert any(math.hypot(*again(seed).goal) > 16.0 for seed in run_.info.seeds)
     assert "zone 0 (goals within 16 m)" in run_.info.setup.conditions
 
 

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import shutil
 import sys
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from airl_mav.cli import listing
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.plugins import DOORS, POLICIES, load_part, names_code
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.policy.registry import find_policy, load_policy
+from airl_mav.profiles.loading import profiles_dir
 from airl_mav.scenario.file import anchored
 from airl_mav.scenario.model import Scenario
 from airl_mav.training.config import TrainingConfig
@@ -71,6 +77,11 @@ def test_a_policy_by_the_name_that_its_package_announces(installed: str) -> None
     assert (known.name, known.program) == ("their-hover", "their_parts.policy:Hover")
     assert known.sha256 == find_policy("their_parts.policy:Hover").sha256
     assert type(load_policy(installed, 0.5)) is load_part(POLICIES, "their_parts.policy:Hover")
+    console = Console(width=120, file=StringIO())
+    assert listing.run(listing.ListOptions(kind="policies"), console) == 0
+    printed = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "their-hover" in printed
+    assert "installed: their_parts.policy:Hover" in printed
     with pytest.raises(UsageError, match=r"known: greedy, .*their-hover \(or a path"):
         find_policy("their-hovver")
 
@@ -127,6 +138,25 @@ def test_reading_a_file_that_names_code_runs_none(package: Path) -> None:
     config = TrainingConfig(description="", network={"kind": own, "options": {"width": 3}})
     assert config.network.own
     assert Scenario(policy=own).policy == own
+    assert "their_parts" not in sys.modules
+
+
+def test_a_card_names_no_code(package: Path) -> None:
+    """A folder that was sent by somebody: reading and flying it imports nothing."""
+    (package / "policy.py").write_text("raise SystemExit('run')\n")
+    folder = package.parent / "sent"
+    shutil.copytree(profiles_dir() / "policies/no-obstacles", folder)
+    plain = json.loads((folder / "card.json").read_text())
+    del plain["crc32"]
+    for table, field in (("actions", "set"), ("observation", "layout")):
+        evil = plain | {table: plain[table] | {field: "their_parts.policy:Evil"}}
+        (folder / "card.json").write_text(json.dumps(evil))
+        with pytest.raises(UsageError, match=rf"{table}\.{field} = 'their_parts.policy:Evil'"):
+            find_policy(str(folder))
+    # What trained it is a note: nobody loads it.
+    plain["training"]["config"]["environment"]["reward"] = "their_parts.policy:Evil"
+    (folder / "card.json").write_text(json.dumps(plain))
+    load_policy(str(folder), 0.5)
     assert "their_parts" not in sys.modules
 
 
