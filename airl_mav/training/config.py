@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+import difflib
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.policy.action_sets import ActionSetName, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
+from airl_mav.training.table import ALGORITHMS, EARLIER_NAMES, ActionKind, fitting
 
 SELECTION_SEED = 500_000
 """First seed of the selection episodes; those of training begin at a million, those of evaluation
@@ -20,6 +24,18 @@ SHIPPED_NETWORKS = ("small", "appendix", "template")
 NetworkKind = Annotated[str, part_name(NETWORKS, SHIPPED_NETWORKS)]
 Precision = Literal["float32", "bfloat16"]
 Option = bool | int | float | str | list[int | float | str]
+
+
+def kind_of(actions: ActionSetName) -> ActionKind:
+    """Return whether an action set is discrete or continuous."""
+    return "continuous" if discrete_actions(ActionSpec(set=actions)) is None else "discrete"
+
+
+ACTION_SETS = {
+    kind: [name for name in get_args(ActionSetName) if kind_of(name) == kind]
+    for kind in get_args(ActionKind)
+}
+"""The action sets of each kind."""
 
 
 class NetworkSpec(ProfileModel):
@@ -85,11 +101,10 @@ class NetworkSpec(ProfileModel):
 class AlgorithmSpec(ProfileModel):
     """The learner and its hyperparameters.
 
-    `dqn` (double, n-step) takes all fields; any other algorithm the first five, as far as it
-    has them, and the rest of its own arguments in `options`.
+    Each algorithm has some of the fields (`table.ALGORITHMS`), and more of its own in `options`.
     """
 
-    name: str = Field(default="dqn", description="dqn, ppo or another by its class name")
+    name: str = Field(default="dqn", description=", ".join(ALGORITHMS))
     learning_rate: float = quantity("step of the optimiser", "1", gt=0, le=1, default=3e-4)
     learning_rate_final: float | None = quantity(
         "its last value, reached in a straight line; left out: it stays",
@@ -119,8 +134,69 @@ class AlgorithmSpec(ProfileModel):
         default="float32", description="numbers of the updates; bfloat16 is for wide networks"
     )
     options: dict[str, Option] = Field(
-        default_factory=dict, description="further arguments of the stable-baselines3 class"
+        default_factory=dict,
+        description="hyperparameters that the algorithm alone has, by stable-baselines3's names",
     )
+
+    @field_validator("name")
+    @classmethod
+    def _is_known(cls, name: str) -> str:
+        name = EARLIER_NAMES.get(name, name)
+        if name not in ALGORITHMS:
+            raise FieldError("algorithm.name", name, ", ".join(ALGORITHMS))
+        return name
+
+    @model_validator(mode="after")
+    def _options_fit_the_algorithm(self) -> AlgorithmSpec:
+        row = ALGORITHMS[self.name]
+        if row.options is not None:
+            check_names(self, row.options.model_fields)
+            try:
+                validated(row.options, self.options)
+            except FieldError as error:
+                raise FieldError(
+                    f"algorithm.options.{error.field}", error.value, error.accepted, error.problem
+                ) from None
+        return self
+
+
+def check_fields(spec: AlgorithmSpec) -> None:
+    """Raise FieldError for a field that was given and that the algorithm does not have.
+
+    No validator of the model: what a run has noted of its configuration names every field.
+    """
+    known = ALGORITHMS[spec.name].fields
+    for name in sorted(spec.model_fields_set - {"name", "options", "learning_rate_final"}):
+        if name not in known:
+            raise FieldError(
+                f"algorithm.{name}",
+                problem=f"{spec.name!r} has no such field; fields: {', '.join(known)}",
+            )
+
+
+def check_names(spec: AlgorithmSpec, accepted: Iterable[str]) -> None:
+    """Raise FieldError for an option that is not among those accepted."""
+    names = list(accepted)
+    for name in spec.options:
+        if name not in names:
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"accepted: {', '.join(names)}"
+            raise FieldError(
+                f"algorithm.options.{name}", problem=f"unknown to {spec.name!r}; {hint}"
+            )
+
+
+def check_actions(name: str, kind: ActionKind) -> None:
+    """Raise FieldError unless an algorithm can choose from a kind of action set."""
+    wanted = ALGORITHMS[name].actions
+    if wanted not in (None, kind):
+        sets = ", ".join(ACTION_SETS[wanted])
+        raise FieldError(
+            "algorithm.name",
+            name,
+            f"a {wanted} action set (environment.actions: {sets}), and this one is {kind}; "
+            f"with it: {', '.join(fitting(kind))}",
+        )
 
 
 class Selection(ProfileModel):
@@ -153,6 +229,11 @@ class TrainingConfig(ProfileModel):
     network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")
     algorithm: AlgorithmSpec = Field(default_factory=AlgorithmSpec, description="algorithm")
     selection: Selection = Field(default_factory=Selection, description="periodic evaluation")
+
+    @model_validator(mode="after")
+    def _chooses_from_the_action_set(self) -> TrainingConfig:
+        check_actions(self.algorithm.name, kind_of(self.environment.actions))
+        return self
 
 
 def configured(

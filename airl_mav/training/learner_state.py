@@ -50,6 +50,8 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
         "variables": {n: attrgetter(n)(model).detach() for n in _variables(model)},
         "rng": {"cpu": torch.get_rng_state()},
     }
+    if memory := _memory(model):
+        weights["memory"] = memory
     if model.device.type == "cuda":
         weights["rng"]["cuda"] = torch.cuda.get_rng_state(model.device)
     last = cast("Mapping[str, NDArray[Any]]", model._last_obs)
@@ -82,6 +84,10 @@ def restore(
     model.set_parameters(weights["states"], exact_match=True, device=model.device)
     for name in _variables(model):
         attrgetter(name)(model).data.copy_(weights["variables"][name])
+    for ours, saved in zip(_memory(model), weights.get("memory", []), strict=True):
+        if ours.shape != saved.shape:
+            raise ValueError(f"memory of shape {tuple(saved.shape)}, not {tuple(ours.shape)}")
+        ours.copy_(saved)
     starts = arrays["last_episode_starts"]
     if starts.shape != (model.n_envs,):
         raise ValueError(f"{len(starts)} vehicles, not {model.n_envs}")
@@ -107,6 +113,12 @@ def restore(
 
 def _variables(model: BaseAlgorithm) -> list[str]:
     return model._get_torch_save_params()[1]
+
+
+def _memory(model: BaseAlgorithm) -> list[torch.Tensor]:
+    """Return what a recurrent learner's networks remember of the flights that go on."""
+    states = getattr(model, "_last_lstm_states", None)
+    return [] if states is None else [each for pair in states for each in pair]
 
 
 def _generators(model: BaseAlgorithm) -> list[np.random.Generator]:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 from typing import Any
 
 import pytest
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 
 from airl_mav.core.errors import UsageError
-from airl_mav.training.algorithms import CLASSES, CONTINUOUS_ONLY, ROLLOUT, make_model
-from airl_mav.training.config import AlgorithmSpec, NetworkSpec
+from airl_mav.training.algorithms import NOT_OPTIONS, ROLLOUT, make_model
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec, TrainingConfig
 from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.table import ALGORITHMS
 from tests.support.toy_fleet import ToyFleet
 
 SHORT: dict[str, dict[str, Any]] = {
     "ppo": {"options": {"n_steps": 16, "n_epochs": 1}, "batch_size": 32},
+    "recurrent-ppo": {"options": {"n_steps": 16, "lstm_hidden_size": 8}, "batch_size": 32},
     "trpo": {"options": {"n_steps": 8}, "batch_size": 16},
     "a2c": {},
 }
@@ -26,9 +30,9 @@ def make(name: str, *, continuous: bool = False, **fields: Any) -> Any:
     return make_model(spec, NetworkSpec(), ToyFleet(4, continuous=continuous), seed=0)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@pytest.mark.parametrize("name", ALGORITHMS)
 def test_every_known_algorithm_learns(name: str) -> None:
-    model = make(name, continuous=name in CONTINUOUS_ONLY, **SHORT.get(name, REPLAYING))
+    model = make(name, continuous=ALGORITHMS[name].actions == "continuous", **SHORT.get(name, REPLAYING))
     before = {k: v.clone() for k, v in model.policy.state_dict().items()}
     model.learn(100)
     after = model.policy.state_dict()
@@ -76,15 +80,22 @@ def test_whole_batches_fill_a_rollout(vehicles: int) -> None:
 @pytest.mark.parametrize(
     ("fields", "line"),
     [
-        ({"name": "reinforce"}, "algorithm.name = 'reinforce': accepted: dqn, ppo, a2c"),
-        ({"name": "sac"}, "'sac': chooses continuous actions, the action set is discrete"),
+        ({"name": "reinforce"}, "algorithm.name 'reinforce': accepted: dqn, qr-dqn, ppo, rec"),
+        ({"name": "sac"}, "'sac': accepted: a continuous action set (environment.actions: veloc"),
+        ({"name": "tqc"}, "and this one is discrete; with it: dqn, qr-dqn, ppo, recurrent-ppo"),
         ({"name": "ppo", "n_step": 3}, "algorithm.n_step: 'ppo' has no such field; fields: learn"),
         ({"name": "a2c", "batch_size": 3}, "algorithm.batch_size: 'a2c' has no such field"),
         ({"name": "ppo", "options": {"nsteps": 3}}, "did you mean 'n_steps'"),
         ({"name": "dqn", "options": {"train_freq": 3}}, "options.train_freq: unknown to 'dqn'"),
         ({"name": "ppo", "options": {"policy": "x"}}, "options.policy: unknown to 'ppo'"),
         ({"name": "ppo", "options": {"gamma": 0.5}}, "options.gamma: unknown to 'ppo'"),
-        ({"name": "ppo", "options": {"clip_range": "x"}}, "algorithm.options of 'ppo': "),
+        ({"name": "ppo", "options": {"clip_range": "x"}}, "clip_range 'x': accepted: 0 < value"),
+        ({"name": "qr-dqn", "options": {"n_quantiles": 0}}, "n_quantiles 0: accepted: 1 <= value"),
+        ({"name": "sac", "options": {"ent_coef": "low"}}, "algorithm.options.ent_coef 'low': acc"),
+        (
+            {"name": "recurrent-ppo", "options": {"shared_lstm": True}},
+            "algorithm.options of 'recurrent-ppo': You must choose",
+        ),
     ],
 )
 def test_misuse_gets_one_line(fields: dict[str, Any], line: str) -> None:
@@ -94,7 +105,46 @@ def test_misuse_gets_one_line(fields: dict[str, Any], line: str) -> None:
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("name", ["dqn", "qrdqn"])
+@pytest.mark.parametrize("name", ["dqn", "qr-dqn"])
 def test_discrete_learners_are_refused_on_continuous_actions(name: str) -> None:
-    with pytest.raises(UsageError, match="chooses discrete actions"):
+    with pytest.raises(UsageError, match="accepted: a discrete action set"):
         make(name, continuous=True)
+    with pytest.raises(UsageError, match=r"a discrete action set \(environment.actions: arc-25,"):
+        TrainingConfig.model_validate(
+            {
+                "description": "any",
+                "algorithm": {"name": name},
+                "environment": {"actions": "velocity"},
+            }
+        )
+
+
+@pytest.mark.parametrize("name", [k for k, row in ALGORITHMS.items() if row.options is not None])
+def test_the_table_has_what_the_classes_take(name: str) -> None:
+    """Nothing that a file may hold is missing, and nothing is in it that the class refuses."""
+    row = ALGORITHMS[name]
+    assert row.options is not None
+    module, _, learner = row.source.rpartition(".")
+    taken = inspect.signature(getattr(importlib.import_module(module), learner)).parameters
+    if "arguments" in taken:  # Passed on to stable-baselines3's.
+        assert set(row.options.model_fields) <= set(inspect.signature(DQN).parameters)
+        return
+    noise = {"use_sde", "sde_sample_freq", "use_sde_at_warmup"}  # Not restored by a checkpoint.
+    steps = {"n_steps"} if "buffer_size" in taken else set()  # Not with Dict observations.
+    assert set(row.fields.values()) < set(taken)
+    assert set(row.options.model_fields) - set(row.to_policy) == (
+        set(taken) - NOT_OPTIONS - noise - steps
+    )
+    assert set(row.defaults) <= set(row.options.model_fields)
+
+
+def test_options_reach_the_learner_and_the_network() -> None:
+    tqc = make(
+        "tqc",
+        continuous=True,
+        options={"n_quantiles": 9, "n_critics": 3, "top_quantiles_to_drop_per_net": 1, "tau": 0.1},
+    )
+    assert (tqc.critic.n_quantiles, tqc.critic.n_critics) == (9, 3)
+    assert (tqc.top_quantiles_to_drop_per_net, tqc.tau) == (1, 0.1)
+    assert make("qrdqn", options={"n_quantiles": 11}).policy.n_quantiles == 11, "an earlier name"
+    assert make("recurrent-ppo").policy.lstm_actor.hidden_size == 128
