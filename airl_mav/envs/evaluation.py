@@ -65,17 +65,21 @@ class Pilots(Protocol):
 
 
 class LearnedPilots:
-    """A network that decides for all vehicles at once."""
+    """A network that decides for all vehicles at once, or for each by itself if it must."""
 
     def __init__(self, policy: LearnedPolicy, chance: Callable[[int], np.random.Generator]) -> None:
         """Take the policy; `chance` returns the generator of random actions for a seed."""
         self._policy = policy
         self._chance = chance
-        self._rngs: dict[int, np.random.Generator] = {}
+        # What chance draws must not depend on the neighbours, and what is remembered must be the
+        # companion's to the last bit, which n rows at a time do not give.
+        self._alone = bool(policy.card.epsilon or policy.card.state)
+        self._own: dict[int, LearnedPolicy] = {}
 
     def begin(self, slot: int, seed: int) -> None:
-        """Give the episode its own random actions."""
-        self._rngs[slot] = self._chance(seed)
+        """Give the episode its own random actions and an empty memory."""
+        if self._alone:
+            self._own[slot] = self._policy.with_generator(self._chance(seed))
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the commands; see `Pilots`.
@@ -86,14 +90,12 @@ class LearnedPilots:
         card = self._policy.card
         encoded = encode_layout(card.observation, seen)
         try:
-            if not card.epsilon:
+            if not self._alone:
                 return commands(card.actions, self._policy.act_batch(encoded))
             chosen = np.zeros((len(flying), 3))
             for i in np.flatnonzero(flying):
-                # One by one: what chance draws must not depend on the neighbours.
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
-                action = self._policy.act_batch(row, self._rngs[int(i)])
-                chosen[i] = commands(card.actions, action)[0]
+                chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
         except ValueError as error:
             raise UsageError(f"policy {card.name}: {error}") from None
         return chosen
@@ -124,12 +126,17 @@ class SinglePilots:
 class _EncodedPilots:
     """A bare function of the environment's own encoding."""
 
-    def __init__(self, navigation: Navigation, decide: Decide) -> None:
+    def __init__(
+        self, navigation: Navigation, decide: Decide, began: Callable[[int], None] | None
+    ) -> None:
         self._navigation = navigation
         self._decide = decide
+        self._began = began
 
-    def begin(self, slot: int, seed: int) -> None:
-        """Do nothing: the function has no memory."""
+    def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
+        """Tell the function, if it wants to know."""
+        if self._began is not None:
+            self._began(slot)
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:  # noqa: ARG002
         """Return the commands; see `Pilots`."""
@@ -144,6 +151,7 @@ def fly_episodes(
     *,
     slots: int = SLOTS,
     zone: int | None = None,
+    began: Callable[[int], None] | None = None,
 ) -> Iterator[EpisodeResult]:
     """Fly one episode a seed and yield each as it ends, in the order in which they end.
 
@@ -155,11 +163,13 @@ def fly_episodes(
         seeds: Seeds of the episodes.
         slots: Number of flights at a time.
         zone: Curriculum zone that bounds the goals; None is the largest.
+        began: Called with the slot in which an episode begins: for a policy with a memory.
     """
     if not seeds:
         return
     navigation = Navigation(spec, min(slots, len(seeds)))
-    for _, flown in fly_seeds(navigation, _EncodedPilots(navigation, decide), seeds, zone=zone):
+    pilots = _EncodedPilots(navigation, decide, began)
+    for _, flown in fly_seeds(navigation, pilots, seeds, zone=zone):
         yield flown
 
 

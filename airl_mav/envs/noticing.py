@@ -67,7 +67,9 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
         cameras.capture(fleet, arenas, np.ones(n, np.bool_), np.zeros(n, np.int64))
         state = Kinematics(fleet.position, fleet.velocity, fleet.quaternion)
         seen = observe(cameras.image, Intrinsics.of(camera), state, arenas.goal)
-        chosen = commands(card.actions, policy.act_batch(encode_layout(card.observation, seen)))
+        # As at the first decision of a flight, where the policy has a memory.
+        fresh = policy.with_generator(np.random.default_rng(0)) if card.state else policy
+        chosen = commands(card.actions, fresh.act_batch(encode_layout(card.observation, seen)))
         moved = np.abs(chosen[:-1] - chosen[-1]).max(axis=1)
         ignored = np.flatnonzero(moved <= SAME * card.actions.max_speed_m_s)
         reach = ignored[0] if ignored.size else len(depths)

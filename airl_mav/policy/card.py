@@ -140,6 +140,11 @@ class PolicyCard(PolicyFacts):
     torch_sha256: Digest | None = Field(
         default=None, description=f"SHA-256 digest of {TORCH_FILE}, if there is one"
     )
+    state: dict[str, tuple[Count, ...]] = Field(
+        default_factory=dict,
+        description="what a network with a memory remembers from decision to decision: shapes by "
+        "name; the input NAME takes it, the output next_NAME gives it, zeros begin a flight",
+    )
     network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
@@ -195,7 +200,7 @@ def open_model(folder: Path, card: PolicyCard, threads: int = 1) -> OnnxRuntime:
     """Return the policy of a card, ready to infer. Raises UsageError as `load_card` does."""
     model = read_model(folder, card)
     try:
-        return OnnxRuntime(model, card.observation, card.actions, threads)
+        return OnnxRuntime(model, card.observation, card.actions, threads, card.state)
     except ValueError as error:
         raise UsageError(f"{folder / ONNX_FILE}: {error}") from None
 

@@ -16,12 +16,23 @@ from airl_mav.policy.actions import Action
 from airl_mav.policy.card import TORCH_FILE, PolicyCard, open_model, read_card, read_torch_program
 from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.runtime import Runtime, RuntimeName, TorchRuntime, outputs_of
+from airl_mav.policy.runtime import (
+    Memory,
+    Runtime,
+    RuntimeName,
+    TorchRuntime,
+    blank_memory,
+    outputs_of,
+)
 from airl_mav.profiles.loading import profiles_dir
 
 
 class LearnedPolicy:
-    """A network with its card. Implements `actions.Policy`."""
+    """A network with its card. Implements `actions.Policy`.
+
+    A network with a memory remembers one flight, or n side by side: an object flies them from
+    their first decision to their last, and `with_generator` gives the one for the next flight.
+    """
 
     def __init__(
         self,
@@ -51,6 +62,8 @@ class LearnedPolicy:
         self._ablate = ablate
         self._fitting: Intrinsics | None = None
         """The camera that was found to fit."""
+        self._memory: Memory | None = None
+        """What the network remembers of its flights; None before their first decision."""
 
     @property
     def name(self) -> str:
@@ -58,7 +71,7 @@ class LearnedPolicy:
         return self.card.name
 
     def with_generator(self, rng: np.random.Generator) -> LearnedPolicy:
-        """Return the same policy with another source of random actions."""
+        """Return the same policy at its first decision, with another source of random actions."""
         return LearnedPolicy(self.card, self._runtime, rng=rng, ablate=self._ablate)
 
     def refuses(self, camera: Intrinsics) -> str | None:
@@ -87,11 +100,24 @@ class LearnedPolicy:
         Args:
             encoded: The arrays of the card's layout, each with n rows.
             rng: Source of random actions in this call; None: the policy's own.
+
+        Raises:
+            ValueError: The network gives no number, or it remembers another number of flights.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
-        outputs = self._runtime.infer(encoded)
+        outputs = self._remembering(encoded) if self.card.state else self._runtime.infer(encoded)
         return decide(self.card.actions, outputs, self.card.epsilon, rng or self._rng)
+
+    def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the outputs of a network with a memory, and remember what it gives."""
+        n = len(next(iter(encoded.values())))
+        memory = blank_memory(self.card.state, n) if self._memory is None else self._memory
+        known = len(next(iter(memory.values())))
+        if known != n:
+            raise ValueError(f"{n} flights; accepted: {known}, as at the first decision")
+        outputs, self._memory = self._runtime.step(encoded, memory)
+        return outputs
 
 
 def decide(
@@ -152,7 +178,11 @@ def load_learned(
     network = open_network(folder, card, runtime, threads, trust=trust)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     blank = {k: np.zeros((1, *box.shape), box.dtype) for k, box in boxes(card.observation).items()}
-    found, wanted = network.infer(blank).shape, (1, outputs_of(card.actions))
+    if card.state:
+        outputs, _ = network.step(blank, blank_memory(card.state, 1))
+    else:
+        outputs = network.infer(blank)
+    found, wanted = outputs.shape, (1, outputs_of(card.actions))
     if found != wanted:
         raise UsageError(f"policy {card.name}: output {found}; accepted: {wanted}")
     return policy
@@ -185,6 +215,6 @@ def open_network(
             "if you trust its maker, or with the onnx runtime"
         )
     try:
-        return TorchRuntime(program, card.observation, threads)
+        return TorchRuntime(program, card.observation, threads, card.state)
     except ValueError as error:
         raise UsageError(f"{folder / TORCH_FILE}: {error}") from None

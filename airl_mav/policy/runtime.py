@@ -1,6 +1,10 @@
 """What runs a network: ONNX Runtime, or torch where it is installed.
 
 Both are imported only when a network is opened: a classical policy needs neither.
+
+A network with a memory takes what it remembers as further inputs, and gives what it will remember
+as further outputs, whose names begin with `next_`. It keeps nothing itself: one runtime serves any
+number of flights.
 """
 
 from __future__ import annotations
@@ -18,7 +22,16 @@ from airl_mav.policy.layouts import ObservationSpec, boxes
 RuntimeName = Literal["onnx", "torch"]
 
 ACTION = "action"
-"""Name of the network's only output."""
+"""Name of the output that decides: the only one of a network without memory."""
+
+NEXT = "next_"
+"""What the name of a memory's output begins with; the rest is the name of its input."""
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""What a network remembers: the shape of each array by name, without the leading axis."""
+
+Memory = dict[str, NDArray[np.float32]]
+"""What the networks of n flights remember: arrays of n rows by name."""
 
 CONTINUOUS_OUTPUTS = 2
 """Numbers of a continuous action: forward and right speed."""
@@ -39,6 +52,17 @@ class Runtime(Protocol):
         """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
         ...
 
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        ...
+
+
+def blank_memory(shapes: Shapes, n: int) -> Memory:
+    """Return what the networks of n flights remember before their first decision: zeros."""
+    return {name: np.zeros((n, *shape), np.float32) for name, shape in shapes.items()}
+
 
 def outputs_of(actions: ActionSpec) -> int:
     """Return the number of outputs: a score for each discrete action, or the action itself."""
@@ -49,7 +73,12 @@ class OnnxRuntime:
     """A network in ONNX Runtime, on the CPU. Implements `Runtime`."""
 
     def __init__(
-        self, model: bytes, observation: ObservationSpec, actions: ActionSpec, threads: int = 1
+        self,
+        model: bytes,
+        observation: ObservationSpec,
+        actions: ActionSpec,
+        threads: int = 1,
+        state: Shapes | None = None,
     ) -> None:
         """Open a network.
 
@@ -58,6 +87,7 @@ class OnnxRuntime:
             observation: What it must take.
             actions: What it must give.
             threads: Threads of one inference. Small networks are fastest with one.
+            state: What it must remember from decision to decision; None: nothing.
 
         Raises:
             ValueError: No ONNX, or other inputs or outputs.
@@ -78,24 +108,40 @@ class OnnxRuntime:
             )
         except Exception as error:  # ONNX Runtime's errors share no other base class.
             raise ValueError(f"not a model that ONNX Runtime loads: {first_line(error)}") from None
-        _check_signature(self._session, observation, actions)
+        self._state = tuple(state or {})
+        _check_signature(self._session, observation, actions, state or {})
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs (n, k) for the arrays of a layout."""
         found: NDArray[np.float32] = self._session.run([ACTION], dict(encoded))[0]
         return found
 
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        names = [ACTION, *(f"{NEXT}{name}" for name in self._state)]
+        found, *after = self._session.run(names, {**encoded, **memory})
+        return found, dict(zip(self._state, after, strict=True))
+
 
 class TorchRuntime:
     """A network as a torch program (`torch.export`), on the CPU. Implements `Runtime`."""
 
-    def __init__(self, program: bytes, observation: ObservationSpec, threads: int = 1) -> None:
+    def __init__(
+        self,
+        program: bytes,
+        observation: ObservationSpec,
+        threads: int = 1,
+        state: Shapes | None = None,
+    ) -> None:
         """Open a network.
 
         Args:
             program: The bytes of a .pt2 file.
             observation: What it takes.
             threads: Threads of torch, in the whole process.
+            state: What it remembers from decision to decision; None: nothing.
 
         Raises:
             ValueError: torch is not installed, or cannot load the program.
@@ -110,21 +156,39 @@ class TorchRuntime:
         except Exception as error:  # Anything, from a bad archive to an unknown operator.
             raise ValueError(f"not a program that torch loads: {first_line(error)}") from None
         self._torch = torch
-        self._keys = tuple(boxes(observation))
+        self._keys, self._state = tuple(boxes(observation)), tuple(state or {})
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs (n, k) for the arrays of a layout."""
         with self._torch.inference_mode():
-            tensors = [self._torch.from_numpy(np.ascontiguousarray(encoded[k])) for k in self._keys]
-            found: NDArray[np.float32] = self._module(*tensors).numpy()
+            found: NDArray[np.float32] = self._module(*self._tensors(encoded, self._keys)).numpy()
         return found
 
+    def step(
+        self, encoded: Mapping[str, NDArray[Any]], memory: Memory
+    ) -> tuple[NDArray[np.float32], Memory]:
+        """Return the outputs (n, k) of a network with a memory, and what it will remember."""
+        with self._torch.inference_mode():
+            tensors = self._tensors(encoded, self._keys) + self._tensors(memory, self._state)
+            found, *after = (each.numpy() for each in self._module(*tensors))
+        return found, dict(zip(self._state, after, strict=True))
 
-def _check_signature(session: Any, observation: ObservationSpec, actions: ActionSpec) -> None:
+    def _tensors(self, arrays: Mapping[str, NDArray[Any]], keys: tuple[str, ...]) -> list[Any]:
+        return [self._torch.from_numpy(np.ascontiguousarray(arrays[key])) for key in keys]
+
+
+def _check_signature(
+    session: Any, observation: ObservationSpec, actions: ActionSpec, state: Shapes
+) -> None:
     """Raise ValueError unless a session takes and gives what its card says."""
-    wanted = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
-    _compare("inputs", session.get_inputs(), wanted)
-    _compare("outputs", session.get_outputs(), {ACTION: ("tensor(float)", (outputs_of(actions),))})
+    takes = {name: (_ONNX_TYPES[box.dtype], box.shape) for name, box in boxes(observation).items()}
+    gives: dict[str, tuple[str, tuple[int, ...]]] = {
+        ACTION: (_ONNX_TYPES[np.float32], (outputs_of(actions),))
+    }
+    for name, shape in state.items():
+        takes[name] = gives[f"{NEXT}{name}"] = _ONNX_TYPES[np.float32], shape
+    _compare("inputs", session.get_inputs(), takes)
+    _compare("outputs", session.get_outputs(), gives)
 
 
 def _compare(

@@ -24,7 +24,14 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
 from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
 from airl_mav.training.export_request import ExportRequest, Taken
-from airl_mav.training.onnx_export import TOLERANCE, export_network, random_inputs
+from airl_mav.training.onnx_export import (
+    TOLERANCE,
+    export_network,
+    memory_of,
+    random_inputs,
+    random_memory,
+)
+from airl_mav.training.recurrent import RecurrentNetwork
 
 CHECKED = 64
 """Random observations on which the model's own decisions are compared."""
@@ -78,11 +85,9 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
     """Return the part of a model that decides, as `export_network` takes it.
 
     Raises:
-        UsageError: The policy has a memory, or is of a kind that is not known.
+        UsageError: The policy is of a kind that is not known.
     """
     policy: Any = model.policy
-    if hasattr(policy, "lstm_actor"):
-        raise UsageError(f"{type(model).__name__}: recurrent policies cannot be exported")
     if hasattr(policy, "quantile_net"):
         return _Network(_MeanOfQuantiles(policy.quantile_net))
     if hasattr(policy, "q_net"):
@@ -102,6 +107,9 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
             last = nn.Tanh() if policy.squash_output else nn.Hardtanh(-1.0, 1.0)
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
+        if hasattr(policy, "lstm_actor"):
+            head = nn.Sequential(hidden, policy.action_net, last)
+            return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head)
         return _Network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
@@ -232,7 +240,7 @@ def export_sb3(
     """Write a model as `policy.onnx` with its card, and return the card.
 
     Args:
-        model: Any algorithm of stable-baselines3 or sb3-contrib without memory.
+        model: Any algorithm of stable-baselines3 or sb3-contrib.
         facts: What the card says beyond the network.
         folder: Where to write; made if need be.
         with_torch: Also write the network as a torch program.
@@ -302,12 +310,16 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
 
 def _check_decisions(model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts) -> None:
     """Raise UsageError unless the network decides as the model's own `predict` does."""
-    seen = random_inputs(facts.observation, CHECKED, np.random.default_rng(2))
-    decided, _ = model.policy.predict(cast("Any", seen), deterministic=True)
-    device = model.device
+    rng, device = np.random.default_rng(2), model.device
+    seen = random_inputs(facts.observation, CHECKED, rng)
+    memory = random_memory(memory_of(network), CHECKED, rng)
+    # sb3-contrib has the layers first, then the rows.
+    state = tuple(array.swapaxes(0, 1) for array in memory.values()) or None
+    decided, _ = model.policy.predict(cast("Any", seen), state, deterministic=True)
     with torch.no_grad():
-        tensors = [torch.from_numpy(seen[key]).to(device) for key in boxes(facts.observation)]
-        outputs = network(*tensors).cpu().numpy()
+        arrays = [*(seen[key] for key in boxes(facts.observation)), *memory.values()]
+        found = network(*(torch.from_numpy(array).to(device) for array in arrays))
+        outputs = (found[0] if memory else found).cpu().numpy()
     slack = TOLERANCE * max(1.0, float(np.abs(outputs).max()))
     if discrete_actions(facts.actions) is None:
         same = np.abs(outputs - decided).max() <= slack

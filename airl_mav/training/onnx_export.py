@@ -20,7 +20,17 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest, write_card
 from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
-from airl_mav.policy.runtime import ACTION, OnnxRuntime, Runtime, TorchRuntime, first_line
+from airl_mav.policy.runtime import (
+    ACTION,
+    NEXT,
+    Memory,
+    OnnxRuntime,
+    Runtime,
+    Shapes,
+    TorchRuntime,
+    first_line,
+)
+from airl_mav.training.recurrent import LstmStep, RecurrentNetwork
 
 OPSET = 18
 """ONNX operators: the newest that torch writes without a conversion."""
@@ -61,6 +71,9 @@ def inspect_network(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tupl
             layers.append(Layer(text, output.numel() * part.weight[0].numel()))
         elif isinstance(part, nn.Linear):
             layers.append(Layer(f"dense {part.out_features}", output.numel() * part.in_features))
+        elif isinstance(part, LstmStep):
+            products = part.input_weight.numel() + part.hidden_weight.numel()
+            layers.append(Layer(f"lstm {part.units}", len(output[0]) * products))
 
     hooks = [part.register_forward_hook(note) for part in module.modules()]
     try:
@@ -79,7 +92,8 @@ def export_network(
 
     The network takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; it returns a
     score for each discrete action (n, k), or the continuous action (n, 2). Scaling the image is its
-    own business.
+    own business. One with a memory has it as further inputs and outputs, and their shapes in its
+    attribute `state` (`recurrent.RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
     without a card, or an old card that refuses the new policy: never a card for the wrong one.
@@ -87,20 +101,22 @@ def export_network(
     Raises:
         UsageError: The network does not fit the facts, cannot be exported, or the export differs.
     """
-    spec = facts.observation
-    example = _tensors(spec, random_inputs(spec, 2, np.random.default_rng(0)))
+    spec, state = facts.observation, memory_of(module)
+    rng = np.random.default_rng(0)
+    example = _tensors(spec, random_inputs(spec, 2, rng), random_memory(state, 2, rng))
     with _quiet():
         try:
             module = copy.deepcopy(module).cpu().eval()
             program = _program(module, example)
-            onnx = _onnx(program)
+            onnx = _onnx(program, state)
         except Exception as error:  # torch's exporter raises all kinds.
             raise UsageError(f"torch cannot export the network: {first_line(error)}") from error
         archive = _archive(program) if with_torch else None
     try:
-        _compare(module, OnnxRuntime(onnx, spec, facts.actions), spec, "ONNX Runtime")
+        runtime = OnnxRuntime(onnx, spec, facts.actions, state=state)
+        _compare(module, runtime, spec, "ONNX Runtime")
         if archive is not None:
-            _compare(module, TorchRuntime(archive, spec), spec, "the torch program")
+            _compare(module, TorchRuntime(archive, spec, state=state), spec, "the torch program")
     except ValueError as error:
         raise UsageError(f"the exported network: {error}") from None
     layers, parameters = inspect_network(module, tuple(tensor[:1] for tensor in example))
@@ -108,6 +124,7 @@ def export_network(
         **{name: getattr(facts, name) for name in PolicyFacts.model_fields},
         sha256=digest(onnx),
         torch_sha256=None if archive is None else digest(archive),
+        state=dict(state),
         network=", ".join(layer.text for layer in layers),
         parameters=parameters,
         macs=sum(layer.macs for layer in layers),
@@ -132,19 +149,41 @@ def random_inputs(spec: ObservationSpec, n: int, rng: np.random.Generator) -> En
     }
 
 
+def random_memory(state: Shapes, n: int, rng: np.random.Generator) -> Memory:
+    """Return what n networks may remember: noise between -1 and 1; nothing without a memory."""
+    return {
+        name: rng.uniform(-1.0, 1.0, (n, *shape)).astype(np.float32)
+        for name, shape in state.items()
+    }
+
+
+def memory_of(module: nn.Module) -> Shapes:
+    """Return what a network remembers from decision to decision; mostly nothing."""
+    return module.state if isinstance(module, RecurrentNetwork) else {}
+
+
 def _compare(module: nn.Module, runtime: Runtime, spec: ObservationSpec, name: str) -> None:
     """Raise ValueError unless a runtime gives what the network gives."""
     rng = np.random.default_rng(1)
     for n in CHECKED_ROWS:
-        inputs = random_inputs(spec, n, rng)
+        inputs, memory = random_inputs(spec, n, rng), random_memory(memory_of(module), n, rng)
         with torch.no_grad():
-            wanted: NDArray[np.float32] = module(*_tensors(spec, inputs)).numpy()
-        found = runtime.infer(inputs)
-        if found.shape != wanted.shape or not np.isfinite(wanted).all():
-            raise ValueError(f"torch gives {wanted.shape}, {name} {found.shape}, or no numbers")
-        error = float(np.abs(found - wanted).max())
-        if not error <= TOLERANCE * max(1.0, float(np.abs(wanted).max())):
-            raise ValueError(f"{name} is off by {error:.3g}; accepted: {TOLERANCE:g} of the output")
+            given = module(*_tensors(spec, inputs, memory))
+        if memory:
+            outputs, after = runtime.step(inputs, memory)
+            pairs = list(zip([outputs, *after.values()], given, strict=True))
+        else:
+            pairs = [(runtime.infer(inputs), given)]
+        for found, tensor in pairs:
+            _compare_arrays(found, tensor.numpy(), name)
+
+
+def _compare_arrays(found: NDArray[np.float32], wanted: NDArray[np.float32], name: str) -> None:
+    if found.shape != wanted.shape or not np.isfinite(wanted).all():
+        raise ValueError(f"torch gives {wanted.shape}, {name} {found.shape}, or no numbers")
+    error = float(np.abs(found - wanted).max())
+    if not error <= TOLERANCE * max(1.0, float(np.abs(wanted).max())):
+        raise ValueError(f"{name} is off by {error:.3g}; accepted: {TOLERANCE:g} of the output")
 
 
 def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.export.ExportedProgram:
@@ -156,7 +195,7 @@ def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.expo
     return program
 
 
-def _onnx(program: torch.export.ExportedProgram) -> bytes:
+def _onnx(program: torch.export.ExportedProgram, state: Shapes) -> bytes:
     """Turn a program into ONNX, weights inside, without notes on where each operator came from."""
     written = torch.onnx.export(
         program,
@@ -164,7 +203,7 @@ def _onnx(program: torch.export.ExportedProgram) -> bytes:
         dynamo=True,
         opset_version=OPSET,
         external_data=False,
-        output_names=[ACTION],
+        output_names=[ACTION, *(f"{NEXT}{name}" for name in state)],
         verbose=False,
     )
     assert written is not None  # noqa: S101 (it is None only for the old exporter)
@@ -188,8 +227,9 @@ def _archive(program: torch.export.ExportedProgram) -> bytes:
     return buffer.getvalue()
 
 
-def _tensors(spec: ObservationSpec, inputs: Encoded) -> tuple[torch.Tensor, ...]:
-    return tuple(torch.from_numpy(inputs[key]) for key in boxes(spec))
+def _tensors(spec: ObservationSpec, inputs: Encoded, memory: Memory) -> tuple[torch.Tensor, ...]:
+    arrays = [*(inputs[key] for key in boxes(spec)), *memory.values()]
+    return tuple(torch.from_numpy(array) for array in arrays)
 
 
 @contextmanager

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import io
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -28,12 +27,12 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
-from airl_mav.policy.layouts import Encoded
 from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 from airl_mav.training.export import export_sb3
+from airl_mav.training.recurrent import GreedyDecisions
 from airl_mav.training.store import Evaluation, TrainingFolder, TrainingProgress
 
 RECENT = 200
@@ -210,7 +209,8 @@ class _BetweenRollouts(BaseCallback):
         seconds, began_us = self._seconds(), self._clock.time_us()
         selection = self._config.selection
         seeds = range(SELECTION_SEED, SELECTION_SEED + selection.episodes)
-        flown = list(fly_episodes(nominal(self._config.environment), greedy(model), seeds))
+        decide, spec = GreedyDecisions(model), nominal(self._config.environment)
+        flown = list(fly_episodes(spec, decide, seeds, began=decide.began))
         curriculum = self._env.env.curriculum
         evaluation = summary(
             flown,
@@ -239,16 +239,6 @@ class _BetweenRollouts(BaseCallback):
 
     def _seconds(self) -> float:
         return self._before_s + (self._clock.time_us() - self._paused_us) / US_PER_S
-
-
-def greedy(model: BaseAlgorithm) -> Callable[[Encoded], NDArray[Any]]:
-    """Return the decisions of a learner without exploration."""
-
-    def decide(seen: Encoded) -> NDArray[Any]:
-        actions, _ = model.predict(seen, deterministic=True)
-        return actions
-
-    return decide
 
 
 def summary(

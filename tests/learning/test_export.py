@@ -17,7 +17,6 @@ import pytest
 pytest.importorskip("sb3_contrib", reason="needs the [train] extra")
 pytest.importorskip("onnxscript", reason="needs the [train] extra")
 
-import sb3_contrib
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -28,13 +27,13 @@ from torch.utils.flop_counter import FlopCounterMode
 from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.card import load_card, open_model, read_card
+from airl_mav.policy.card import load_card, open_model, read_card, write_card
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.learned import decide, load_learned
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training import onnx_export as export
 from airl_mav.training.export import export_sb3, network_of
-from tests.support.policy_kit import SPEC, Eye, export_tiny, facts, make_model, noise
+from tests.support.policy_kit import SPEC, export_tiny, facts, make_model, noise
 from tests.support.processes import ROOT
 
 ONE = (
@@ -94,7 +93,7 @@ def test_the_network_decides_as_the_model_predicts(name: str) -> None:
     compare(decide(actions, outputs.numpy()), wanted)
 
 
-@pytest.mark.parametrize("name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3"])
+@pytest.mark.parametrize("name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3", "TQC"])
 def test_onnx_decides_as_the_model_predicts(name: str, tmp_path: Path) -> None:
     model, actions = model_of(name)
     model.policy.set_training_mode(True)
@@ -237,7 +236,7 @@ def test_nothing_is_written_when_the_export_differs(
     out = tmp_path / "new"
     export_tiny(tmp_path / "wrong", "PPO")
     wrong = (tmp_path / "wrong" / "policy.onnx").read_bytes()
-    monkeypatch.setattr(export, "_onnx", lambda program: wrong)
+    monkeypatch.setattr(export, "_onnx", lambda *_: wrong)
     with pytest.raises(UsageError, match="ONNX Runtime is off by"):
         export_tiny(out)
     assert not out.exists()
@@ -263,13 +262,60 @@ def test_a_policy_that_decides_by_more_than_its_network_is_refused(tmp_path: Pat
         export_sb3(model, facts(), tmp_path)
 
 
-def test_a_policy_with_a_memory_is_refused(tmp_path: Path) -> None:
-    learner: Any = sb3_contrib.RecurrentPPO
-    kwargs = {"lstm_hidden_size": 4, "features_extractor_class": Eye}
-    environment = make_model("PPO").get_env()
-    model = learner("MultiInputLstmPolicy", environment, n_steps=8, policy_kwargs=kwargs)
-    with pytest.raises(UsageError, match="recurrent"):
-        export_sb3(model, facts(), tmp_path)
+RECURRENT: dict[str, tuple[str, dict[str, Any]]] = {
+    "discrete": ("arc-25", {"lstm_hidden_size": 12}),
+    "continuous, two layers": ("velocity", {"lstm_hidden_size": 8, "n_lstm_layers": 2}),
+    "one LSTM for both": (
+        "velocity",
+        {"lstm_hidden_size": 8, "shared_lstm": True, "enable_critic_lstm": False},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RECURRENT)
+def test_a_recurrent_policy_remembers_as_the_model_does(name: str, tmp_path: Path) -> None:
+    """Flights of ten decisions, three beside each other, and two one after the other."""
+    actions, kwargs = RECURRENT[name]
+    model = make_model("RecurrentPPO", actions, n_steps=8, policy_kwargs=kwargs)
+    spec = ActionSpec.model_validate({"set": actions})
+    card = export_sb3(model, facts(actions=spec), tmp_path, with_torch=True)
+    units, layers = kwargs["lstm_hidden_size"], kwargs.get("n_lstm_layers", 1)
+    assert card.state == {"hidden": (layers, units), "cell": (layers, units)}
+    assert card == load_card(tmp_path)
+    assert f"lstm {units}" in card.network
+    loaded = load_learned(tmp_path)
+    by_torch = load_learned(tmp_path, runtime="torch", trust=True)
+    differs = 0
+    for flight in range(2):
+        # As the companion has it: an object a flight.
+        policies = [loaded.with_generator(np.random.default_rng(0)) for _ in range(3)]
+        together = loaded.with_generator(np.random.default_rng(0))
+        trusted = by_torch.with_generator(np.random.default_rng(0))
+        state: Any = None
+        for k in range(10):
+            seen = noise(3, seed=100 * flight + k)
+            wanted, state = model.predict(seen, state, deterministic=True)  # type: ignore[arg-type]
+            rows = [{key: value[i : i + 1] for key, value in seen.items()} for i in range(3)]
+            alone = [p.act_batch(row)[0] for p, row in zip(policies, rows, strict=True)]
+            np.testing.assert_allclose(np.array(alone), wanted, atol=1e-5)
+            np.testing.assert_allclose(together.act_batch(seen), wanted, atol=1e-5)
+            np.testing.assert_allclose(trusted.act_batch(seen), wanted, atol=1e-5)
+            forgetful, _ = model.predict(seen, deterministic=True)  # type: ignore[arg-type]
+            differs += int(np.abs(forgetful - wanted).max() > 1e-3)
+    assert differs > 5, "the memory matters"
+
+
+def test_the_card_and_the_file_agree_on_the_memory(tmp_path: Path) -> None:
+    model = make_model("RecurrentPPO", n_steps=8, policy_kwargs={"lstm_hidden_size": 12})
+    card = export_sb3(model, facts(), tmp_path)
+    with pytest.raises(ValueError, match="3 flights; accepted: 2"):
+        policy = load_learned(tmp_path)
+        policy.act_batch(noise(2))
+        policy.act_batch(noise(3))
+    for state in ({}, {"hidden": (1, 13), "cell": (1, 13)}):
+        write_card(tmp_path, card.model_copy(update={"state": state}))
+        with pytest.raises(UsageError, match=r"policy\.onnx: inputs .*hidden"):
+            load_card(tmp_path)
 
 
 # --- the command

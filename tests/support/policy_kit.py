@@ -104,7 +104,7 @@ def make_model(
     policy_kwargs = {"features_extractor_class": Eye, "net_arch": [16, 16]}
     policy_kwargs |= options.pop("policy_kwargs", {})
     model: BaseAlgorithm = learner(
-        "MultiInputPolicy",
+        "MultiInputLstmPolicy" if algorithm == "RecurrentPPO" else "MultiInputPolicy",
         environment,
         policy_kwargs=policy_kwargs,
         seed=seed,

@@ -1,0 +1,101 @@
+"""Recurrent policies of sb3-contrib: the part that decides, with its memory as inputs and outputs.
+
+The LSTM is written out as one step of its equations: an export then has nothing but products and
+sums, any number of rows, and the memory has its rows first, as everything else has.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+from torch.nn import functional
+
+from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, Encoded
+from airl_mav.policy.runtime import Shapes
+
+HIDDEN, CELL = "hidden", "cell"
+"""Names of the two arrays (n, layers, units) that an LSTM remembers."""
+
+
+class LstmStep(nn.Module):
+    """One layer of an LSTM, one step: hidden' and cell' (n, units) of inputs, hidden and cell."""
+
+    def __init__(self, lstm: nn.LSTM, layer: int) -> None:
+        super().__init__()
+        self.units = lstm.hidden_size
+        self.input_weight = getattr(lstm, f"weight_ih_l{layer}")
+        self.hidden_weight = getattr(lstm, f"weight_hh_l{layer}")
+        self.input_bias = getattr(lstm, f"bias_ih_l{layer}")
+        self.hidden_bias = getattr(lstm, f"bias_hh_l{layer}")
+
+    def forward(
+        self, seen: torch.Tensor, hidden: torch.Tensor, cell: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        gates = functional.linear(seen, self.input_weight, self.input_bias)
+        gates = gates + functional.linear(hidden, self.hidden_weight, self.hidden_bias)
+        # torch's order of the gates.
+        take, keep, new, show = gates.chunk(4, dim=1)
+        cell = torch.sigmoid(keep) * cell + torch.sigmoid(take) * torch.tanh(new)
+        return torch.sigmoid(show) * torch.tanh(cell), cell
+
+
+class RecurrentNetwork(nn.Module):
+    """From the three inputs, hidden and cell to the outputs, the next hidden and the next cell."""
+
+    def __init__(self, features: nn.Module, lstm: nn.LSTM, head: nn.Module) -> None:
+        """Take the way from a Dict of observations to features, and from the LSTM to outputs."""
+        super().__init__()
+        self.features = features
+        self.steps = nn.ModuleList(LstmStep(lstm, layer) for layer in range(lstm.num_layers))
+        self.head = head
+        self.state: Shapes = {
+            HIDDEN: (lstm.num_layers, lstm.hidden_size),
+            CELL: (lstm.num_layers, lstm.hidden_size),
+        }
+
+    def forward(
+        self,
+        depth: torch.Tensor,
+        velocity: torch.Tensor,
+        goal: torch.Tensor,
+        hidden: torch.Tensor,
+        cell: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        found = self.features({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
+        hiddens, cells = [], []
+        for layer, step in enumerate(self.steps):
+            found, kept = step(found, hidden[:, layer], cell[:, layer])
+            hiddens.append(found)
+            cells.append(kept)
+        return self.head(found), torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
+
+
+class GreedyDecisions:
+    """The decisions of a learner without exploration, n flights at a time.
+
+    A recurrent one remembers each flight from `began` on; any other has no memory.
+    """
+
+    def __init__(self, model: BaseAlgorithm) -> None:
+        self._model = model
+        self._state: tuple[NDArray[Any], ...] | None = None
+        self._new: set[int] = set()
+
+    def began(self, slot: int) -> None:
+        """An episode begins in a slot."""
+        self._new.add(slot)
+
+    def __call__(self, seen: Encoded) -> NDArray[Any]:
+        """Return the actions of n vehicles."""
+        starts = np.zeros(len(seen[GOAL]), np.bool_)
+        starts[list(self._new)] = True
+        self._new.clear()
+        actions, self._state = self._model.predict(
+            seen, self._state, episode_start=starts, deterministic=True
+        )
+        return actions

@@ -1,0 +1,128 @@
+"""A policy with a memory in flight: each flight has its own, from its first decision on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_episodes, fly_seeds
+from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.lockstep.flight import fly
+from airl_mav.policy.action_sets import ActionSpec
+from airl_mav.policy.layouts import ObservationSpec
+from airl_mav.policy.learned import LearnedPolicy, load_learned
+from airl_mav.policy.observation import Observation
+from airl_mav.training.export import export_sb3
+from airl_mav.training.recurrent import GreedyDecisions
+from tests.support.lockstep_kit import demo_scenario
+from tests.support.policy_kit import facts, make_model
+
+SEEDS = (1, 2, 3, 4, 5)
+HOLD_S = 0.4
+SHAPE = ObservationSpec(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=20.0)
+
+
+@pytest.fixture(scope="module")
+def model() -> Any:
+    kwargs = {"lstm_hidden_size": 12}
+    return make_model("RecurrentPPO", "velocity", spec=SHAPE, n_steps=8, policy_kwargs=kwargs)
+
+
+@pytest.fixture(scope="module")
+def policy(model: Any, tmp_path_factory: pytest.TempPathFactory) -> LearnedPolicy:
+    folder = tmp_path_factory.mktemp("policy") / "dreamer"
+    export_sb3(model, facts(name="dreamer", actions=ActionSpec(set="velocity")), folder)
+    return load_learned(folder)
+
+
+@pytest.fixture(scope="module")
+def spec() -> EnvironmentSpec:
+    episode = {"time_limit_s": 12.0, "hold_s": HOLD_S, "goal_radius_m": 2.5, "altitude_m": 2.0}
+    arena = {"arena": "dynamic-obstacles", "actions": "velocity"}
+    return spec_of(None, {**arena, "episode": episode})
+
+
+def fresh(policy: LearnedPolicy) -> LearnedPolicy:
+    return policy.with_generator(np.random.default_rng(0))
+
+
+class Recorded:
+    """The companion's policy, and what it was shown and did."""
+
+    def __init__(self, policy: LearnedPolicy, seen: list[Any], done: list[Any]) -> None:
+        self.policy, self.seen, self.done = policy, seen, done
+
+    def act(self, observation: Observation) -> Any:
+        action = self.policy.act(observation)
+        self.seen.append(observation)
+        self.done.append(action)
+        return action
+
+
+def test_the_twin_flies_as_the_companion_bit_for_bit(
+    policy: LearnedPolicy, spec: EnvironmentSpec
+) -> None:
+    """More flights than slots: a slot's memory must not outlive its flight."""
+    together = fly_seeds(
+        Navigation(spec, 2), LearnedPilots(policy, lambda _: np.random.default_rng(0)), SEEDS
+    )
+    alone = fly_seeds(Navigation(spec, 1), SinglePilots(lambda: fresh(policy), 30.0), SEEDS)
+    by_seed = {flown.seed: flown for _, flown in together}
+    assert by_seed == {flown.seed: flown for _, flown in alone}
+    assert len(by_seed) == len(SEEDS)
+
+
+def test_the_memory_decides(policy: LearnedPolicy, spec: EnvironmentSpec) -> None:
+    """Or the test before would pass without any."""
+
+    class Forgetful(LearnedPilots):
+        def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
+            for i in range(len(flying)):
+                self.begin(i, 0)
+            return super().decide(seen, flying)
+
+    kinds = (LearnedPilots, Forgetful)
+    flown = [
+        next(fly_seeds(Navigation(spec, 1), kind(policy, np.random.default_rng), [1]))[1]
+        for kind in kinds
+    ]
+    assert flown[0].distance_m != flown[1].distance_m
+
+
+def test_the_selection_flies_as_the_export(
+    model: Any, policy: LearnedPolicy, spec: EnvironmentSpec
+) -> None:
+    """The learner's own decisions in training, two slots for five flights."""
+    decide = GreedyDecisions(model)
+    learner = {
+        each.seed: each
+        for each in fly_episodes(spec, decide, SEEDS, slots=2, began=decide.began)
+    }
+    pilots = LearnedPilots(policy, np.random.default_rng)
+    for _, flown in fly_seeds(Navigation(spec, 2), pilots, SEEDS):
+        assert learner[flown.seed].decisions == flown.decisions
+        assert learner[flown.seed].distance_m == pytest.approx(flown.distance_m, rel=1e-3)
+
+
+def test_a_companion_begins_each_flight_with_nothing_in_mind(
+    model: Any, tmp_path: Path
+) -> None:
+    """In lockstep, through MAVLink: what it was shown, shown to the model, gives what it did."""
+    folder = tmp_path / "dreamer"
+    export_sb3(model, facts(name="dreamer", actions=ActionSpec(set="velocity")), folder)
+    scenario = demo_scenario(policy=str(folder), time_limit_s=5.0)
+    for seed in (1, 2):
+        seen: list[Observation] = []
+        done: list[Any] = []
+        begun = scenario.fresh_policy(seed)
+        assert isinstance(begun, LearnedPolicy)
+        fly(scenario, Recorded(begun, seen, done), 0, seed)
+        assert len(done) > 5
+        # Another object, as a companion that was started anew has it, decides the same again.
+        again = scenario.fresh_policy(seed)
+        assert [again.act(each) for each in seen] == done
