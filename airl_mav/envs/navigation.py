@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +23,12 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import batch_of, put_arena
+from airl_mav.envs.arenas import ArenaBatch, batch_of, put_arena
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.estimation import Telemetry
-from airl_mav.envs.fleet import Rules, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import Fleet, Rules, Vehicle, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import EnvironmentSpec
@@ -65,6 +65,14 @@ class Flights:
     """Charge left, 1 to 0."""
     touched: NDArray[np.int64]
     """Index of the obstacle that is touched, or `contact.FLOOR`, `WALL`, `NOTHING`."""
+
+
+class WholeTruth(NamedTuple):
+    """What no policy is told, for experts that are imitated."""
+
+    fleet: Fleet
+    arenas: ArenaBatch
+    vehicle: Vehicle
 
 
 class Navigation(Stateful):
@@ -229,6 +237,10 @@ class Navigation(Stateful):
         """Return the true state of all n; a copy."""
         fleet = self._fleet
         return Kinematics(fleet.position.copy(), fleet.velocity.copy(), fleet.quaternion.copy())
+
+    def whole_truth(self) -> WholeTruth:
+        """Return all that the twin knows, the very arrays that it flies on: to look at only."""
+        return WholeTruth(self._fleet, self._batch, self._vehicle)
 
     def fly(self, commands: NDArray[np.float64]) -> None:
         """Fly one decision of every flight that has not ended.

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
+from airl_mav.envs.experts import Expert
 from airl_mav.envs.saved_state import Stateful
+from airl_mav.envs.spec import ExpertName
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.layouts import Encoded
 
@@ -30,8 +32,14 @@ class NavigationVecEnv(Stateful, VecEnv):
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: NDArray[Any] = np.zeros(0)
+        self._expert: Expert | None = None
         self._return = np.zeros(env.num_envs)
         self._length = np.zeros(env.num_envs, np.int64)
+
+    def teach(self, name: ExpertName) -> Expert:
+        """Return an expert that looks on, for a learner that imitates it."""
+        self._expert = Expert(name, self.env.navigation)
+        return self._expert
 
     def reset(self) -> Encoded:
         """Begin n episodes, as `seed()` and `set_options()` have set."""
@@ -41,6 +49,8 @@ class NavigationVecEnv(Stateful, VecEnv):
         self._reset_options()
         self._return[:] = 0.0
         self._length[:] = 0
+        if self._expert is not None:
+            self._expert.begin(range(self.num_envs))
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -66,6 +76,8 @@ class NavigationVecEnv(Stateful, VecEnv):
             }
         self._return[done] = 0.0
         self._length[done] = 0
+        if self._expert is not None and done.any():
+            self._expert.begin(np.flatnonzero(done).tolist())
         return seen, reward.astype(np.float32), done, infos
 
     def observe(self) -> Encoded:
@@ -73,7 +85,9 @@ class NavigationVecEnv(Stateful, VecEnv):
         return self.env.navigation.observe()
 
     def _held(self) -> Mapping[str, Any]:
-        return {"vector": self.env, "adapter": {"return": self._return, "length": self._length}}
+        adapter = {"return": self._return, "length": self._length}
+        held: dict[str, Any] = {"vector": self.env, "adapter": adapter}
+        return held if self._expert is None else held | {"expert": self._expert}
 
     def close(self) -> None:
         """Nothing to release."""

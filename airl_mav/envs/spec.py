@@ -23,6 +23,10 @@ SHIPPED_REWARDS = ("shaped", "paper-scaled", "paper")
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
 
 
+ExpertName = Literal["greedy", "planner"]
+"""See `envs.experts`."""
+
+
 class EpisodeRules(ProfileModel):
     """Rules of an episode and the decision period."""
 

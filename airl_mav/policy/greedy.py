@@ -47,7 +47,7 @@ class GreedyPolicy:
 
     def __init__(self, settings: GreedySettings | None = None) -> None:
         self._settings = settings or GreedySettings()
-        self._side = 1.0
+        self.side = 1.0
         """Which way to turn when nothing is free: kept, so as not to dither."""
 
     def act(self, observation: Observation) -> Action:
@@ -56,7 +56,7 @@ class GreedyPolicy:
         half_fov = math.atan2(0.5 * observation.intrinsics.width, observation.intrinsics.focal)
         if abs(bearing) > half_fov:
             # The goal is out of view: turn to it on the spot.
-            self._side = math.copysign(1.0, bearing)
+            self.side = math.copysign(1.0, bearing)
             return Action(0.0, 0.0, self._turn(bearing))
         points = near_points(observation, s.band_m)
         margin = half_fov / s.headings
@@ -69,10 +69,10 @@ class GreedyPolicy:
         cost = np.abs(headings - bearing) + 4.0 * lack
         best = int(np.argmin(cost))
         if clear[best] <= s.stop_distance_m:
-            return Action(0.0, 0.0, self._side * s.max_yaw_rate_rad_s * 0.5)
+            return Action(0.0, 0.0, self.side * s.max_yaw_rate_rad_s * 0.5)
         heading = float(headings[best])
         if abs(heading) > math.radians(3.0):
-            self._side = math.copysign(1.0, heading)
+            self.side = math.copysign(1.0, heading)
         speed = self._speed(float(clear[best]), distance)
         turn = self._turn(heading)
         # The command turns with the nose while it is held: aim so that its mean lies right.

@@ -18,6 +18,7 @@ from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layo
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.runtime import (
     Memory,
+    RecurrentRuntime,
     Runtime,
     RuntimeName,
     TorchRuntime,
@@ -111,6 +112,8 @@ class LearnedPolicy:
 
     def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs of a network with a memory, and remember what it gives."""
+        if not isinstance(self._runtime, RecurrentRuntime):
+            raise ValueError(f"{type(self._runtime).__name__} runs no network with a memory")
         n = len(next(iter(encoded.values())))
         memory = blank_memory(self.card.state, n) if self._memory is None else self._memory
         known = len(next(iter(memory.values())))
@@ -190,7 +193,7 @@ def load_learned(
 
 def open_network(
     folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int, *, trust: bool = False
-) -> Runtime:
+) -> RecurrentRuntime:
     """Return the network of a card, ready for its first inference.
 
     Args:

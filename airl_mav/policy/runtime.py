@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,11 @@ class Runtime(Protocol):
         """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
         ...
 
+
+@runtime_checkable
+class RecurrentRuntime(Runtime, Protocol):
+    """One that also runs networks with a memory."""
+
     def step(
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
@@ -70,7 +75,7 @@ def outputs_of(actions: ActionSpec) -> int:
 
 
 class OnnxRuntime:
-    """A network in ONNX Runtime, on the CPU. Implements `Runtime`."""
+    """A network in ONNX Runtime, on the CPU. Implements `RecurrentRuntime`."""
 
     def __init__(
         self,
@@ -126,7 +131,7 @@ class OnnxRuntime:
 
 
 class TorchRuntime:
-    """A network as a torch program (`torch.export`), on the CPU. Implements `Runtime`."""
+    """A network as a torch program (`torch.export`), on the CPU. Implements `RecurrentRuntime`."""
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.plugins import NETWORKS, part_name
-from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.policy.action_sets import ActionSetName, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training.table import ALGORITHMS, EARLIER_NAMES, ActionKind, fitting
@@ -132,6 +132,11 @@ class AlgorithmSpec(ProfileModel):
     )
     precision: Precision = Field(
         default="float32", description="numbers of the updates; bfloat16 is for wide networks"
+    )
+    expert: ExpertName = Field(
+        default="planner",
+        description="who is imitated: greedy, which sees what the policy sees, or planner, which "
+        "knows the true arena",
     )
     options: dict[str, Option] = Field(
         default_factory=dict,

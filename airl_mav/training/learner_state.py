@@ -17,6 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from airl_mav.core.files import Arrays
 from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.imitation import Imitation
 
 COUNTERS = (
     "num_timesteps",
@@ -139,7 +140,7 @@ def _below(prefix: str, arrays: Arrays) -> Arrays:
 
 def _get_replay(model: BaseAlgorithm) -> Arrays:
     """Return the filled part of a learner's replay memory by name; nothing when it has none."""
-    if isinstance(model, DoubleDQN):
+    if isinstance(model, DoubleDQN | Imitation):
         return model.replay.get_state()
     buffer = _stock_buffer(model)
     if buffer is None:
@@ -151,7 +152,7 @@ def _get_replay(model: BaseAlgorithm) -> Arrays:
 
 def _set_replay(model: BaseAlgorithm, saved: Mapping[str, NDArray[Any]]) -> None:
     """Put back what `_get_replay` gave. Raises ValueError when it is of another size."""
-    if isinstance(model, DoubleDQN):
+    if isinstance(model, DoubleDQN | Imitation):
         model.replay.set_state(saved)
         return
     buffer = _stock_buffer(model)

@@ -36,6 +36,7 @@ class LstmStep(nn.Module):
     def forward(
         self, seen: torch.Tensor, hidden: torch.Tensor, cell: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return what the layer gives, which is the next hidden, and the next cell."""
         gates = functional.linear(seen, self.input_weight, self.input_bias)
         gates = gates + functional.linear(hidden, self.hidden_weight, self.hidden_bias)
         # torch's order of the gates.
@@ -66,6 +67,7 @@ class RecurrentNetwork(nn.Module):
         hidden: torch.Tensor,
         cell: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
         found = self.features({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
         hiddens, cells = [], []
         for layer, step in enumerate(self.steps):

@@ -161,6 +161,30 @@ class RecurrentPpoOptions(PpoOptions):
     )
 
 
+class CloningOptions(Options):
+    """Options of `bc`: behaviour cloning."""
+
+    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
+
+
+class DaggerOptions(CloningOptions):
+    """Options of `dagger` (Ross et al., arXiv 1011.0686)."""
+
+    expert_share_initial: float | None = quantity(
+        "share of the decisions that the expert flies at first; left out: 1",
+        "1",
+        ge=0,
+        le=1,
+        default=None,
+    )
+    expert_share_final: float | None = quantity(
+        "the same in the end; left out: 0", "1", ge=0, le=1, default=None
+    )
+    expert_share_fraction: float | None = quantity(
+        "share of the training in which it falls; left out: 0.3", "1", gt=0, le=1, default=None
+    )
+
+
 @dataclass(frozen=True)
 class Algorithm:
     """What sets an algorithm apart."""
@@ -191,6 +215,10 @@ def _same(*names: str) -> dict[str, str]:
 _ANY = _same("learning_rate", "gamma")
 _BATCHES = _same("learning_rate", "gamma", "batch_size")
 _REPLAY = _same("learning_rate", "gamma", "batch_size", "buffer_size", "learning_starts")
+_IMITATION = "airl_mav.training.imitation.Imitation"
+_IMITATED = _same("learning_rate", "batch_size", "buffer_size", "learning_starts") | _same(
+    "env_steps_per_update", "expert"
+)
 _PPO: dict[str, Any] = {"n_epochs": 4, "ent_coef": 0.005}
 
 ALGORITHMS: dict[str, Algorithm] = {
@@ -237,6 +265,14 @@ ALGORITHMS: dict[str, Algorithm] = {
         TqcOptions,
         to_policy=("n_critics", "n_quantiles"),
     ),
+    "bc": Algorithm(
+        _IMITATION,
+        _IMITATED,
+        options=CloningOptions,
+        defaults={"expert_share_final": 1.0},
+        batch=256,
+    ),
+    "dagger": Algorithm(_IMITATION, _IMITATED, options=DaggerOptions, batch=256),
     "a2c": Algorithm("stable_baselines3.A2C", _ANY),
     "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, "continuous"),
     "td3": Algorithm("stable_baselines3.TD3", _REPLAY, "continuous"),

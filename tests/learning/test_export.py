@@ -93,7 +93,9 @@ def test_the_network_decides_as_the_model_predicts(name: str) -> None:
     compare(decide(actions, outputs.numpy()), wanted)
 
 
-@pytest.mark.parametrize("name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3", "TQC"])
+@pytest.mark.parametrize(
+    "name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3", "TQC"]
+)
 def test_onnx_decides_as_the_model_predicts(name: str, tmp_path: Path) -> None:
     model, actions = model_of(name)
     model.policy.set_training_mode(True)
@@ -294,13 +296,13 @@ def test_a_recurrent_policy_remembers_as_the_model_does(name: str, tmp_path: Pat
         state: Any = None
         for k in range(10):
             seen = noise(3, seed=100 * flight + k)
-            wanted, state = model.predict(seen, state, deterministic=True)  # type: ignore[arg-type]
+            wanted, state = model.predict(seen, state, deterministic=True)
             rows = [{key: value[i : i + 1] for key, value in seen.items()} for i in range(3)]
             alone = [p.act_batch(row)[0] for p, row in zip(policies, rows, strict=True)]
             np.testing.assert_allclose(np.array(alone), wanted, atol=1e-5)
             np.testing.assert_allclose(together.act_batch(seen), wanted, atol=1e-5)
             np.testing.assert_allclose(trusted.act_batch(seen), wanted, atol=1e-5)
-            forgetful, _ = model.predict(seen, deterministic=True)  # type: ignore[arg-type]
+            forgetful, _ = model.predict(seen, deterministic=True)
             differs += int(np.abs(forgetful - wanted).max() > 1e-3)
     assert differs > 5, "the memory matters"
 

@@ -100,8 +100,7 @@ def test_the_selection_flies_as_the_export(
     """The learner's own decisions in training, two slots for five flights."""
     decide = GreedyDecisions(model)
     learner = {
-        each.seed: each
-        for each in fly_episodes(spec, decide, SEEDS, slots=2, began=decide.began)
+        each.seed: each for each in fly_episodes(spec, decide, SEEDS, slots=2, began=decide.began)
     }
     pilots = LearnedPilots(policy, np.random.default_rng)
     for _, flown in fly_seeds(Navigation(spec, 2), pilots, SEEDS):
@@ -109,9 +108,7 @@ def test_the_selection_flies_as_the_export(
         assert learner[flown.seed].distance_m == pytest.approx(flown.distance_m, rel=1e-3)
 
 
-def test_a_companion_begins_each_flight_with_nothing_in_mind(
-    model: Any, tmp_path: Path
-) -> None:
+def test_a_companion_begins_each_flight_with_nothing_in_mind(model: Any, tmp_path: Path) -> None:
     """In lockstep, through MAVLink: what it was shown, shown to the model, gives what it did."""
     folder = tmp_path / "dreamer"
     export_sb3(model, facts(name="dreamer", actions=ActionSpec(set="velocity")), folder)

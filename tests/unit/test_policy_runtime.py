@@ -91,9 +91,6 @@ class Answers:
         self.seen.append(encoded)
         return self.outputs
 
-    def step(self, encoded: Any, memory: Any) -> tuple[np.ndarray, Any]:
-        raise AssertionError("a card without state has no memory")
-
 
 # --- runtimes
 

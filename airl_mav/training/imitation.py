@@ -1,0 +1,207 @@
+"""Learning from an expert: behaviour cloning and DAgger, as a learner of stable-baselines3.
+
+Behaviour cloning flies the expert and learns what it did (Pomerleau, "ALVINN", NIPS 1988). DAgger
+flies the learner, more and more, and asks the expert what it would have done where the learner got
+to (Ross, Gordon, Bagnell, AISTATS 2011, arXiv 1011.0686). Cloning is DAgger in which the expert
+never lets go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, cast
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import (
+    ActorCriticPolicy,
+    BasePolicy,
+    MultiInputActorCriticPolicy,
+)
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from torch.nn import functional
+
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.experts import Expert
+from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.spec import ExpertName
+from airl_mav.policy.layouts import Encoded
+from airl_mav.training.demonstrations import Demonstrations
+
+
+class Imitation(BaseAlgorithm):
+    """Learns what an expert does, on the networks of PPO; their value is not learned.
+
+    All intervals count steps of single vehicles. One generator draws who flies and what is learned
+    from, so that a run can be continued exactly.
+
+    Args:
+        policy: "MultiInputPolicy".
+        env: A `NavigationVecEnv`: the expert looks into it.
+        expert: Who is imitated.
+        learning_rate: Step of the optimiser.
+        batch_size: Samples an update.
+        buffer_size: Steps that are remembered.
+        learning_starts: Steps before the first update.
+        env_steps_per_update: Steps for each update.
+        expert_share_initial: Share of the decisions that the expert flies at first.
+        expert_share_final: The same in the end.
+        expert_share_fraction: Share of the training in which it falls, in a straight line.
+        max_grad_norm: Greatest norm of a gradient.
+        arguments: Further arguments of stable-baselines3's base class.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MultiInputPolicy": MultiInputActorCriticPolicy
+    }
+    policy: ActorCriticPolicy
+
+    def __init__(
+        self,
+        policy: str,
+        env: NavigationVecEnv,
+        *,
+        expert: ExpertName = "planner",
+        learning_rate: float | Schedule = 3e-4,
+        batch_size: int = 256,
+        buffer_size: int = 100_000,
+        learning_starts: int = 2000,
+        env_steps_per_update: int = 32,
+        expert_share_initial: float = 1.0,
+        expert_share_final: float = 0.0,
+        expert_share_fraction: float = 0.3,
+        max_grad_norm: float = 1.0,
+        _init_setup_model: bool = True,
+        **arguments: Any,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            supported_action_spaces=(spaces.Discrete, spaces.Box),
+            support_multi_env=True,
+            **arguments,
+        )
+        self.expert_name: ExpertName = expert
+        self.batch_size = batch_size
+        self.buffer_size = buffer_size
+        self.learning_starts = learning_starts
+        self.env_steps_per_update = env_steps_per_update
+        self.expert_shares = expert_share_initial, expert_share_final, expert_share_fraction
+        self.max_grad_norm = max_grad_norm
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        policy = self.policy_class(
+            self.observation_space, self.action_space, self.lr_schedule, **self.policy_kwargs
+        )
+        self.policy = cast("ActorCriticPolicy", policy.to(self.device))
+        if not isinstance(self.env, NavigationVecEnv):
+            raise UsageError(f"algorithm.expert: none for a {type(self.env).__name__}")
+        self._expert: Expert = self.env.teach(self.expert_name)
+        assert isinstance(self.observation_space, spaces.Dict)  # noqa: S101 (MultiInputPolicy's)
+        boxes = {k: cast("spaces.Box", v) for k, v in self.observation_space.spaces.items()}
+        shapes = {k: (box.shape, box.dtype) for k, box in boxes.items()}
+        self.replay = Demonstrations(self.buffer_size, self.n_envs, shapes, self.action_space)
+        self.generator = np.random.default_rng(self.seed)
+
+    @property
+    def expert_share(self) -> float:
+        """Share of the decisions that the expert flies at present."""
+        first, last, fraction = self.expert_shares
+        gone = 1.0 - self._current_progress_remaining
+        return first + (last - first) * min(1.0, gone / fraction)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 100,
+        tb_log_name: str = "imitation",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Imitation:
+        """Fly and learn for a number of steps; see stable-baselines3's `BaseAlgorithm.learn`."""
+        total, hooks = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        hooks.on_training_start(locals(), globals())
+        logged = self._episode_num
+        while self.num_timesteps < total:
+            hooks.on_rollout_start()
+            infos = self._fly()
+            hooks.update_locals(locals())
+            if not hooks.on_step():
+                break
+            hooks.on_rollout_end()
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            self._train()
+            if self._episode_num // log_interval > logged // log_interval:
+                logged = self._episode_num
+                self.logger.record("rollout/expert_share", self.expert_share)
+                self.logger.dump(self.num_timesteps)
+            del infos
+        hooks.on_training_end()
+        return self
+
+    def _fly(self) -> list[dict[str, Any]]:
+        """Fly one step of all vehicles and note what the expert would do; return the infos."""
+        assert self.env is not None and self._last_obs is not None  # noqa: S101 (_setup_learn)
+        seen = cast("Encoded", self._last_obs)
+        shown = self._expert.decide()
+        theirs = self.generator.random(self.n_envs) < self.expert_share
+        flown = shown
+        if not theirs.all():
+            own, _ = self.policy.predict(seen, deterministic=True)
+            flown = np.where(theirs.reshape(-1, *[1] * (shown.ndim - 1)), shown, own)
+        self.replay.add(seen, shown)
+        following, _, dones, infos = self.env.step(flown)
+        self._last_obs = cast("dict[str, NDArray[Any]]", following)
+        self._last_episode_starts = dones
+        self.num_timesteps += self.n_envs
+        self._episode_num += int(dones.sum())
+        self._update_info_buffer(infos, dones)
+        return infos
+
+    def _train(self) -> None:
+        """Make the updates that are due after the last step of all vehicles."""
+        interval = self.env_steps_per_update
+        due = self.num_timesteps // interval - (self.num_timesteps - self.n_envs) // interval
+        if not due or self.num_timesteps < self.learning_starts:
+            return
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = [self._update() for _ in range(due)]
+        self._n_updates += due
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", float(np.mean(losses)))
+
+    def _update(self) -> float:
+        """Make one update and return its loss."""
+        observations, actions = self.replay.sample(self.batch_size, self.generator)
+        wanted = torch.from_numpy(actions).to(self.device)
+        distribution = self.policy.get_distribution(self._tensors(observations))
+        if isinstance(self.action_space, spaces.Discrete):
+            loss = -distribution.log_prob(wanted).mean()
+        else:
+            loss = functional.mse_loss(distribution.mode(), wanted)
+        self.policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+        self.policy.optimizer.step()
+        return loss.item()
+
+    def _tensors(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+        return {key: torch.from_numpy(array).to(self.device) for key, array in arrays.items()}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "replay", "generator", "_expert"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
