@@ -14,8 +14,8 @@ from airl_mav.envs.curriculum import CurriculumState
 from airl_mav.envs.delay import bounded
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.rewards import Step, reward_of
-from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
+from airl_mav.envs.rewards import Step, costs, reward_of
+from airl_mav.envs.spec import Costs, EnvironmentSpec, gymnasium_spec
 from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
 from airl_mav.policy.layouts import ObservationSpec, boxes
 
@@ -53,8 +53,8 @@ class Decisions:
         self.navigation = Navigation(self.environment, n)
         self.curriculum: CurriculumState | None = None
         if self.environment.curriculum is not None:
-            zones = len(self.navigation.arena_spec.zones_m)
-            self.curriculum = CurriculumState(self.environment.curriculum, zones)
+            stages = len(self.navigation.stages)
+            self.curriculum = CurriculumState(self.environment.curriculum, stages)
         self._zone: int | None = None
         """Curriculum zone that `reset` was asked for."""
         self._before: Flights | None = None
@@ -74,8 +74,9 @@ class Decisions:
         before, spec = self._before, self.environment
         if before is None:
             raise gym.error.ResetNeeded("step() before reset()")
-        flown = commands(spec.action_spec, actions)
-        self.navigation.fly(flown)
+        chosen = commands(spec.action_spec, actions)
+        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)]
+        self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()
         truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
         terminated = (now.verdict != Verdict.FLYING) & ~truncated
@@ -83,7 +84,10 @@ class Decisions:
             for i in np.flatnonzero(terminated | truncated):
                 success = bool(now.verdict[i] == Verdict.SUCCESS)
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
-        reward = self._reward(Step(before, now, flown, spec.episode.hold_s))
+        step = Step(before, now, chosen, spec.episode.hold_s)
+        reward = self._reward(step)
+        if spec.costs != Costs():
+            reward = reward - costs(spec.costs, last, step)
         return Decided(now, reward, terminated, truncated)
 
     def _quality(self, flights: Flights) -> dict[str, NDArray[Any]]:

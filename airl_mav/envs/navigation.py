@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.arena.zones import zone_radius_m
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, batch_of, put_arena
 from airl_mav.envs.cameras import Cameras
+from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.estimation import Telemetry
@@ -117,6 +117,7 @@ class Navigation(Stateful):
             computer_w = computer.onboard_watts
         self.vehicle: VehicleProfile = vehicle
         self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
+        self.stages = stages_of(spec.curriculum, self.arena_spec)
         self.camera: Camera = spec.camera.of(self.vehicle.camera)
         self.observation = ObservationSpec(
             layout=spec.layout,
@@ -167,12 +168,12 @@ class Navigation(Stateful):
         Args:
             slots: Which of the n.
             seeds: Of the episodes, one a slot.
-            zone: Curriculum zone that bounds the goals; None is the largest.
+            zone: Curriculum zone, or stage, that bounds the goals; None is the whole arena.
 
         Raises:
             UsageError: No arena can be made of a seed, or there is no such zone.
         """
-        zone_radius_m(self.arena_spec, zone)
+        check_stage(self.stages, self.arena_spec, zone)
         who = np.zeros(self.n, np.bool_)
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
@@ -305,12 +306,13 @@ class Navigation(Stateful):
         self._batch = batch_of([arena for arena in room if arena is not None])
 
     def _arena(self, seed: int, zone: int | None) -> Arena:
+        stage = None if zone is None else self.stages[zone]
         return generate(
-            self.arena_spec,
+            self.arena_spec if stage is None else stage.arena,
             seed if self._arena_seed is None else self._arena_seed,
             name=Path(self.spec.arena).stem,
             vehicle_width_m=self.vehicle.body.width_m,
-            zone=zone,
+            zone=None if stage is None else stage.zone,
         )
 
     def _wait(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:

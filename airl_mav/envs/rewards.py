@@ -3,7 +3,7 @@
 `shaped` is the default. `paper` is the paper's equation 2 to the letter: it does not train, its
 terms being a thousand times too large for any learner with a usual scale. `paper-scaled` is the
 same divided by 1000. Any other is the user's: a function of a `Step`, or a class, made without
-arguments, whose object is one.
+arguments, whose object is one. `costs` are taken off any of them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
+from airl_mav.envs.spec import Costs
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S
 
 PROGRESS_1_M = 0.02
@@ -28,6 +29,8 @@ DECISION_COST = 0.005
 """`shaped`: cost of every decision, so that faster is better."""
 
 PAPER_BONUS = 1000.0
+
+J_PER_KJ = 1000.0
 
 
 @dataclass(frozen=True)
@@ -133,3 +136,19 @@ class _Checked:
             found = f"an array {paid.shape}" if paid.shape != (n,) else "what is no number"
             raise UsageError(f"reward {self._name!r}: gives {found}; accepted: ({n},) numbers")
         return paid
+
+
+def costs(weights: Costs, last: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
+    """Return what a decision costs (n,), to be taken off its reward.
+
+    Args:
+        weights: What is how dear.
+        last: (n, 3) the commands that flew until now: forward, right [m/s], yaw rate [rad/s]; zero
+            at the start of a flight, and where the watchdog has let the vehicle hover.
+        step: The decision.
+    """
+    change = np.abs(step.commands - last)
+    found: NDArray[np.float64] = weights.command_step * np.hypot(change[:, 0], change[:, 1])
+    found += weights.turn_step * change[:, 2]
+    found += weights.energy * (step.now.energy_j - step.before.energy_j) / J_PER_KJ
+    return found

@@ -132,12 +132,70 @@ class Randomisation(SensorNoise, Spread):
     )
 
 
+class Costs(ProfileModel):
+    """What a decision costs beside the reward, whichever that is: 0 is nothing."""
+
+    command_step: float = quantity(
+        "per m/s by which the velocity command differs from the one before",
+        "1",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+    turn_step: float = quantity(
+        "per rad/s by which the yaw rate differs from the one before",
+        "1",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+    energy: float = quantity(
+        "per kilojoule that the vehicle has drawn, its computer apart",
+        "1",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+
+
 class Curriculum(ProfileModel):
-    """Zones of growing radius around the start (the paper's): the goal is drawn inside."""
+    """Zones of growing radius around the start (the paper's): the goal is drawn inside.
+
+    Obstacles can grow more, faster and denser with them, stage by stage; the last stage is the
+    arena as it is.
+    """
 
     window: int = quantity("last episodes that count", "1", ge=1, le=1_000_000, default=1000)
     threshold: float = quantity(
         "success rate over them from which the next zone opens", "1", gt=0, le=1, default=0.5
+    )
+    stages: int | None = quantity(
+        "stages, over which the zones are spread; left out: as many as the arena has zones",
+        "1",
+        ge=1,
+        le=100,
+        default=None,
+    )
+    count: float = quantity(
+        "share of the obstacles that the first stage has; it grows in a straight line to 1",
+        "1",
+        ge=0,
+        le=1,
+        default=1.0,
+    )
+    speed: float = quantity(
+        "share of their speed that moving obstacles have in the first stage; it grows to 1",
+        "1",
+        gt=0,
+        le=1,
+        default=1.0,
+    )
+    clearance_m: float = quantity(
+        "added to the least gap between obstacles in the first stage; it falls to 0",
+        "m",
+        ge=0,
+        le=50,
+        default=0.0,
     )
 
 
@@ -155,6 +213,9 @@ class EnvironmentSpec(ProfileModel):
         default="shaped",
         description="reward: shaped, paper-scaled, paper, or your own as MODULE:NAME or"
         " FILE.py:NAME",
+    )
+    costs: Costs = Field(
+        default_factory=Costs, description="of unsteady commands and of energy, beside the reward"
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")

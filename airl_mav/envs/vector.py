@@ -31,7 +31,7 @@ from airl_mav.envs.saved_state import (
     unpack,
     unpack_generators,
 )
-from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.policy.layouts import Encoded
 
 
@@ -179,6 +179,8 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
 
     def _check_same(self, theirs: dict[str, Any]) -> None:
         ours = self.environment.model_dump(mode="json")
+        # A state of an earlier version has the defaults of what it does not name.
+        theirs = spec_of(None, theirs).model_dump(mode="json")
         changed = [key for key in ours if theirs.get(key) != ours[key]]
         if changed:
             raise UsageError(f"state: of an environment with another {', '.join(changed)}")

@@ -230,6 +230,10 @@ class TrainingConfig(ProfileModel):
     checkpoint_every: int = quantity(
         "steps between checkpoints", "1", ge=1, le=10**9, default=20_000
     )
+    keep_zones: bool = Field(
+        default=False,
+        description="keep a checkpoint and the weights with which each curriculum zone was done",
+    )
     environment: EnvironmentSpec = Field(default_factory=EnvironmentSpec, description="environment")
     network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")
     algorithm: AlgorithmSpec = Field(default_factory=AlgorithmSpec, description="algorithm")

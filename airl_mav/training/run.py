@@ -17,6 +17,7 @@ from stable_baselines3.common.logger import configure
 
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
 from airl_mav.envs.delay import bounded
@@ -33,7 +34,7 @@ from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 from airl_mav.training.export import export_sb3
 from airl_mav.training.recurrent import GreedyDecisions
-from airl_mav.training.store import Evaluation, TrainingFolder, TrainingProgress
+from airl_mav.training.store import BEST_MODEL, Evaluation, TrainingFolder, TrainingProgress
 
 RECENT = 200
 """Episodes in training that the shown success rate is of."""
@@ -147,6 +148,8 @@ class _BetweenRollouts(BaseCallback):
         self._recent: deque[bool] = deque(maxlen=RECENT)
         self._evaluated = -1
         self._saved = 0
+        self._zone = 0
+        """Curriculum zones before this one are done, and kept if asked for."""
         self._before_s = 0.0
         self._clock = WallClock()
         self._paused_us = 0
@@ -158,6 +161,7 @@ class _BetweenRollouts(BaseCallback):
         self._recent.extend(meta["recent"])
         self._evaluated = meta["evaluated"]
         self._saved = meta["steps"]
+        self._zone = meta.get("zone", 0)
         self._before_s = meta["seconds"]
         self.done = meta["done"]
 
@@ -167,6 +171,7 @@ class _BetweenRollouts(BaseCallback):
             "seconds": self._seconds(),
             "recent": list(self._recent),
             "evaluated": self._evaluated,
+            "zone": self._zone,
             "done": self.done,
         }
 
@@ -174,9 +179,21 @@ class _BetweenRollouts(BaseCallback):
         self._saved = self.model.num_timesteps
         save_checkpoint(self._folder.checkpoints, self.model, self._meta())
 
+    def _keep_zones(self) -> None:
+        """Keep what the learner is when it has just done with a curriculum zone."""
+        curriculum = self._env.env.curriculum
+        if not self._config.keep_zones or curriculum is None:
+            return
+        while self._zone < curriculum.zone:
+            kept = self._folder.zone(self._zone)
+            self._zone += 1
+            save_checkpoint(kept, self.model, self._meta())
+            replace_file(kept / BEST_MODEL, model_bytes(self.model))
+
     # --- SB3's hooks
 
     def _on_rollout_start(self) -> None:
+        self._keep_zones()
         steps, selection = self.model.num_timesteps, self._config.selection
         if steps // selection.every > max(self._evaluated, 0) // selection.every:
             self._evaluate(self.model)

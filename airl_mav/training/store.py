@@ -5,6 +5,7 @@ evaluations.jsonl   one line an evaluation on the selection seeds
 tensorboard/        curves
 checkpoints/        everything needed to go on
 best/               the best weights so far, and which they are
+zones/zone-0/       with keep_zones: a checkpoint and the weights with which the zone was done
 policy/             the result: policy.onnx and card.json
 """
 
@@ -94,6 +95,7 @@ class TrainingFolder:
         self.tensorboard = path / "tensorboard"
         self.best_model = path / "best" / BEST_MODEL
         """The best weights so far, as stable-baselines3 saves them."""
+        self.zones = path / "zones"
         self.policy = path / "policy"
         """The exported result."""
 
@@ -154,6 +156,10 @@ class TrainingFolder:
         if not file.exists() or not self.best_model.exists():
             return None
         return read_typed(file, _EVALUATION, None, "training run")
+
+    def zone(self, zone: int) -> Path:
+        """Return the folder of what is kept of a curriculum zone."""
+        return self.zones / f"zone-{zone}"
 
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:
         """Save the best weights, then their evaluation."""

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.envs.curriculum import CurriculumState
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.curriculum import CurriculumState, stages_of
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.spec import Curriculum, EnvironmentSpec
+from airl_mav.envs.spec import Curriculum, EnvironmentSpec, spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.training import run
+from airl_mav.training.checkpoint import _read
+from airl_mav.training.config import TrainingConfig
+from airl_mav.training.store import TrainingProgress
 
 
 def state(window: int, threshold: float = 0.5, zones: int = 3) -> CurriculumState:
@@ -114,3 +122,104 @@ def test_trains_through_the_zones(threshold: float, expected: list[int]) -> None
         assert info["final_info"]["outcome"].tolist() == ["collision", "success"]
         zones.append(int(info["zone"].max()))
     assert zones == expected
+
+
+EASED = {"stages": 5, "count": 0.2, "speed": 0.5, "clearance_m": 1.0}
+ARENA = {
+    "description": "any",
+    "static": {"count": [10, 20]},
+    "moving": {"count": [5, 5], "speed_m_s": [0.15, 2.0]},
+}
+
+
+def test_stages_grow_to_the_arena_as_it_is() -> None:
+    arena = ArenaSpec.model_validate(ARENA)
+    stages = stages_of(Curriculum.model_validate(EASED), arena)
+    assert [stage.zone for stage in stages] == [0, 0, 1, 2, 2]
+    assert [stage.arena.static.count for stage in stages] == [
+        (2, 4),
+        (4, 8),
+        (6, 12),
+        (8, 16),
+        (10, 20),
+    ]
+    assert [stage.arena.moving.count for stage in stages] == [(k, k) for k in (1, 2, 3, 4, 5)]
+    assert [stage.arena.moving.speed_m_s[1] for stage in stages] == pytest.approx(
+        [1.0, 1.25, 1.5, 1.75, 2.0]
+    )
+    assert stages[0].arena.moving.speed_m_s[0] == 0.1, "no slower than an arena may ask for"
+    assert [stage.arena.min_clearance_m for stage in stages] == pytest.approx(
+        [3.0, 2.75, 2.5, 2.25, 2.0]
+    )
+    assert stages[-1].arena == arena
+    assert [stage.zone for stage in stages_of(Curriculum(), arena)] == [0, 1, 2]
+    assert all(stage.arena == arena for stage in stages_of(Curriculum(), arena)), "zones alone"
+
+
+def test_episodes_are_flown_in_their_stage_and_put_back_there() -> None:
+    spec = spec_of(None, {"arena": "dynamic-obstacles", "curriculum": EASED})
+    counts = []
+    for stage in (0, 2, 4, None):
+        navigation = Navigation(spec, 3)
+        navigation.begin(range(3), [5, 6, 7], stage)
+        again = Navigation(spec, 3)
+        again.set_state(navigation.get_state())
+        for ours, theirs in zip(navigation.arenas, again.arenas, strict=True):
+            assert ours is not None
+            assert theirs is not None
+            np.testing.assert_array_equal(ours.obstacles.center, theirs.obstacles.center)
+        counts.append(sum(len(arena.obstacles) for arena in navigation.arenas if arena))
+    assert counts[0] < counts[1] < counts[2] == counts[3]
+    with pytest.raises(UsageError, match="zone = 5: accepted: 0 <= value <= 4, the stages"):
+        navigation.begin([0], [1], 5)
+
+
+class Dies(TrainingProgress):
+    """Ends the training at once, as a kill does, after so many steps."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    def trained(self, steps: int, success: float | None, zone: int | None) -> None:
+        if steps >= self.steps:
+            raise KeyboardInterrupt
+
+
+def test_what_was_learned_in_a_zone_is_kept_and_the_same_after_a_kill(tmp_path: Path) -> None:
+    """Every goal is reached at once, so that each zone takes a window of episodes."""
+    config = TrainingConfig.model_validate(
+        {
+            "description": "any",
+            "steps": 400,
+            "vehicles": 4,
+            "checkpoint_every": 40,
+            "keep_zones": True,
+            "environment": {
+                "arena": "no-obstacles",
+                "image_width_px": 16,
+                "image_height_px": 12,
+                "episode": {"goal_radius_m": 50},
+                "curriculum": {"window": 30, "threshold": 0.5, "stages": 4},
+            },
+            "algorithm": {"learning_starts": 40, "buffer_size": 200},
+            "selection": {"every": 400, "episodes": 2},
+        }
+    )
+    run.train(config, tmp_path / "straight", name="any")
+    with pytest.raises(KeyboardInterrupt):
+        run.train(config, tmp_path / "killed", name="any", progress=Dies(60))
+    run.train(config, tmp_path / "killed", name="any", resume=True)
+    for zone in range(3):
+        kept = [tmp_path / each / "zones" / f"zone-{zone}" for each in ("straight", "killed")]
+        assert (kept[0] / "model.zip").exists()
+        weights, arrays, state = zip(
+            *(_read(folder / (folder / "latest").read_text().strip()) for folder in kept),
+            strict=True,
+        )
+        policies = [each["states"]["policy"] for each in weights]
+        assert all(policies[0][key].equal(policies[1][key]) for key in policies[0])
+        np.testing.assert_array_equal(arrays[0]["replay/actions"], arrays[1]["replay/actions"])
+        steps = [each["meta"]["steps"] for each in state]
+        assert steps[0] == steps[1]
+        assert state[0]["meta"]["zone"] == zone + 1
+    assert not (tmp_path / "straight" / "zones" / "zone-3").exists()

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
-from airl_mav.envs.rewards import Step, reward_of
-from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.rewards import Step, costs, reward_of
+from airl_mav.envs.spec import Costs, EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
 
 NEARER, AWAY, GOAL, CRASH, FAST, STILL = range(6)
@@ -118,3 +118,36 @@ def test_the_environment_pays_what_the_formula_says(name: str) -> None:
         assert reward == pytest.approx(expected, abs=1e-5)
         assert seen["goal"][:, 2] * 20.0 == pytest.approx(now, abs=1e-4)
         distance = now
+
+
+def test_costs_by_hand() -> None:
+    """A command that turns by a right angle at 3 and 4 m/s is a step of 5 m/s."""
+    last = np.array([[3.0, 0.0, 0.5], [1.0, 0.0, 0.0]])
+    chosen = np.array([[0.0, 4.0, -0.5], [1.0, 0.0, 0.0]])
+    before, now = flights([9.0, 9.0], [0.0, 0.0]), flights([8.0, 8.0], [1.0, 1.0])
+    now.energy_j[:] = 100.0, 50.0
+    weights = Costs(command_step=0.01, turn_step=0.1, energy=2.0)
+    step = Step(before, now, chosen, HOLD_S)
+    found = costs(weights, last, step)
+    assert found == pytest.approx([0.05 + 0.1 + 0.2, 0.1])
+    assert not costs(Costs(), last, step).any()
+
+
+def test_the_environment_takes_the_costs_off_its_reward() -> None:
+    """Flown alike, with and without; a flight's first command differs from none."""
+    paid = {}
+    weights = {"command_step": 0.01, "turn_step": 0.2, "energy": 0.5}
+    for name, knobs in (("dear", {"costs": weights}), ("free", {})):
+        env = NavigationVectorEnv(2, arena="no-obstacles", **knobs)
+        _, info = env.reset(seed=[1, 2])
+        rows = []
+        # arc-25: 3.5 m/s straight on; at a stand with 72 deg/s to the right; the same again.
+        for action in (17, 4, 4):
+            before_j = info["energy_j"]
+            _, reward, *_, info = env.step(np.array([action, action]))
+            rows.append(np.stack([reward, info["energy_j"] - before_j]))
+        paid[name] = np.array(rows)
+    taken, drawn_kj = paid["free"][:, 0] - paid["dear"][:, 0], paid["free"][:, 1] / 1000.0
+    steps = np.array([0.01 * 3.5, 0.01 * 3.5 + 0.2 * np.radians(72.0), 0.0])
+    assert taken == pytest.approx(steps[:, None] + 0.5 * drawn_kj)
+    assert (drawn_kj > 0.01).all()
