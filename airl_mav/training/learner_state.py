@@ -31,6 +31,9 @@ COUNTERS = (
 )
 """Plain numbers of a learner; not every one has all of them."""
 
+NOISE = ("exploration_mat", "exploration_matrices")
+"""What gSDE draws at the beginning of a rollout, before stable-baselines3 says that it begins."""
+
 
 class Restorable(Protocol):
     """A VecEnv whose state can be saved and restored."""
@@ -53,6 +56,9 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
     }
     if memory := _memory(model):
         weights["memory"] = memory
+    if model.use_sde:
+        noise = _explorer(model).action_dist
+        weights["noise"] = {name: getattr(noise, name) for name in NOISE}
     if model.device.type == "cuda":
         weights["rng"]["cuda"] = torch.cuda.get_rng_state(model.device)
     last = cast("Mapping[str, NDArray[Any]]", model._last_obs)
@@ -89,6 +95,8 @@ def restore(
         if ours.shape != saved.shape:
             raise ValueError(f"memory of shape {tuple(saved.shape)}, not {tuple(ours.shape)}")
         ours.copy_(saved)
+    if model.use_sde:
+        _restore_noise(model, weights["noise"])
     starts = arrays["last_episode_starts"]
     if starts.shape != (model.n_envs,):
         raise ValueError(f"{len(starts)} vehicles, not {model.n_envs}")
@@ -120,6 +128,23 @@ def _memory(model: BaseAlgorithm) -> list[torch.Tensor]:
     """Return what a recurrent learner's networks remember of the flights that go on."""
     states = getattr(model, "_last_lstm_states", None)
     return [] if states is None else [each for pair in states for each in pair]
+
+
+def _explorer(model: BaseAlgorithm) -> Any:
+    """Return the part of a policy that draws gSDE's noise."""
+    return getattr(model, "actor", None) or model.policy
+
+
+def _restore_noise(model: BaseAlgorithm, saved: Mapping[str, torch.Tensor]) -> None:
+    """Put gSDE's noise back; the draw with which the next rollout begins has been made."""
+    explorer = _explorer(model)
+    for name in NOISE:
+        setattr(explorer.action_dist, name, saved[name].to(model.device))
+
+    def once(n_envs: int = 1) -> None:  # noqa: ARG001 (the signature of what it stands for)
+        del explorer.reset_noise
+
+    explorer.reset_noise = once
 
 
 def _generators(model: BaseAlgorithm) -> list[np.random.Generator]:

@@ -81,8 +81,25 @@ class QrDqnOptions(ReplayOptions):
     n_quantiles: int | None = quantity("quantiles of a value", "1", ge=1, le=1000, default=None)
 
 
-class SacOptions(ReplayOptions):
+class NoiseOptions(ProfileModel):
+    """Options of exploration with noise that depends on the state (Raffin et al., gSDE)."""
+
+    use_sde: bool | None = Field(default=None, description="explore with gSDE; continuous actions")
+    sde_sample_freq: int | None = quantity(
+        "steps between two draws of gSDE's noise; -1: once a rollout",
+        "1",
+        ge=-1,
+        le=10**6,
+        default=None,
+    )
+
+
+class SacOptions(ReplayOptions, NoiseOptions):
     """Options of `sac` (Haarnoja et al., arXiv 1812.05905)."""
+
+    use_sde_at_warmup: bool | None = Field(
+        default=None, description="gSDE in place of uniform actions before learning_starts"
+    )
 
     ent_coef: float | str | None = Field(
         default=None,
@@ -107,7 +124,7 @@ class TqcOptions(SacOptions):
     n_quantiles: int | None = quantity("quantiles of a critic", "1", ge=1, le=1000, default=None)
 
 
-class PpoOptions(Options):
+class PpoOptions(Options, NoiseOptions):
     """Options of `ppo` (Schulman et al., arXiv 1707.06347)."""
 
     n_steps: int | None = quantity(

@@ -131,12 +131,9 @@ def test_the_table_has_what_the_classes_take(name: str) -> None:
     if "arguments" in taken:  # Passed on to stable-baselines3's.
         assert set(row.options.model_fields) <= {*taken, *inspect.signature(DQN).parameters}
         return
-    noise = {"use_sde", "sde_sample_freq", "use_sde_at_warmup"}  # Not restored by a checkpoint.
     steps = {"n_steps"} if "buffer_size" in taken else set()  # Not with Dict observations.
     assert set(row.fields.values()) < set(taken)
-    assert set(row.options.model_fields) - set(row.to_policy) == (
-        set(taken) - NOT_OPTIONS - noise - steps
-    )
+    assert set(row.options.model_fields) - set(row.to_policy) == (set(taken) - NOT_OPTIONS - steps)
     assert set(row.defaults) <= set(row.options.model_fields)
 
 

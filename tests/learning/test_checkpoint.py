@@ -131,6 +131,24 @@ def test_other_learners_go_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     assert_same(expected, resume(name, tmp_path / "checkpoints"))
 
 
+@pytest.mark.parametrize("name", ["ppo", "recurrent-ppo", "sac"])
+def test_noise_that_depends_on_the_state_goes_on(name: str, tmp_path: Path) -> None:
+    """gSDE draws before a rollout begins, which is when a checkpoint is written."""
+    total = TOTAL.get(name, OTHERS)
+    options = FIELDS[name].get("options", {}) | {"use_sde": True, "sde_sample_freq": 5}
+
+    def noisy(seed: int) -> Any:
+        spec = AlgorithmSpec(**({"name": name} | FIELDS[name] | {"options": options}))
+        return make_model(spec, NetworkSpec(), ToyFleet(VEHICLES, continuous=True), seed)
+
+    straight = noisy(3)
+    straight.learn(total, callback=SaveOnce(tmp_path / "checkpoints", total // 2))
+    resumed = noisy(99)
+    load_latest(tmp_path / "checkpoints", resumed)
+    resumed.learn(total - resumed.num_timesteps, reset_num_timesteps=False)
+    assert_same(everything(straight), everything(resumed))
+
+
 @pytest.mark.parametrize("name", ["dqn", "ppo"])
 def test_saving_changes_nothing(name: str, tmp_path: Path) -> None:
     saved = straight(name, tmp_path / "checkpoints")

@@ -137,8 +137,8 @@ def test_the_environment_takes_the_costs_off_its_reward() -> None:
     """Flown alike, with and without; a flight's first command differs from none."""
     paid = {}
     weights = {"command_step": 0.01, "turn_step": 0.2, "energy": 0.5}
-    for name, knobs in (("dear", {"costs": weights}), ("free", {})):
-        env = NavigationVectorEnv(2, arena="no-obstacles", **knobs)
+    for name, costly in (("dear", weights), ("free", {})):
+        env = NavigationVectorEnv(2, arena="no-obstacles", costs=costly)
         _, info = env.reset(seed=[1, 2])
         rows = []
         # arc-25: 3.5 m/s straight on; at a stand with 72 deg/s to the right; the same again.

@@ -328,4 +328,6 @@ def test_cameras_that_do_not_fit(folder: Path, changes: dict[str, Any], words: l
 def test_facts_and_card_share_their_fields() -> None:
     """The card adds what the file tells, and nothing that its maker says is lost."""
     extra = set(PolicyCard.model_fields) - set(type(facts()).model_fields)
-    assert extra == {"sha256", "torch_sha256", "network", "parameters", "macs", "quantisation"}
+    assert extra == {
+        *("sha256", "torch_sha256", "state", "network", "parameters", "macs", "quantisation")
+    }
