@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from airl_mav.core.clock import Clock
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
@@ -57,6 +58,7 @@ def fly_mission(
     watchdog_settings: WatchdogSettings,
     guard: Guard,
     latency: LatencySampler | None = None,
+    compensator: Compensator | None = None,
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
 
@@ -74,9 +76,14 @@ def fly_mission(
         watchdog_settings: Bounds on silence.
         guard: Who looks after them.
         latency: Where to draw t2 from, to fly as a slower computer.
+        compensator: Carries forward what is seen; None: the policy sees what is.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
-    pilot = Pilot(link, frames, policy, watchdog, clock, pilot_settings, latency=latency)
+    pilot = Pilot(
+        *(link, frames, policy, watchdog, clock, pilot_settings),
+        latency=latency,
+        compensator=compensator,
+    )
     try:
         progress("arming")
         link.prepare(PREPARE_TIMEOUT_S, stop)
@@ -121,19 +128,33 @@ def fly_mission(
     return MissionResult(reason, tuple(notes), pilot.log)
 
 
-def check_camera(policy: Policy, frames: FrameSource, stop: threading.Event) -> None:
-    """Look at the camera before take-off. Raises UsageError when the policy cannot use it.
+def check_camera(
+    policy: Policy,
+    frames: FrameSource,
+    stop: threading.Event,
+    compensator: Compensator | None = None,
+) -> None:
+    """Look at the camera before take-off.
 
     Without a frame nothing is known of it, and nothing is refused. `stop`, set from outside, ends
-    the wait for a first frame.
+    the wait for a first frame. Raises UsageError when policy or compensator cannot use it.
     """
-    if not isinstance(policy, CameraBound):
+    if not isinstance(policy, CameraBound) and compensator is None:
         return
     for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):
         received = frames.wait(newer_than_sequence=-1, timeout_s=FRAME_WAIT_S)
-        if received is not None:
-            if (reason := policy.refuses(received.frame.intrinsics)) is not None:
-                raise UsageError(f"--policy {policy.name}: {reason}")
-            return
-        if stop.is_set():
-            return
+        if received is None:
+            if stop.is_set():
+                return
+            continue
+        camera = received.frame.intrinsics
+        if isinstance(policy, CameraBound) and (reason := policy.refuses(camera)) is not None:
+            raise UsageError(f"--policy {policy.name}: {reason}")
+        if compensator is not None and camera != compensator.intrinsics:
+            raise FieldError(
+                "compensate",
+                True,
+                problem=f"the camera is {camera}; accepted: that of the vehicle's profile,"
+                f" {compensator.intrinsics}",
+            )
+        return

@@ -1,6 +1,8 @@
 """The decision loop: observe -> infer -> act, and hold; every step stamped.
 
-Sequential, as in the paper: while the next decision is computed, the last command keeps flying.
+Sequential, as in the paper, or pipelined: then nothing is held, and the next decision begins as
+soon as the last one is ready. While a decision is computed, the last command keeps flying; where
+that is compensated, the policy sees what will be when its action is sent.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
-from airl_mav.policy.observation import Kinematics, encode
+from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource, ReceivedFrame
 from companion.interfaces import BodyVelocity, Link
@@ -23,6 +26,9 @@ from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1
 """How long one wait for a frame lasts before the other conditions are looked at [s]."""
+
+ONE = np.zeros(1, np.intp)
+"""The only companion of its compensator."""
 
 WAITING = "waiting for a frame"
 """What the pilot tells the watchdog that it is at."""
@@ -41,6 +47,8 @@ class Pilot:
     settings: PilotSettings
     latency: LatencySampler | None = None
     """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
+    compensator: Compensator | None = None
+    """Carries forward what is seen, of one companion; None = as it is."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
 
     def fly(self, goal: tuple[float, float], stop: Event) -> str:
@@ -50,6 +58,8 @@ class Pilot:
         Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
+        if self.compensator is not None:
+            self.compensator.begin(0)
         while not stop.is_set():
             if not self.link.connected:
                 return "link lost"
@@ -75,7 +85,8 @@ class Pilot:
         clock, settings = self.clock, self.settings
         self.watchdog.doing("inference")
         started_us = clock.time_us()
-        action = limited(self.policy.act(encode(seen.frame, state, goal)), settings.max_speed_m_s)
+        observation = self._observe(seen, state, goal, started_us)
+        action = limited(self.policy.act(observation), settings.max_speed_m_s)
         if self.latency is not None:
             # Not to be interrupted: a computation is not.
             clock.sleep_until(started_us + self.latency.sample_us())
@@ -89,8 +100,18 @@ class Pilot:
             return True
         if not self.watchdog.command(setpoint, hold_us):
             return False
-        self.watchdog.doing("holding an action")
-        clock.sleep_until(sent_us + hold_us, stop)
+        if self.compensator is not None:
+            hover_s = self.watchdog.hover_after_s
+            self.compensator.decided(
+                ONE,
+                np.array([setpoint]),
+                np.array([ready_us - started_us]),
+                np.array([sent_us]),
+                None if hover_s is None else np.array([sent_us + hold_us + hover_s * US_PER_S]),
+            )
+        if settings.decisions == "sequential":
+            self.watchdog.doing("holding an action")
+            clock.sleep_until(sent_us + hold_us, stop)
         self.log.record(
             seen.frame.capture_time_us,
             seen.received_us,
@@ -101,3 +122,20 @@ class Pilot:
             setpoint,
         )
         return True
+
+    def _observe(
+        self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], now_us: int
+    ) -> Observation:
+        """Return what the policy sees: what is, or what will be when its action is sent."""
+        frame, depth_mm = seen.frame, seen.frame.depth_mm
+        if self.compensator is not None:
+            images, states = self.compensator.foresee(
+                ONE,
+                depth_mm[None],
+                np.array([now_us - frame.capture_time_us]),
+                np.array([now_us]),
+                Kinematics(state.position[None], state.velocity[None], state.quaternion[None]),
+            )
+            depth_mm = images[0]
+            state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
+        return observe(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64))

@@ -7,11 +7,14 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import find_policy
+from airl_mav.prediction.compensator import Compensator
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
     check_quota,
@@ -37,6 +40,8 @@ class Mission:
     watchdog: WatchdogSettings
     latency: LatencySampler | None
     """Where t2 is drawn from; None injects nothing."""
+    compensator: Compensator | None
+    """Carries forward what is seen; None: the policy sees what is."""
 
 
 def prepare(asked: StandAloneCompanion) -> Mission:
@@ -53,7 +58,11 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
     loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
-    return Mission(asked.goal, loaded, pilot, watchdog, sampler)
+    compensator = None
+    if pilot.compensate:
+        vehicle = load_vehicle(asked.vehicle)
+        compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
+    return Mission(asked.goal, loaded, pilot, watchdog, sampler, compensator)
 
 
 def fly_alone(
@@ -86,7 +95,7 @@ def fly_alone(
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)
-        check_camera(mission.policy, frames, stop)
+        check_camera(mission.policy, frames, stop, mission.compensator)
         return fly_mission(
             link,
             frames,
@@ -100,4 +109,5 @@ def fly_alone(
             watchdog_settings=mission.watchdog,
             guard=ThreadGuard(clock),
             latency=mission.latency,
+            compensator=mission.compensator,
         )

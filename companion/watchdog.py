@@ -69,6 +69,11 @@ class Watchdog:
             return True
 
     @property
+    def hover_after_s(self) -> float | None:
+        """Time after an action's hold at which the velocity is zeroed [s]; None: never."""
+        return self._settings.hover_after_s
+
+    @property
     def due_us(self) -> int | None:
         """When `look` next has something to do, unless a decision comes first [µs]; None: never."""
         if self.left_offboard:

@@ -76,7 +76,7 @@ def read_options(
         UsageError: A value is out of its range, or the scenario file cannot be used.
         SystemExit: tyro has printed the help, or what is wrong with the words.
     """
-    words = _with_new_names(words, renamed)
+    words = _with_values(model, _with_new_names(words, renamed))
     held: dict[str, Any] = {}
     file = _scenario_file(model, words)
     if file is not None:
@@ -140,6 +140,23 @@ def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]
             f"{name} is called {' '.join(new)} now", style="yellow", markup=False, highlight=False
         )
         out += [*new[:-1], f"{new[-1]}{equals}{value}"]
+    return out
+
+
+def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
+    """Return the words with switches that may be left open spelled out, as tyro wants them.
+
+    --name becomes --name True, and --no-name becomes --name False.
+    """
+    values = {}
+    for name, field in model.model_fields.items():
+        if field.annotation == (bool | None):
+            option = option_of(name)
+            values |= {option: [option, "True"], f"--no-{option[2:]}": [option, "False"]}
+    out: list[str] = []
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        spelled = following in ("None", "True", "False")
+        out += [word] if spelled else values.get(word, [word])
     return out
 
 

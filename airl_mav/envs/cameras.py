@@ -52,8 +52,8 @@ class Cameras(Stateful):
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
         """(n, h, w) newest frames, Z16 [mm]."""
-        self._period_us = camera.period_us
-        self._transport_us = transport_us
+        self.period_us = camera.period_us
+        self.transport_us = transport_us
         self._noise = noise
         self._mount = Mount(
             (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
@@ -63,13 +63,18 @@ class Cameras(Stateful):
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
-        self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self._period_us)
+        self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.period_us)
 
     def age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how old the newest decoded frame is at a time (n,) [µs] of each episode."""
-        since_us = time_us - self._transport_us - self._first_us
-        age: NDArray[np.int64] = self._transport_us + since_us % self._period_us
+        since_us = time_us - self.transport_us - self._first_us
+        age: NDArray[np.int64] = self.transport_us + since_us % self.period_us
         return age
+
+    def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return when the first frame taken from a time (n,) on is decoded [µs]."""
+        waited: NDArray[np.int64] = (self._first_us - time_us) % self.period_us
+        return time_us + waited + self.transport_us
 
     def capture(
         self,
@@ -84,7 +89,7 @@ class Cameras(Stateful):
         """
         render_images(fleet, arenas, who, self._mount, self._lens, self.image)
         # Frames are taken at whole ticks, up to half of one before their time.
-        frame = (fleet.time_us + TICK_US // 2 - self._first_us) // self._period_us
+        frame = (fleet.time_us + TICK_US // 2 - self._first_us) // self.period_us
         for i in np.flatnonzero(who).tolist() if is_noisy(self._noise) else ():
             self.image[i] = noisy_frame(self.image[i], self._noise, int(seeds[i]), int(frame[i]))
 

@@ -28,16 +28,18 @@ from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.estimation import Telemetry
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, ticks_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.winds import Winds
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
@@ -142,13 +144,11 @@ class Navigation(Stateful):
         self._link_us = round(spec.delay.link_ms * US_PER_MS)
         hover_s = rules.hover_after_s
         self._hover_us = None if hover_s is None else round(hover_s * US_PER_S)
-        self._check_hold()
-
         self.arenas: list[Arena | None] = [None] * n
         self.seeds = np.zeros(n, np.int64)
         self.zones = np.full(n, -1, np.int64)
         self._begun = np.zeros(n, np.bool_)
-        self._fleet = new_fleet(n)
+        self.fleet = new_fleet(n)
         self._batch = batch_of([])
         self._decision = np.zeros(n, np.int64)
         self._extra_us = np.zeros(n, np.int64)
@@ -160,7 +160,19 @@ class Navigation(Stateful):
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
         self._winds = Winds(n, spec.wind)
-        self._cameras = Cameras(n, self.camera, self._transport_us, randomisation)
+        self.cameras = Cameras(n, self.camera, self._transport_us, randomisation)
+        self._timing: SequentialTiming | PipelinedTiming
+        if spec.decisions == "pipelined":
+            self._timing = PipelinedTiming(n, self._link_us)
+        else:
+            self._timing = SequentialTiming(
+                self.cameras, self._link_us, self._hold_us, self._hover_us
+            )
+        self._compensator: Compensator | None = None
+        if spec.compensate:
+            self._compensator = Compensator(n, self.vehicle, self.intrinsics)
+            self._foreseen_mm = np.zeros_like(self.cameras.image)
+            self._foreseen = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
         """Start episodes: each in a hover above its start, the first frame taken.
@@ -178,7 +190,8 @@ class Navigation(Stateful):
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
             who[i] = True
-        self._capture(who)
+        self.capture(who)
+        self._foresee(who, np.zeros(self.n, np.int64))
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         arena = self._arena(seed, zone)
@@ -196,20 +209,28 @@ class Navigation(Stateful):
         altitude_m = self.spec.episode.altitude_m
         north, east, down = self._winds.begin(i, seed).tolist()
         steady = (north, east, down)
-        hover(self._fleet, i, altitude_m, self._vehicle, airframe, self._charge, steady)
+        hover(self.fleet, i, altitude_m, self._vehicle, airframe, self._charge, steady)
         if self._trace is not None:
-            self._trace.begin(i, self._fleet)
+            self._trace.begin(i, self.fleet)
         self._decision[i] = 0
         low, high = randomisation.extra_delay_ms
         delay_rng = stream(seed, Stream.DELAY)
         self._extra_us[i] = round(delay_rng.uniform(low, high) * US_PER_MS)
         self._delays.begin(i, seed)
         self._telemetry.begin(i, seed)
-        self._cameras.begin(i, seed)
+        self.cameras.begin(i, seed)
+        self._timing.begin(i)
+        if self._compensator is not None:
+            self._compensator.begin(i)
 
     def see(self) -> Observation:
-        """Return the present observations of all vehicles, with a leading axis (n,)."""
-        return observe(self._cameras.image, self.intrinsics, self.kinematics(), self._batch.goal)
+        """Return the present observations of all vehicles, with a leading axis (n,).
+
+        Where latency is compensated, they are those of when the decision is expected to act.
+        """
+        if self._compensator is not None:
+            return observe(self._foreseen_mm, self.intrinsics, self._foreseen, self._batch.goal)
+        return observe(self.cameras.image, self.intrinsics, self.kinematics(), self._batch.goal)
 
     def observe(self) -> Encoded:
         """Return the present observations of all vehicles in the environment's layout."""
@@ -221,7 +242,7 @@ class Navigation(Stateful):
 
     def flights(self) -> Flights:
         """Return the status of all flights."""
-        fleet = self._fleet
+        fleet = self.fleet
         to_goal = self._batch.goal - fleet.position[:, :2]
         return Flights(
             verdict=fleet.verdict.copy(),
@@ -236,12 +257,12 @@ class Navigation(Stateful):
 
     def truth(self) -> Kinematics:
         """Return the true state of all n; a copy."""
-        fleet = self._fleet
+        fleet = self.fleet
         return Kinematics(fleet.position.copy(), fleet.velocity.copy(), fleet.quaternion.copy())
 
     def whole_truth(self) -> WholeTruth:
         """Return all that the twin knows, the very arrays that it flies on: to look at only."""
-        return WholeTruth(self._fleet, self._batch, self._vehicle)
+        return WholeTruth(self.fleet, self._batch, self._vehicle)
 
     def fly(self, commands: NDArray[np.float64]) -> None:
         """Fly one decision of every flight that has not ended.
@@ -254,28 +275,37 @@ class Navigation(Stateful):
         """
         if commands.shape != (self.n, 3):
             raise ValueError(f"commands of shape {commands.shape}: accepted: ({self.n}, 3)")
+        setpoints = np.insert(commands, 2, 0.0, axis=1)
         if self._trace is not None:
-            self._trace.deciding(self._fleet)
-        began_us = self._fleet.time_us.copy()
-        # Ticks are counted from the observation that is being decided on.
+            self._trace.deciding(self.fleet)
+        began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
-        sent, accepted = _ticks(t2_us), _ticks(t2_us + self._link_us)
-        self._wait(np.zeros_like(sent), sent)
-        down = vertical_speeds(self.spec.episode.altitude_m, self.kinematics().position[:, 2])
-        self._wait(sent, accepted)
-        self._command(commands, down)
-        left = sent + self._hold_us // TICK_US - accepted
-        age = np.minimum(_ticks(self._cameras.age_us(self._fleet.time_us + left * TICK_US)), left)
-        self._advance(left - age)
-        self._capture(self._fleet.verdict >= 0)
-        self._advance(age)
+        age_us = self._timing.fly(self, setpoints, t2_us)
         self._decision += 1
-        self._telemetry.step(self._decision, (self._fleet.time_us - began_us) / US_PER_S)
+        self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
         if self._trace is not None:
-            self._trace.decided(self._fleet, t2_us, self._transport_us, self._link_us)
+            self._trace.decided(self.fleet, setpoints, t2_us, self._transport_us, self._link_us)
+        if self._compensator is not None:
+            sent_us = began_us + TICK_US * ticks_of(t2_us)
+            hover_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
+            everyone = np.arange(self.n)
+            self._compensator.decided(everyone, setpoints, t2_us, sent_us, hover_us)
+        self._foresee(self.fleet.verdict == Verdict.FLYING, age_us)
+
+    def _foresee(self, who: NDArray[np.bool_], age_us: NDArray[np.int64]) -> None:
+        """Carry what is seen forward to when the next decisions act, if that is compensated."""
+        if self._compensator is None:
+            return
+        image, state = self._compensator.foresee(
+            np.flatnonzero(who), self.cameras.image, age_us, self.fleet.time_us, self.kinematics()
+        )
+        self._foreseen_mm[who] = image[who]
+        self._foreseen.position[who] = state.position[who]
+        self._foreseen.velocity[who] = state.velocity[who]
+        self._foreseen.quaternion[who] = state.quaternion[who]
 
     def _held(self) -> Mapping[str, Any]:
-        held = {
+        held: dict[str, Any] = {
             "navigation": {
                 "seeds": self.seeds,
                 "zones": self.zones,
@@ -283,12 +313,20 @@ class Navigation(Stateful):
                 "decision": self._decision,
                 "extra_us": self._extra_us,
             },
-            "fleet": self._fleet._asdict(),
+            "fleet": self.fleet._asdict(),
             "delays": self._delays,
             "telemetry": self._telemetry,
-            "cameras": self._cameras,
+            "cameras": self.cameras,
         }
-        return held if self._winds.calm else held | {"winds": self._winds}
+        # What a checkpoint of an environment without them does not have.
+        if not self._winds.calm:
+            held["winds"] = self._winds
+        if isinstance(self._timing, PipelinedTiming):
+            held["timing"] = self._timing
+        if self._compensator is not None:
+            foreseen = {"depth_mm": self._foreseen_mm, **vars(self._foreseen)}
+            held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
+        return held
 
     def set_state(self, state: State) -> None:
         """Restore a saved state; arenas are generated again from their seeds.
@@ -315,57 +353,25 @@ class Navigation(Stateful):
             zone=None if stage is None else stage.zone,
         )
 
-    def _wait(self, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:
-        """Fly on the last setpoint from one tick to another; it may expire in between."""
-        if self._hover_us is None:
-            self._advance(end - start)
-            return
-        # The stop takes as long to arrive as any setpoint.
-        stop = _ticks(np.full(self.n, self._hover_us + self._link_us))
-        reached = np.clip(stop, start, end)
-        self._advance(reached - start)
-        over = (stop >= start) & (stop < end)
-        self._fleet.setpoint[over] = 0.0
-        self._fleet.repeat_us[over] = self._fleet.time_us[over]
-        self._advance(end - reached)
+    def holding_altitude(self) -> NDArray[np.float64]:
+        """Return the downward speeds (n,) [m/s] that hold the altitude."""
+        return vertical_speeds(self.spec.episode.altitude_m, self.kinematics().position[:, 2])
 
-    def _command(self, commands: NDArray[np.float64], down: NDArray[np.float64]) -> None:
-        fleet = self._fleet
-        fleet.setpoint[:, :2] = commands[:, :2]
-        fleet.setpoint[:, 2] = down
-        fleet.setpoint[:, 3] = commands[:, 2]
-        fleet.repeat_us[:] = fleet.time_us
-
-    def _check_hold(self) -> None:
-        """Refuse a hold so short that a decision would have to wait for its frame."""
-        least_us = self._link_us + self._transport_us + self.camera.period_us
-        if self._hold_us < least_us:
-            raise UsageError(
-                f"episode.hold_s = {self.spec.episode.hold_s:g}: accepted: value >= "
-                f"{least_us / US_PER_S:g} s (delay.link_ms, delay.transport_ms and "
-                f"{self.camera.period_us / US_PER_MS:g} ms between two frames)"
-            )
-
-    def _advance(self, ticks: NDArray[np.int64]) -> None:
+    def advance(self, ticks: NDArray[np.int64]) -> None:
         """Advance all flights by ticks (n,); the only place where time passes."""
         if self._trace is not None:
-            self._trace.advance(self._fleet, ticks, self._fly)
+            self._trace.advance(self.fleet, ticks, self._fly)
         else:
             self._fly(ticks)
 
     def _fly(self, ticks: NDArray[np.int64]) -> None:
         def fly(ticks: NDArray[np.int64], air: NDArray[np.float64] | None) -> None:
-            advance(self._fleet, self._batch, ticks, self._vehicle, self._rules, air)
+            advance(self.fleet, self._batch, ticks, self._vehicle, self._rules, air)
 
-        self._winds.fly(self._fleet, ticks, fly)
+        self._winds.fly(self.fleet, ticks, fly)
 
-    def _capture(self, who: NDArray[np.bool_]) -> None:
+    def capture(self, who: NDArray[np.bool_]) -> None:
+        """Take the frames of those in `who` (n,), from where they are now."""
         if self._trace is not None:
-            self._trace.captured(self._fleet, who)
-        self._cameras.capture(self._fleet, self._batch, who, self.seeds)
-
-
-def _ticks(time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Round times [µs] to whole ticks."""
-    ticks: NDArray[np.int64] = (time_us + TICK_US // 2) // TICK_US
-    return ticks
+            self._trace.captured(self.fleet, who)
+        self.cameras.capture(self.fleet, self._batch, who, self.seeds)

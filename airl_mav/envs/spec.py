@@ -12,6 +12,7 @@ from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
+from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import STRIP_ROWS, LayoutName
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
@@ -220,6 +221,16 @@ class EnvironmentSpec(ProfileModel):
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
     delay: Delay = Field(default_factory=Delay, description="how late decisions are")
+    decisions: DecisionTiming = Field(
+        default="sequential",
+        description="when a decision begins: sequential, after the hold of the one before;"
+        " pipelined, with the newest frame as soon as that one is ready",
+    )
+    compensate: bool = Field(
+        default=False,
+        description="carry what is seen forward to when the decision will act, by the vehicle's"
+        " response to the setpoints in flight",
+    )
     safe_velocity: SafeVelocity | None = Field(
         default=None, description="bound max_speed_m_s by the safe velocity; left out: do not"
     )
@@ -237,6 +248,15 @@ class EnvironmentSpec(ProfileModel):
             raise ValueError(
                 f"episode.hold_s = {self.episode.hold_s:g}: accepted: value < "
                 f"{self.episode.time_limit_s:g} s (episode.time_limit_s)"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _hovers_between_decisions(self) -> EnvironmentSpec:
+        if self.decisions == "pipelined" and self.episode.hover_after_s is not None:
+            raise ValueError(
+                "decisions = 'pipelined': with episode.hover_after_s: accepted: one of them, as no"
+                " hold ends"
             )
         return self
 

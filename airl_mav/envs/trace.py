@@ -120,12 +120,18 @@ class Trace:
         self._seen_us = self._capture_us.copy()
 
     def decided(
-        self, fleet: Fleet, t2_us: NDArray[np.int64], transport_us: int, link_us: int
+        self,
+        fleet: Fleet,
+        setpoint: NDArray[np.float64],
+        t2_us: NDArray[np.int64],
+        transport_us: int,
+        link_us: int,
     ) -> None:
         """Note the decision that `deciding` began, once it has been flown.
 
         Args:
-            fleet: As it is at the end of the hold.
+            fleet: As it is when the next decision begins.
+            setpoint: (n, 4) what was decided: forward, right, down [m/s], yaw rate [rad/s].
             t2_us: (n,) inference as modelled, before it was rounded to ticks [µs].
             transport_us: Capture to decoded [µs].
             link_us: Setpoint sent to first motor command [µs].
@@ -140,7 +146,7 @@ class Trace:
         rows[rows > end[:, None]] = NO_STAMP
         rows[sent > end, -1] = NO_STAMP
         self._stamps.append(who, rows)
-        self._setpoints.append(who, fleet.setpoint[who])
+        self._setpoints.append(who, setpoint[who])
 
     def trajectory(self, i: int) -> Trajectory:
         """Return the path of slot i: a row at the start, every 20 ms, and at the end.

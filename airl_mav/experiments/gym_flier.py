@@ -70,6 +70,8 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
                 "workload": asked.workload,
                 "latency": () if asked.latency is None else (asked.latency,),
             },
+            "decisions": pilot.decisions,
+            "compensate": pilot.compensate,
             "wind": asked.wind,
             "randomisation": asked.spread.model_dump() | asked.sensors.model_dump(),
         },

@@ -130,7 +130,8 @@ class _Flight:
 
     def _program(self) -> None:
         resolved, stage = self._resolved, self._stage
-        check_camera(self._policy, stage.camera, self._stop)
+        compensator = resolved.compensator()
+        check_camera(self._policy, stage.camera, self._stop, compensator)
         self._result = fly_mission(
             stage.link,
             stage.camera,
@@ -144,6 +145,7 @@ class _Flight:
             watchdog_settings=resolved.watchdog,
             guard=stage.clock,
             latency=resolved.latency_sampler(self._seed, native=False),
+            compensator=compensator,
         )
 
     def _announce(self, phase: str) -> None:

@@ -69,7 +69,7 @@ def fly_in_lockstep(
         link.connect(asked.connect_timeout, stop)
         camera = TokenFrameSource(frames, turns, clock)
         with turns.taken(link):
-            check_camera(mission.policy, camera, stop)
+            check_camera(mission.policy, camera, stop, mission.compensator)
             result = fly_mission(
                 link,
                 camera,
@@ -83,5 +83,6 @@ def fly_in_lockstep(
                 watchdog_settings=mission.watchdog,
                 guard=clock,
                 latency=mission.latency or FixedSampler(NATIVE_T2_US),
+                compensator=mission.compensator,
             )
     return result, {SEEN: digest.lanes()[SEEN]}

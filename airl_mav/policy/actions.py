@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.policy.observation import Observation
+
+DecisionTiming = Literal["sequential", "pipelined"]
+"""When a decision begins: after the hold of the one before, or as soon as that one is ready."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, replace_file, write_json
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
 from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 from airl_mav.policy.runtime import OnnxRuntime
@@ -96,6 +97,12 @@ class PolicyFacts(ProfileModel):
         ge=0,
         le=60,
         default=None,
+    )
+    decisions: DecisionTiming = Field(
+        default="sequential", description="when a decision begins; see airl_mav.scenario.model"
+    )
+    compensate: bool = Field(
+        default=False, description="it wants its decision latency compensated, as in training"
     )
     algorithm: str = Field(default="", description="what trained it")
     epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)

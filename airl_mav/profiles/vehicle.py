@@ -241,6 +241,23 @@ class Estimation(ProfileModel):
     heading_time_s: float = quantity("its correlation time", "s", gt=0, le=100_000)
 
 
+class Response(ProfileModel):
+    """How the vehicle answers velocity setpoints, seen from outside: a first-order model.
+
+    Identified from flown steps by `scripts/fit-response`, which prints this table. Compensation of
+    decision latency predicts the vehicle's motion with it.
+    """
+
+    dead_time_s: float = quantity(
+        "setpoint accepted until the vehicle begins to answer", "s", ge=0, le=2
+    )
+    velocity_time_s: float = quantity("time constant of the velocity", "s", gt=0, le=10)
+    yaw_rate_time_s: float = quantity("time constant of the yaw rate", "s", gt=0, le=10)
+    drag_1_s: float = quantity(
+        "deceleration that it leans against, per speed", "1/s", ge=0, le=5, default=0.0
+    )
+
+
 # Strict, or true and "0.5" would pass; a whole number passes for a float.
 ParameterTable = dict[str, Annotated[float, Strict()]]
 
@@ -294,6 +311,11 @@ class VehicleProfile(ProfileModel):
     sensors: Sensors
     estimation: Estimation | None = Field(
         default=None, description="error of the estimator on these sensors; absent = not known"
+    )
+    response: Response | None = Field(
+        default=None,
+        description="how it answers velocity setpoints; absent = not known: its decisions' latency"
+        " cannot be compensated",
     )
     parameters: ParameterTable = Field(
         default_factory=dict,

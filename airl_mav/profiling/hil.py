@@ -138,7 +138,7 @@ def _fly(
         closing(TimesyncLink(asked.connect, clock, abandon)) as link,
     ):
         link.connect(asked.connect_timeout, stop)
-        check_camera(mission.policy, frames, stop)
+        check_camera(mission.policy, frames, stop, mission.compensator)
         link.exchange(GROUND_EXCHANGES, GROUND_INTERVAL_S, stop)
         before = link.take_exchanges()
         with link.exchanging(FLIGHT_INTERVAL_S):
@@ -154,6 +154,7 @@ def _fly(
                 pilot_settings=mission.pilot,
                 watchdog_settings=mission.watchdog,
                 guard=ThreadGuard(clock),
+                compensator=mission.compensator,
             )
         during = link.take_exchanges()
         # `stop` is set by now: it ends the flight.

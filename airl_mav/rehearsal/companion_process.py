@@ -78,6 +78,7 @@ class Missions:
         aircraft, clock = self._scenario.scenario, self._clock
         use = UseMeter(WallClock())
         self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
+        compensator = self._scenario.compensator()
         with (
             held_to(aircraft.cpu_quota),
             closing(open_camera(f"tcp://{LOOPBACK}:{aircraft.ports.camera_port}", clock)) as frames,
@@ -90,7 +91,7 @@ class Missions:
                 if not link.connected:
                     link.connect(CONNECT_TIMEOUT_S)
                 policy = self._scenario.fresh_policy(request.seed)
-                check_camera(policy, frames, self._stop)
+                check_camera(policy, frames, self._stop, compensator)
                 use.begin()
                 result = fly_mission(
                     link,
@@ -105,6 +106,7 @@ class Missions:
                     watchdog_settings=self._scenario.watchdog,
                     guard=ThreadGuard(clock),
                     latency=self._scenario.latency_sampler(request.seed, native=True),
+                    compensator=compensator,
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())

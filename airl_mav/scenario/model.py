@@ -13,6 +13,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 
 from airl_mav.core.fields import ProfileModel, field_error, quantity
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
+from airl_mav.policy.actions import DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
 
 ArenaName = Annotated[str, Field(description="arena profile: a shipped name, or a path to a .toml")]
@@ -82,6 +83,10 @@ class PilotSettings:
     """Height above the start that is held [m]."""
     max_speed_m_s: float = 5.0
     """Horizontal speed limit of all actions [m/s]."""
+    decisions: DecisionTiming = "sequential"
+    """When a decision begins: after the hold of the one before, or as soon as that is ready."""
+    compensate: bool = False
+    """Whether what is seen is carried forward to when the decision will act."""
 
 
 class Inference(ProfileModel):
@@ -136,6 +141,18 @@ class Decisions(Inference):
         ge=0.1,
         le=30,
         default=None,
+    )
+    decisions: DecisionTiming | None = Field(
+        default=None,
+        description="sequential: a decision begins after the hold of the one before; pipelined:"
+        " with the newest frame as soon as the one before is ready; by default as the policy's card"
+        " says, or sequential",
+    )
+    compensate: bool | None = Field(
+        default=None,
+        description="compensate the latency: state and depth image are carried forward to when the"
+        " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
+        " default as the policy's card says, or not",
     )
     watchdog: WatchdogSettings = Field(
         default_factory=WatchdogSettings, description="bounds on silence"

@@ -52,11 +52,17 @@ def decide_piloting(
             "goal_radius_m": card.goal_radius_m,
             "altitude_m": card.altitude_m,
             "max_speed_m_s": card.actions.max_speed_m_s,
+            "decisions": card.decisions,
+            "compensate": card.compensate,
         }
         hover_s = card.hover_after_s if hover_s is None else hover_s
     names = asdict(PilotSettings())
     given = {name: value for name in names if (value := getattr(asked, name)) is not None}
     pilot = PilotSettings(**(known | given))
+    if pilot.decisions == "pipelined" and hover_s is not None:
+        raise FieldError(
+            "decisions", pilot.decisions, "without watchdog.hover_after_s, as no hold ends"
+        )
     timeout_s = asked.watchdog.decision_timeout_s
     if timeout_s <= pilot.hold_s:
         raise FieldError(

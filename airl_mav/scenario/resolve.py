@@ -57,6 +57,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     # What cannot be flown is better found here than by a process that is already flying.
     resolved.arena_of(scenario.seed)
     resolved.fresh_policy(scenario.seed)
+    resolved.compensator()
     return resolved
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
@@ -20,6 +21,7 @@ from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_gene
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import PolicyInfo
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.computer import ComputerProfile
 from airl_mav.profiles.loading import profile_digest
@@ -168,7 +170,7 @@ class ResolvedScenario:
             computer_on_ground=self.computer.ground_equipment,
             injection=self.injection,
             speed=self.speed,
-            between_commands="persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms",
+            between_commands=_between_commands(self.pilot, hover_s),
             conditions=", ".join([*_conditions(scenario), *self._zone()]),
         )
 
@@ -198,6 +200,15 @@ class ResolvedScenario:
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
 
+    def compensator(self) -> Compensator | None:
+        """Return what carries forward what a companion sees, or None where nothing does.
+
+        Raises FieldError for a vehicle whose response is not known.
+        """
+        if not self.pilot.compensate:
+            return None
+        return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
+
     def fresh_policy(self, seed: int) -> Policy:
         """Return the policy as it begins the flight of a seed: it remembers nothing.
 
@@ -221,6 +232,16 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
+
+
+def _between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
+    """Return what happens from one command to the next, in words."""
+    words = ["persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms"]
+    if pilot.decisions != PilotSettings.decisions:
+        words.append(f"{pilot.decisions} decisions")
+    if pilot.compensate:
+        words.append("latency compensated")
+    return ", ".join(words)
 
 
 def _conditions(scenario: Aircraft) -> Iterator[str]:

@@ -149,6 +149,11 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
     )
+    vehicle: str = Field(
+        default="quad",
+        description="vehicle profile: its response to setpoints and its camera's mount are what"
+        " compensation reckons with",
+    )
     lockstep: bool = Field(
         default=False,
         description="take turns with a simulator that waits for this program (airl-firmware"

@@ -87,7 +87,7 @@ def test_a_simulation_draws_what_the_twin_draws() -> None:
             EpisodeSetup(QUAD, None, seed, asked), start_us=0, clock=SimClock()
         ).plant
         body = pybullet.getDynamicsInfo(plant._body, -1, plant.world.number)
-        row = twin._fleet.airframe[0]
+        row = twin.fleet.airframe[0]
         assert row.tolist() == list(plant._airframe)
         assert body[0] == row[0] != QUAD.body.mass_kg
         np.testing.assert_allclose(body[2], row[1:4], rtol=1e-12)

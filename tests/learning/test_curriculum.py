@@ -117,7 +117,7 @@ def test_trains_through_the_zones(threshold: float, expected: list[int]) -> None
     env.reset(seed=3)
     zones = []
     for _ in range(5):
-        env.navigation._fleet.position[0, 0] = -1000.0  # through the wall
+        env.navigation.fleet.position[0, 0] = -1000.0  # through the wall
         *_, info = env.step(np.array([2, 2]))
         assert info["final_info"]["outcome"].tolist() == ["collision", "success"]
         zones.append(int(info["zone"].max()))

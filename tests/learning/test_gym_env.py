@@ -314,7 +314,7 @@ def test_time_limit_truncates_and_the_goal_terminates() -> None:
 def test_an_empty_battery_terminates() -> None:
     env = NavigationEnv()
     env.reset(seed=4)
-    env.navigation._fleet.battery[0] = 1e-6
+    env.navigation.fleet.battery[0] = 1e-6
     _, reward, terminated, truncated, info = env.step(2)
     assert (terminated, truncated, info["outcome"]) == (True, False, "battery")
     assert reward < -0.9

@@ -67,14 +67,14 @@ def test_every_seed_flies_its_own_airframe() -> None:
     spec = EnvironmentSpec(arena="no-obstacles", randomisation={"mass": 0.3, "thrust": 0.1})
     navigation = Navigation(spec, 3)
     navigation.begin([0, 1, 2], [7, 8, 7])
-    rows = navigation._fleet.airframe.copy()
+    rows = navigation.fleet.airframe.copy()
     assert np.array_equal(rows[0], rows[2])
     assert not np.array_equal(rows[0], rows[1])
     navigation.begin([0], [8])
-    assert np.array_equal(navigation._fleet.airframe[0], rows[1])
+    assert np.array_equal(navigation.fleet.airframe[0], rows[1])
     plain = Navigation(EnvironmentSpec(arena="no-obstacles"), 1)
     plain.begin([0], [7])
-    assert plain._fleet.airframe[0].tolist() == list(NOMINAL)
+    assert plain.fleet.airframe[0].tolist() == list(NOMINAL)
 
 
 def test_extra_delay_is_one_value_an_episode_within_its_range() -> None:

@@ -92,7 +92,7 @@ def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
     navigation = Navigation(spec, 5)
     navigation.begin(range(5), range(5))
     before = navigation.flights()
-    navigation._fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
+    navigation.fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
     found = rewards("shaped", before, navigation.flights(), spec.episode.hold_s)
     assert found.round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]
 

@@ -1,0 +1,196 @@
+"""When decisions begin, act and end, of n vehicles at a time.
+
+Sequential, as in the paper: observe, infer, act, hold, and observe again. Pipelined: the next
+decision begins with the newest frame as soon as the last one is ready; nothing is held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.cameras import Cameras
+from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.saved_state import Stateful
+
+Times = NDArray[np.int64]
+"""(n,) [µs], or in ticks."""
+
+
+class Vehicles(Protocol):
+    """What a decision is flown with: n vehicles and their cameras."""
+
+    @property
+    def fleet(self) -> Fleet:
+        """Their state."""
+        ...
+
+    @property
+    def cameras(self) -> Cameras:
+        """Their cameras."""
+        ...
+
+    def advance(self, ticks: Times) -> None:
+        """Fly each one for so many ticks (n,)."""
+        ...
+
+    def capture(self, who: NDArray[np.bool_]) -> None:
+        """Take the frames of those in `who` (n,)."""
+        ...
+
+    def holding_altitude(self) -> NDArray[np.float64]:
+        """Return the downward speeds (n,) [m/s] that hold the altitude, as telemetry has it."""
+        ...
+
+
+class Timing(Protocol):
+    """How a decision is flown."""
+
+    def begin(self, i: int) -> None:
+        """Begin the flight of vehicle i."""
+        ...
+
+    def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
+        """Fly one decision of every vehicle, from its observation to the next one.
+
+        Args:
+            vehicles: What flies.
+            setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s]; the third, which is
+                decided when it is sent, is written.
+            t2_us: (n,) time of the inference.
+
+        Returns:
+            (n,) age of the frames of the next observation [µs].
+        """
+        ...
+
+
+class SequentialTiming(Stateful):
+    """After its hold, a decision is followed by the next."""
+
+    def __init__(self, cameras: Cameras, link_us: int, hold_us: int, hover_us: int | None) -> None:
+        """Take the times.
+
+        Args:
+            cameras: Of the vehicles.
+            link_us: Setpoint sent to accepted [µs].
+            hold_us: How long an action is held before the next observation [µs].
+            hover_us: The velocity is zeroed so long after the hold when no new action has come;
+                None: the last one persists [µs].
+
+        Raises:
+            UsageError: The hold is so short that a decision would have to wait for its frame.
+        """
+        self._link_us, self._hold_us, self._hover_us = link_us, hold_us, hover_us
+        least_us = link_us + cameras.transport_us + cameras.period_us
+        if hold_us < least_us:
+            raise UsageError(
+                f"episode.hold_s = {hold_us / 1e6:g}: accepted: value >= {least_us / 1e6:g} s "
+                f"(delay.link_ms, delay.transport_ms and {cameras.period_us / 1e3:g} ms between two"
+                " frames)"
+            )
+
+    def begin(self, i: int) -> None:
+        """Do nothing: all that was sent has been taken when a decision begins."""
+
+    def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
+        """Fly one decision of every vehicle; see `Timing`."""
+        fleet = vehicles.fleet
+        # Ticks are counted from the observation that is being decided on.
+        sent, accepted = ticks_of(t2_us), ticks_of(t2_us + self._link_us)
+        self._wait(vehicles, np.zeros_like(sent), sent)
+        setpoints[:, 2] = vehicles.holding_altitude()
+        self._wait(vehicles, sent, accepted)
+        give(fleet, setpoints, np.ones(len(sent), np.bool_))
+        left = sent + self._hold_us // TICK_US - accepted
+        age_us = vehicles.cameras.age_us(fleet.time_us + left * TICK_US)
+        age = np.minimum(ticks_of(age_us), left)
+        vehicles.advance(left - age)
+        vehicles.capture(fleet.verdict >= 0)
+        vehicles.advance(age)
+        aged: Times = TICK_US * age
+        return aged
+
+    def _wait(self, vehicles: Vehicles, start: Times, end: Times) -> None:
+        """Fly on the last setpoint from one tick to another; it may expire in between."""
+        if self._hover_us is None:
+            vehicles.advance(end - start)
+            return
+        fleet = vehicles.fleet
+        # The stop takes as long to arrive as any setpoint.
+        stop = ticks_of(np.full(len(start), self._hover_us + self._link_us))
+        reached = np.clip(stop, start, end)
+        vehicles.advance(reached - start)
+        over = (stop >= start) & (stop < end)
+        fleet.setpoint[over] = 0.0
+        fleet.repeat_us[over] = fleet.time_us[over]
+        vehicles.advance(end - reached)
+
+    def _held(self) -> Mapping[str, Any]:
+        return {}
+
+
+class PipelinedTiming(Stateful):
+    """A decision is followed by the next as soon as it is ready and there is a frame for it.
+
+    The frame is one that was taken since the decision began. The vehicle may not have taken the
+    new setpoint yet when the next decision begins: it is in flight.
+    """
+
+    def __init__(self, n: int, link_us: int) -> None:
+        """Prepare n vehicles; `link_us` is the time from a setpoint sent to accepted [µs]."""
+        self._link_us = link_us
+        self._left = np.zeros(n, np.int64)
+        """Ticks until the setpoint in flight is accepted; 0: none is."""
+        self._in_flight = np.zeros((n, 4))
+
+    def begin(self, i: int) -> None:
+        """Begin the flight of vehicle i: nothing is in flight."""
+        self._left[i] = 0
+
+    def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
+        """Fly one decision of every vehicle; see `Timing`."""
+        fleet, cameras = vehicles.fleet, vehicles.cameras
+        began_us, now = fleet.time_us.copy(), self._left.copy()
+        vehicles.advance(now)
+        give(fleet, self._in_flight, now > 0)
+        # Ticks from the observation that is being decided on.
+        sent, accepted = ticks_of(t2_us), ticks_of(t2_us + self._link_us)
+        ended = np.maximum(sent, ticks_of(cameras.next_decoded_us(began_us) - began_us))
+        age = np.minimum(ticks_of(cameras.age_us(began_us + ended * TICK_US)), ended)
+        events = np.stack([ended - age, sent, np.minimum(accepted, ended)], axis=1)
+        each = np.arange(len(sent))
+        for event in np.argsort(events, axis=1, kind="stable").T:
+            until = np.maximum(events[each, event], now)
+            vehicles.advance(until - now)
+            now = until
+            if (event == 0).any():
+                vehicles.capture(event == 0)
+            if (event == 1).any():
+                setpoints[event == 1, 2] = vehicles.holding_altitude()[event == 1]
+            give(fleet, setpoints, (event == 2) & (accepted <= ended))
+        vehicles.advance(ended - now)
+        self._left[:] = np.maximum(accepted - ended, 0)
+        self._in_flight[:] = setpoints
+        aged: Times = TICK_US * age
+        return aged
+
+    def _held(self) -> Mapping[str, Any]:
+        return {"left": self._left, "in_flight": self._in_flight}
+
+
+def give(fleet: Fleet, setpoints: NDArray[np.float64], who: NDArray[np.bool_]) -> None:
+    """Give the vehicles in `who` (n,) their setpoints (n, 4); they take them at once."""
+    fleet.setpoint[who] = setpoints[who]
+    fleet.repeat_us[who] = fleet.time_us[who]
+
+
+def ticks_of(time_us: Times) -> Times:
+    """Round times [µs] to whole ticks."""
+    ticks: Times = (time_us + TICK_US // 2) // TICK_US
+    return ticks

@@ -1,0 +1,223 @@
+"""Compensation of decision latency: what a decision sees is what it will act on.
+
+A decision that takes t2 acts on a vehicle that has flown on meanwhile. But what it flies on is
+known: the setpoints that were sent. So the state is carried forward by the vehicle's response to
+them, to the moment at which the decision is expected to act; and the depth images are reprojected
+to where the camera will be then. The policy need not have been trained for it.
+
+The same code in the companion (n = 1) and in the batch twin (n at a time); numpy alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError
+from airl_mav.core.frames import (
+    Vector,
+    quat_from_euler,
+    quat_to_matrix,
+    quats_to_euler,
+)
+from airl_mav.policy.observation import Kinematics
+from airl_mav.prediction.lateness import ExpectedLatency
+from airl_mav.prediction.motion import Motion, flown_on, leaning
+from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
+from airl_mav.profiles.vehicle import Camera, VehicleProfile
+
+LINK_US = round(4.0 * US_PER_MS)
+"""A setpoint is taken to be in effect so long after it was sent [µs]: a tick of the flight
+controller."""
+
+REMEMBERED = 4
+"""Images that are kept: the newest, and those that fill what it did not see."""
+
+NEVER_US = np.iinfo(np.int64).max
+
+
+class Compensator:
+    """Carries forward what n companions see."""
+
+    def __init__(self, n: int, vehicle: VehicleProfile, intrinsics: Intrinsics) -> None:
+        """Prepare n companions of one vehicle, whose camera has these intrinsics.
+
+        Raises:
+            FieldError: The vehicle's profile does not say how it answers setpoints.
+        """
+        if vehicle.response is None:
+            raise FieldError(
+                "compensate",
+                True,
+                problem="the vehicle's profile has no table `response`; scripts/fit-response"
+                " identifies it",
+            )
+        self.intrinsics = intrinsics
+        """Of the images that are carried forward."""
+        self._response = vehicle.response
+        self._dead_us = round(self._response.dead_time_s * US_PER_S)
+        self._mount = _Mount(vehicle.camera)
+        self._reprojector = Reprojector(vehicle.camera, intrinsics)
+        self._latency = ExpectedLatency(n)
+        shape = (intrinsics.height, intrinsics.width)
+        self._depth_mm = np.zeros((n, REMEMBERED, *shape), np.uint16)
+        self._position = np.zeros((n, REMEMBERED, 3))
+        self._axes = np.zeros((n, REMEMBERED, 3, 3))
+        self._kept = np.zeros(n, np.int64)
+        """Images that each one has; the newest come first."""
+        self._before = np.zeros((n, 4))
+        """Setpoints before the newest: forward, right, down [m/s], yaw rate [rad/s]."""
+        self._newest = np.zeros((n, 4))
+        self._answered_us = np.zeros(n, np.int64)
+        """When the vehicle begins to answer the newest one."""
+        self._stopped_us = np.full(n, NEVER_US, np.int64)
+        """When the newest one expires, and the vehicle is told to hover."""
+
+    def begin(self, i: int) -> None:
+        """Begin a flight of companion i, in a hover."""
+        self._latency.begin(i)
+        self._kept[i] = 0
+        self._before[i] = self._newest[i] = 0.0
+        self._answered_us[i], self._stopped_us[i] = 0, NEVER_US
+
+    def held(self) -> Mapping[str, Any]:
+        """Return by name all arrays that change, for checkpoints."""
+        return {
+            "depth_mm": self._depth_mm,
+            "position": self._position,
+            "axes": self._axes,
+            "kept": self._kept,
+            "before": self._before,
+            "newest": self._newest,
+            "answered_us": self._answered_us,
+            "stopped_us": self._stopped_us,
+            "measured_us": self._latency.measured_us,
+            "measured": self._latency.count,
+        }
+
+    def expected_us(self) -> NDArray[np.int64]:
+        """Return the latency t2 (n,) [µs] that is expected of each one's next decision."""
+        return self._latency.expected_us()
+
+    def foresee(
+        self,
+        who: NDArray[np.intp],
+        depth_mm: NDArray[np.uint16],
+        age_us: NDArray[np.int64],
+        now_us: NDArray[np.int64],
+        state: Kinematics,
+    ) -> tuple[NDArray[np.uint16], Kinematics]:
+        """Return what is seen, and how the vehicles move, when their decisions will act.
+
+        Call it once a decision: the images are kept.
+
+        Args:
+            who: (k,) the companions that decide; the rows of others mean nothing.
+            depth_mm: (n, h, w) newest images, 0 = no return.
+            age_us: (n,) how long ago they were taken.
+            now_us: (n,) when the decisions begin.
+            state: Telemetry of all n.
+        """
+        roll, pitch, heading = quats_to_euler(state.quaternion)
+        now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))
+        then, command = self._carried(now, now_us)
+        quaternion = state.quaternion.copy()
+        tilted = leaning(then, command, self._response)
+        image = depth_mm.copy()
+        for i in who.tolist():
+            age_s = age_us[i] / US_PER_S
+            # The tilt is taken to be the same as then: it changes little once a setpoint is flown.
+            taken = quat_from_euler(
+                float(roll[i]), float(pitch[i]), float(heading[i] - now.heading_rate[i] * age_s)
+            )
+            self._keep(i, depth_mm[i], state.position[i] - state.velocity[i] * age_s, taken)
+            quaternion[i] = quat_from_euler(
+                float(tilted[0][i]), float(tilted[1][i]), float(then.heading[i])
+            )
+            sights = [
+                Sight(self._depth_mm[i, k], CameraPose(self._position[i, k], self._axes[i, k]))
+                for k in range(int(self._kept[i]))
+            ]
+            pose = self._mount.pose(then.position[i], quaternion[i])
+            image[i] = self._reprojector.image(sights, pose)
+        return image, Kinematics(then.position, then.velocity, quaternion)
+
+    def decided(
+        self,
+        who: NDArray[np.intp],
+        command: NDArray[np.float64],
+        t2_us: NDArray[np.int64],
+        sent_us: NDArray[np.int64],
+        stopped_us: NDArray[np.int64] | None = None,
+    ) -> None:
+        """Take the setpoints that were sent.
+
+        Args:
+            who: (k,) the companions that sent one.
+            command: (k, 4) forward, right, down [m/s], yaw rate [rad/s].
+            t2_us: (k,) what the decisions took.
+            sent_us: (k,) when they were sent.
+            stopped_us: (k,) when each will be replaced by a stop if no other has come; None: never.
+        """
+        self._latency.measure(who, t2_us)
+        self._before[who] = self._newest[who]
+        self._newest[who] = command
+        self._answered_us[who] = sent_us + LINK_US + self._dead_us
+        self._stopped_us[who] = (
+            NEVER_US if stopped_us is None else stopped_us + LINK_US + self._dead_us
+        )
+
+    def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
+        """Return the rates (n,) [rad/s] at which the vehicles turn, by their setpoints alone."""
+        answering_s = np.maximum(now_us - self._answered_us, 0) / US_PER_S
+        fading = np.exp(-answering_s / self._response.yaw_rate_time_s)
+        rate: Vector = self._newest[:, 3] + (self._before[:, 3] - self._newest[:, 3]) * fading
+        return rate
+
+    def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
+        """Return how the vehicles will move, and the setpoints (n, 4) that will be in effect."""
+        acts_us = now_us + self.expected_us() + LINK_US
+        newest_us = np.clip(self._answered_us, now_us, acts_us)
+        stopped_us = np.clip(self._stopped_us, newest_us, acts_us)
+        command = self._before
+        for setpoint, begins_us, ends_us in (
+            (self._before, now_us, newest_us),
+            (self._newest, newest_us, stopped_us),
+            (np.zeros_like(self._newest), stopped_us, acts_us),
+        ):
+            lasts = ends_us > begins_us
+            if lasts.any():
+                seconds = (ends_us - begins_us) / US_PER_S
+                motion = flown_on(motion, setpoint, self._response, seconds)
+                command = np.where(lasts[:, None], setpoint, command)
+        return motion, command
+
+    def _keep(
+        self, i: int, depth_mm: NDArray[np.uint16], position: Vector, quaternion: Vector
+    ) -> None:
+        """Keep an image of companion i, and where it was taken."""
+        for array in (self._depth_mm, self._position, self._axes):
+            array[i, 1:] = array[i, :-1]
+        pose = self._mount.pose(position, quaternion)
+        self._depth_mm[i, 0], self._position[i, 0], self._axes[i, 0] = depth_mm, *pose
+        self._kept[i] = min(self._kept[i] + 1, REMEMBERED)
+
+
+class _Mount:
+    """Where a camera sits on its vehicle."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._offset = np.array([camera.forward_m, 0.0, -camera.up_m])
+        self._turn = quat_to_matrix(
+            quat_from_euler(0.0, float(np.deg2rad(camera.pitch_up_deg)), 0.0)
+        )
+
+    def pose(self, position: Vector, quaternion: Vector) -> CameraPose:
+        """Return the pose of the camera of a vehicle at NED [m], body -> NED."""
+        axes = quat_to_matrix(quaternion)
+        return CameraPose(position + axes @ self._offset, axes @ self._turn)

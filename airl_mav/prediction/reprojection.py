@@ -1,0 +1,113 @@
+"""A depth image as it would be from elsewhere, made of the newest images.
+
+Every pixel with a return is a point; points are carried into the other camera, and the nearest of
+those that fall on a pixel is seen there. What the newest image saw decides; where it saw nothing of
+a pixel (beyond its edges, behind something) older images do; where no image did, level ground at
+the height of the take-off is assumed, and above the horizon that nothing is there. What moves is
+taken to stand still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.profiles.vehicle import Camera
+
+LEAST_DEPTH_M = 0.05
+"""Points closer to the image plane than this are left out [m]: they have no pixel."""
+
+_RANK = 1 << 16
+"""Older images rank behind all depths of newer ones."""
+
+_UNSEEN = np.uint32(0xFFFFFFFF)
+
+Image = NDArray[np.uint16]
+Floats = NDArray[np.float32]
+
+
+class CameraPose(NamedTuple):
+    """Where a camera is, and how it looks."""
+
+    position: NDArray[np.float64]  # (3,) NED [m]
+    axes: NDArray[np.float64]  # (3, 3) columns: forward (optical axis), right, down, in NED
+
+
+class Sight(NamedTuple):
+    """A depth image and where it was taken."""
+
+    depth_mm: Image  # (h, w), 0 = no return
+    pose: CameraPose
+
+
+class Reprojector:
+    """Reprojects the images of one camera."""
+
+    def __init__(self, camera: Camera, intrinsics: Intrinsics) -> None:
+        """Take the camera, and the intrinsics of its images."""
+        self._k = k = intrinsics
+        self._range_m = camera.range_m
+        u = (np.arange(k.width, dtype=np.float32) - np.float32(k.cx)) / np.float32(k.focal)
+        v = (np.arange(k.height, dtype=np.float32) - np.float32(k.cy)) / np.float32(k.focal)
+        rays = np.ones((3, k.height, k.width), np.float32)
+        rays[1], rays[2] = u[None, :], v[:, None]
+        self._rays = rays.reshape(3, -1)
+        """(3, h w) what each pixel looks along: forward 1, right, down."""
+
+    def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
+        """Return the depth image (h, w) [mm] from a pose; 0 = no return.
+
+        Args:
+            sights: What was seen; the newest first.
+            pose: Where the camera is to be.
+        """
+        k, size = self._k, self._rays.shape[1]
+        nearest = np.full(size, _UNSEEN, np.uint32)
+        for rank, sight in enumerate(sights):
+            pixels, depth_mm = self._carried(sight, pose)
+            np.minimum.at(nearest, pixels, depth_mm + np.uint32(rank * _RANK))
+        out = (nearest & np.uint32(MAX_MM)).astype(np.uint16)
+        # What lies beyond the range was seen to be empty.
+        out[out == MAX_MM] = 0
+        unseen = nearest == _UNSEEN
+        out[unseen] = self._ground_mm(pose)[unseen]
+        return out.reshape(k.height, k.width)
+
+    def _carried(
+        self, sight: Sight, pose: CameraPose
+    ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
+        """Return the pixels that the points of an image fall on, and their depths there [mm]."""
+        k = self._k
+        turn = (pose.axes.T @ sight.pose.axes).astype(np.float32)
+        shift = (pose.axes.T @ (sight.pose.position - pose.position)).astype(np.float32)
+        mm = sight.depth_mm.reshape(-1)
+        empty = mm == 0
+        depth = mm * np.float32(1.0 / MM_PER_M)
+        depth[empty] = self._range_m
+        points = (turn @ self._rays) * depth
+        forward = points[0] + shift[0]
+        kept = forward > LEAST_DEPTH_M
+        scale = np.float32(k.focal) / np.maximum(forward, np.float32(LEAST_DEPTH_M))
+        column = np.rint((points[1] + shift[1]) * scale + np.float32(k.cx))
+        row = np.rint((points[2] + shift[2]) * scale + np.float32(k.cy))
+        kept &= (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
+        column, row, forward, empty = column[kept], row[kept], forward[kept], empty[kept]
+        pixels = (row * np.float32(k.width) + column).astype(np.intp)
+        carried_mm = np.rint(forward * np.float32(MM_PER_M)).astype(np.uint32)
+        carried_mm[empty | (forward > self._range_m)] = MAX_MM
+        return pixels, carried_mm
+
+    def _ground_mm(self, pose: CameraPose) -> Image:
+        """Return the depth (h w) [mm] of level ground at the height of the take-off."""
+        sinking = pose.axes[2].astype(np.float32) @ self._rays
+        height = np.float32(-pose.position[2])
+        with np.errstate(divide="ignore"):
+            depth = np.where(sinking > 0.0, height / sinking, np.inf)
+        depth[(depth > self._range_m) | (depth < LEAST_DEPTH_M)] = 0.0
+        ground: Image = np.rint(depth * np.float32(MM_PER_M)).astype(np.uint16)
+        return ground
