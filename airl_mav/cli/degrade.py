@@ -23,6 +23,7 @@ class DegradeOptions(Gate, ExperimentOptions):
     Examples:
         airl degrade
         airl degrade static-obstacles static-obstacles-ras-pi-4 --latencies native 200ms 400ms
+        airl degrade --compensated
         airl degrade MINE --level lockstep --episodes 100
     """
 
@@ -34,6 +35,10 @@ class DegradeOptions(Gate, ExperimentOptions):
         default=LATENCIES,
         description="sources of t2 as latency takes them, growing; native: none injected; the first"
         " is the reference",
+    )
+    compensated: bool = Field(
+        default=False,
+        description="fly each policy with its latency compensated, too: a curve of its own",
     )
     arena: ArenaName = DEFAULT_ARENA
     episodes: int = episodes("episodes at each latency", 300)
@@ -50,6 +55,8 @@ OPTIONS = DegradeOptions
 def run(options: DegradeOptions, console: Console | None = None) -> int:
     """Fly the latencies and show what they cost; exit status and errors as of `fly_and_show`."""
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
-    experiment = declare_degradation(scenario, options.latencies, options.policies)
+    experiment = declare_degradation(
+        scenario, options.latencies, options.policies, compensated=options.compensated
+    )
     code, _ = fly_and_show(experiment, options.out, console or Console(), options)
     return code

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.experiment import (
@@ -30,6 +32,7 @@ def degrade(
     latencies: Sequence[str] = LATENCIES,
     policies: Sequence[str] = (),
     *,
+    compensated: bool = False,
     out: Path | str | None = None,
     progress: bool = False,
 ) -> ExperimentResult:
@@ -39,17 +42,22 @@ def degrade(
         scenario: What is flown; its latency and workload are passed over.
         latencies: Sources of t2, growing; `native`: none injected. The first is the reference.
         policies: Names or folders; none given: the scenario's.
+        compensated: Whether each policy is flown with compensated latency, too.
         out: Folder; the same one goes on. None makes `runs/<UTC time>-degradation-...`.
         progress: Whether to draw bars on standard error.
 
     Raises what `evaluate` does.
     """
-    declared = declare_degradation(scenario, latencies, policies)
+    declared = declare_degradation(scenario, latencies, policies, compensated=compensated)
     return run_and_compare(declared, out, progress=progress)
 
 
 def declare_degradation(
-    scenario: Scenario, latencies: Sequence[str] = LATENCIES, policies: Sequence[str] = ()
+    scenario: Scenario,
+    latencies: Sequence[str] = LATENCIES,
+    policies: Sequence[str] = (),
+    *,
+    compensated: bool = False,
 ) -> Experiment:
     """Declare a latency curve; see `degrade`. Raises UsageError."""
     if len(latencies) < 2 or len(set(latencies)) < len(latencies):
@@ -57,11 +65,13 @@ def declare_degradation(
     names = list(policies) or [scenario.policy]
     cells = []
     found = [find_policy(name).name for name in names]
-    for path, policy in zip(names, found, strict=True):
+    flown_as: list[dict[str, Any]] = [{}, {"compensate": True}] if compensated else [{}]
+    for (path, name), way in product(zip(names, found, strict=True), flown_as):
+        policy = f"{name}, compensated" if way else name
         for latency in latencies:
             given = None if latency == NATIVE else latency
             label = latency if given is None or not Path(given).is_file() else Path(given).stem
-            flown = {"policy": path, "latency": given, "workload": None}
+            flown = {"policy": path, "latency": given, "workload": None, **way}
             cells.append(
                 make_cell(
                     file_name(f"{policy}-{label}"),

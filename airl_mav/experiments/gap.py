@@ -14,6 +14,7 @@ from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_c
 from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 
 DEFAULT_MITIGATED = "static-obstacles-ras-pi-4"
@@ -30,6 +31,22 @@ NOT_MITIGATED = "none"
 TRAINING_LATENCY_SEED = 1
 """The latencies of the training's conditions are drawn anew: with the same draws as the target's,
 the mitigated policy would be compared with itself."""
+
+
+COMPENSATED, PIPELINED, BOTH = "compensated", "compensated-pipelined", "mitigated-compensated"
+
+COMPENSATION: dict[str, dict[str, Any]] = {
+    COMPENSATED: {"compensate": True},
+    PIPELINED: {"compensate": True, "decisions": "pipelined"},
+    BOTH: {"compensate": True},
+}
+"""Runs whose latency is compensated in flight, by their roles: fields of the scenario."""
+
+COMPENSATION_TITLES = {
+    COMPENSATED: "compensated",
+    PIPELINED: "compensated, pipelined",
+    BOTH: "compensated",
+}
 
 
 @dataclass(frozen=True)
@@ -65,8 +82,9 @@ def gap(
 ) -> ExperimentResult:
     """Measure what a policy loses on an onboard computer, without mitigation and with it.
 
-    Always the same seeds: the policy on the reference computer and on the onboard computer; a
-    policy that was trained as late as that computer decides, there, under the conditions of its
+    Always the same seeds: the policy on the reference computer and on the onboard computer; there
+    with its latency compensated in flight, and with pipelined decisions, too; a policy that was
+    trained as late as that computer decides, there, compensated, under the conditions of its
     training, and on the reference.
 
     Args:
@@ -108,15 +126,27 @@ def declare_gap(
     names = [Path(arena).stem for arena in arenas]
     if len(set(names)) < len(names):
         raise FieldError("arena", " ".join(names), "each arena once")
+    if scenario.compensate:
+        raise FieldError(
+            "compensate", True, "left out: a gap is flown with compensation and without"
+        )
     target = _target(scenario)
     undelayed = _reference(reference, reference_workload, target)
     training, remarks = _training(other, target)
+    compensated = scenario.compensate is None
+    if compensated and load_vehicle(scenario.vehicle).response is None:
+        compensated = False
+        remarks += (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
     planned = [
         ("reference", "reference", policy, undelayed),
         ("target", "target", policy, target),
     ]
+    if compensated:
+        planned += [(role, role, policy, target) for role in (COMPENSATED, PIPELINED)]
     if other is not None:
         planned.append(("mitigated", "mitigated", other, target))
+        if compensated:
+            planned.append((BOTH, BOTH, other, target))
         for number, place in enumerate(training, start=1):
             name = "training" if number == 1 else f"training-{number}"
             planned.append((name, "training", other, place))
@@ -132,6 +162,9 @@ def declare_gap(
                 flown["latency_seed"] = TRAINING_LATENCY_SEED
                 label = f"{who.name} as trained"
                 label += f" ({place.name})" if len(training) > 1 else ""
+            if role in COMPENSATION:
+                flown |= COMPENSATION[role]
+                label += f", {COMPENSATION_TITLES[role]}"
             asked = scenario.model_copy(update=flown)
             title = f"{label}, {short}"
             cells.append(
