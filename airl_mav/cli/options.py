@@ -148,7 +148,7 @@ def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
 
     --name becomes --name True, and --no-name becomes --name False.
     """
-    values = {}
+    values: dict[str, list[str]] = {}
     for name, field in model.model_fields.items():
         if field.annotation == (bool | None):
             option = option_of(name)
