@@ -17,8 +17,9 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
-from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
 from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource, ReceivedFrame
 from companion.interfaces import BodyVelocity, Link
@@ -49,7 +50,14 @@ class Pilot:
     """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
     compensator: Compensator | None = None
     """Carries forward what is seen, of one companion; None = as it is."""
+    memory: DecisionMemory = field(init=False)
+    """The setpoints and latencies so far."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
+
+    def __post_init__(self) -> None:
+        """Keep account of the decisions: the compensator's, where there is one."""
+        compensator = self.compensator
+        self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
     def fly(self, goal: tuple[float, float], stop: Event) -> str:
         """Decide until the goal is reached, or something ends it; return why, in words.
@@ -60,6 +68,8 @@ class Pilot:
         sequence = -1
         if self.compensator is not None:
             self.compensator.begin(0)
+        else:
+            self.memory.begin(0)
         while not stop.is_set():
             if not self.link.connected:
                 return "link lost"
@@ -100,12 +110,15 @@ class Pilot:
             return True
         if not self.watchdog.command(setpoint, hold_us):
             return False
-        if self.compensator is not None:
+        t2_us = np.array([ready_us - started_us])
+        if self.compensator is None:
+            self.memory.decided(ONE, np.array([setpoint]), t2_us)
+        else:
             hover_s = self.watchdog.hover_after_s
             self.compensator.decided(
                 ONE,
                 np.array([setpoint]),
-                np.array([ready_us - started_us]),
+                t2_us,
                 np.array([sent_us]),
                 None if hover_s is None else np.array([sent_us + hold_us + hover_s * US_PER_S]),
             )
@@ -128,14 +141,19 @@ class Pilot:
     ) -> Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
         frame, depth_mm = seen.frame, seen.frame.depth_mm
+        age_us = np.array([now_us - frame.capture_time_us])
         if self.compensator is not None:
             images, states = self.compensator.foresee(
                 ONE,
                 depth_mm[None],
-                np.array([now_us - frame.capture_time_us]),
+                age_us,
                 np.array([now_us]),
                 Kinematics(state.position[None], state.velocity[None], state.quaternion[None]),
             )
             depth_mm = images[0]
             state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
-        return observe(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64))
+        told = self.memory.in_flight(age_us)
+        return observe(
+            *(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64)),
+            InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+        )

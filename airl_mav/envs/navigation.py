@@ -40,6 +40,7 @@ from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
@@ -127,6 +128,7 @@ class Navigation(Stateful):
             width_px=spec.image_width_px,
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
             range_m=self.camera.range_m,
+            in_flight=spec.in_flight,
         )
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
@@ -173,6 +175,13 @@ class Navigation(Stateful):
             self._compensator = Compensator(n, self.vehicle, self.intrinsics)
             self._foreseen_mm = np.zeros_like(self.cameras.image)
             self._foreseen = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
+        self._memory: DecisionMemory | None = None
+        if self._compensator is not None:
+            self._memory = self._compensator.memory
+        elif spec.in_flight:
+            self._memory = DecisionMemory(n)
+        self._age_us = np.zeros(n, np.int64)
+        """Of the frames, when their decisions begin."""
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
         """Start episodes: each in a hover above its start, the first frame taken.
@@ -191,7 +200,8 @@ class Navigation(Stateful):
             self._begin(i, int(seed), zone)
             who[i] = True
         self.capture(who)
-        self._foresee(who, np.zeros(self.n, np.int64))
+        self._age_us[who] = 0
+        self._foresee(who)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         arena = self._arena(seed, zone)
@@ -222,15 +232,19 @@ class Navigation(Stateful):
         self._timing.begin(i)
         if self._compensator is not None:
             self._compensator.begin(i)
+        elif self._memory is not None:
+            self._memory.begin(i)
 
     def see(self) -> Observation:
         """Return the present observations of all vehicles, with a leading axis (n,).
 
         Where latency is compensated, they are those of when the decision is expected to act.
         """
+        image, state = self.cameras.image, self.kinematics()
         if self._compensator is not None:
-            return observe(self._foreseen_mm, self.intrinsics, self._foreseen, self._batch.goal)
-        return observe(self.cameras.image, self.intrinsics, self.kinematics(), self._batch.goal)
+            image, state = self._foreseen_mm, self._foreseen
+        told = None if self._memory is None else self._memory.in_flight(self._age_us)
+        return observe(image, self.intrinsics, state, self._batch.goal, told)
 
     def observe(self) -> Encoded:
         """Return the present observations of all vehicles in the environment's layout."""
@@ -280,24 +294,30 @@ class Navigation(Stateful):
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
-        age_us = self._timing.fly(self, setpoints, t2_us)
+        self._age_us[:] = self._timing.fly(self, setpoints, t2_us)
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
         if self._trace is not None:
             self._trace.decided(self.fleet, setpoints, t2_us, self._transport_us, self._link_us)
+        everyone = np.arange(self.n)
         if self._compensator is not None:
             sent_us = began_us + TICK_US * ticks_of(t2_us)
             hover_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
-            everyone = np.arange(self.n)
             self._compensator.decided(everyone, setpoints, t2_us, sent_us, hover_us)
-        self._foresee(self.fleet.verdict == Verdict.FLYING, age_us)
+        elif self._memory is not None:
+            self._memory.decided(everyone, setpoints, t2_us)
+        self._foresee(self.fleet.verdict == Verdict.FLYING)
 
-    def _foresee(self, who: NDArray[np.bool_], age_us: NDArray[np.int64]) -> None:
+    def _foresee(self, who: NDArray[np.bool_]) -> None:
         """Carry what is seen forward to when the next decisions act, if that is compensated."""
         if self._compensator is None:
             return
         image, state = self._compensator.foresee(
-            np.flatnonzero(who), self.cameras.image, age_us, self.fleet.time_us, self.kinematics()
+            np.flatnonzero(who),
+            self.cameras.image,
+            self._age_us,
+            self.fleet.time_us,
+            self.kinematics(),
         )
         self._foreseen_mm[who] = image[who]
         self._foreseen.position[who] = state.position[who]
@@ -326,6 +346,8 @@ class Navigation(Stateful):
         if self._compensator is not None:
             foreseen = {"depth_mm": self._foreseen_mm, **vars(self._foreseen)}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
+        if self._memory is not None:
+            held["decisions"] = {**self._memory.held(), "age_us": self._age_us}
         return held
 
     def set_state(self, state: State) -> None:

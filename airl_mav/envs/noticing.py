@@ -16,7 +16,7 @@ from airl_mav.envs.fleet import hover, new_fleet
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.policy.observation import Kinematics, observe
+from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import VehicleProfile
 
@@ -66,7 +66,10 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
         arenas.goal[:] = (away_m * math.cos(bearing), away_m * math.sin(bearing))
         cameras.capture(fleet, arenas, np.ones(n, np.bool_), np.zeros(n, np.int64))
         state = Kinematics(fleet.position, fleet.velocity, fleet.quaternion)
-        seen = observe(cameras.image, Intrinsics.of(camera), state, arenas.goal)
+        seen = observe(
+            *(cameras.image, Intrinsics.of(camera), state, arenas.goal),
+            InFlight.of_first_decisions(n),
+        )
         # As at the first decision of a flight, where the policy has a memory.
         fresh = policy.with_generator(np.random.default_rng(0)) if card.state else policy
         chosen = commands(card.actions, fresh.act_batch(encode_layout(card.observation, seen)))

@@ -13,7 +13,7 @@ from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.layouts import STRIP_ROWS, LayoutName
+from airl_mav.policy.layouts import STRIP_ROWS, LayoutName, Told
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.vehicle import Camera, load_vehicle
@@ -208,6 +208,9 @@ class EnvironmentSpec(ProfileModel):
     layout: LayoutName = Field(default="body", description="observation layout")
     image_width_px: int = quantity("image that the network sees", "px", ge=4, le=640, default=32)
     image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
+    in_flight: tuple[Told, ...] = Field(
+        default=(), description="what else the network is told: command, latency, age"
+    )
     actions: ActionSetName = Field(default="arc-25", description="action set")
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
     reward: RewardName = Field(

@@ -17,19 +17,27 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import heading_to_ned
-from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation import InFlight, Observation
 
 LayoutName = Literal["body", "paper"]
 Encoded = dict[str, NDArray[Any]]
 
 DEPTH, VELOCITY, GOAL = "depth", "velocity", "goal"
 """Keys of every layout."""
+
+IN_FLIGHT = "in_flight"
+"""Key of what else a network is told, where it is."""
+
+Told = Literal["command", "latency", "age"]
+
+TOLD: dict[Told, int] = {"command": 3, "latency": 1, "age": 1}
+"""Numbers of each thing that a network may be told of the decisions."""
 
 SPEED_SCALE_M_S = 5.0
 """`body`: velocities are divided by this, the fastest action of the paper."""
@@ -52,6 +60,11 @@ class ObservationSpec(ProfileModel):
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
     range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
+    in_flight: tuple[Told, ...] = Field(
+        default=(),
+        description="what else the network is told: command, the newest setpoint; latency, the t2"
+        " that is expected; age, of the image",
+    )
 
     @model_validator(mode="after")
     def _camera_has_rows(self) -> ObservationSpec:
@@ -79,11 +92,15 @@ class Box(NamedTuple):
 
 def boxes(spec: ObservationSpec) -> dict[str, Box]:
     """Return the arrays of a layout, by key."""
-    return {
+    found = {
         DEPTH: Box((1, spec.height_px, spec.width_px), np.uint8, 0, 255),
         VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
         GOAL: Box((3,), np.float32, -math.inf, math.inf),
     }
+    if spec.in_flight:
+        numbers = sum(TOLD[name] for name in spec.in_flight)
+        found[IN_FLIGHT] = Box((numbers,), np.float32, -math.inf, math.inf)
+    return found
 
 
 def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
@@ -121,6 +138,11 @@ def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
         `depth` (n, 1, height, width) uint8, `velocity` (n, 3) and `goal` (n, 3) float32.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
         its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
+        Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
+        rate [rad/s]; latency [s]; age [s].
+
+    Raises:
+        ValueError: The network is told of decisions of which nobody keeps account.
     """
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
     table = _body_table if spec.layout == "body" else _paper_table
@@ -137,11 +159,26 @@ def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
         goal = heading_to_ned(level, seen.yaw)
         goal[:, 2] = distance
         velocity = heading_to_ned(seen.velocity, seen.yaw)
-    return {
+    encoded: Encoded = {
         DEPTH: image[:, None],
         VELOCITY: velocity.astype(np.float32),
         GOAL: goal.astype(np.float32),
     }
+    if spec.in_flight:
+        encoded[IN_FLIGHT] = _told(spec.in_flight, seen.in_flight)
+    return encoded
+
+
+def _told(names: tuple[Told, ...], known: InFlight | None) -> NDArray[np.float32]:
+    """Return what networks are told of the decisions of n vehicles (n, k)."""
+    if known is None:
+        raise ValueError(f"the network is told {', '.join(names)}, and nobody keeps account of it")
+    parts = {
+        "command": known.command / (SPEED_SCALE_M_S, SPEED_SCALE_M_S, 1.0),
+        "latency": np.asarray(known.latency_s)[:, None],
+        "age": np.asarray(known.age_s)[:, None],
+    }
+    return np.concatenate([parts[name] for name in names], axis=1).astype(np.float32)
 
 
 def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:

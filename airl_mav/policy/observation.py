@@ -28,6 +28,22 @@ class Kinematics:
 
 
 @dataclass(frozen=True)
+class InFlight:
+    """What a companion knows of its own decisions, of one or of n."""
+
+    command: Vector  # (..., 3) newest setpoint: forward, right [m/s], yaw rate [rad/s]
+    latency_s: Vector
+    """(...) latency t2 that is expected of this decision [s]."""
+    age_s: Vector
+    """(...) how long ago the image was taken [s]."""
+
+    @classmethod
+    def of_first_decisions(cls, n: int) -> InFlight:
+        """Return that of n companions which have not decided yet."""
+        return cls(np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+
+
+@dataclass(frozen=True)
 class Observation:
     """Input of a policy, of one vehicle or with a leading axis of n.
 
@@ -44,11 +60,19 @@ class Observation:
     """(...) [rad]."""
     yaw: float | Vector
     """(...) heading [rad], 0 = north, positive to the east."""
+    in_flight: InFlight | None = None
+    """None: nobody keeps account of the decisions."""
 
     def rows(self, index: int | None) -> Observation:
         """Return what vehicle `index` of n sees, or, with None, one vehicle's as that of n = 1."""
         names = ("depth_mm", "goal", "velocity", "roll", "pitch", "yaw")
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
+        if (told := self.in_flight) is not None:
+            found["in_flight"] = InFlight(
+                told.command[index],
+                np.asarray(told.latency_s)[index],
+                np.asarray(told.age_s)[index],
+            )
         return replace(self, **found)
 
     @property
@@ -73,7 +97,11 @@ def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observ
 
 
 def observe(
-    depth_mm: NDArray[np.uint16], intrinsics: Intrinsics, state: Kinematics, goal: Vector
+    depth_mm: NDArray[np.uint16],
+    intrinsics: Intrinsics,
+    state: Kinematics,
+    goal: Vector,
+    in_flight: InFlight | None = None,
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
@@ -82,6 +110,7 @@ def observe(
         intrinsics: The camera.
         state: Telemetry.
         goal: (..., 2) north, east [m].
+        in_flight: What is known of the decisions; None: nothing is.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
@@ -94,4 +123,5 @@ def observe(
         roll=roll,
         pitch=pitch,
         yaw=yaw,
+        in_flight=in_flight,
     )

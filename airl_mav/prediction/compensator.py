@@ -26,7 +26,7 @@ from airl_mav.core.frames import (
     quats_to_euler,
 )
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.lateness import ExpectedLatency
+from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.prediction.motion import Motion, flown_on, leaning
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.vehicle import Camera, VehicleProfile
@@ -63,7 +63,8 @@ class Compensator:
         self._dead_us = round(self._response.dead_time_s * US_PER_S)
         self._mount = _Mount(vehicle.camera)
         self._reprojector = Reprojector(vehicle.camera, intrinsics)
-        self._latency = ExpectedLatency(n)
+        self.memory = DecisionMemory(n)
+        """The setpoints and latencies so far."""
         shape = (intrinsics.height, intrinsics.width)
         self._depth_mm = np.zeros((n, REMEMBERED, *shape), np.uint16)
         self._position = np.zeros((n, REMEMBERED, 3))
@@ -72,7 +73,6 @@ class Compensator:
         """Images that each one has; the newest come first."""
         self._before = np.zeros((n, 4))
         """Setpoints before the newest: forward, right, down [m/s], yaw rate [rad/s]."""
-        self._newest = np.zeros((n, 4))
         self._answered_us = np.zeros(n, np.int64)
         """When the vehicle begins to answer the newest one."""
         self._stopped_us = np.full(n, NEVER_US, np.int64)
@@ -80,9 +80,9 @@ class Compensator:
 
     def begin(self, i: int) -> None:
         """Begin a flight of companion i, in a hover."""
-        self._latency.begin(i)
+        self.memory.begin(i)
         self._kept[i] = 0
-        self._before[i] = self._newest[i] = 0.0
+        self._before[i] = 0.0
         self._answered_us[i], self._stopped_us[i] = 0, NEVER_US
 
     def held(self) -> Mapping[str, Any]:
@@ -93,16 +93,9 @@ class Compensator:
             "axes": self._axes,
             "kept": self._kept,
             "before": self._before,
-            "newest": self._newest,
             "answered_us": self._answered_us,
             "stopped_us": self._stopped_us,
-            "measured_us": self._latency.measured_us,
-            "measured": self._latency.count,
         }
-
-    def expected_us(self) -> NDArray[np.int64]:
-        """Return the latency t2 (n,) [µs] that is expected of each one's next decision."""
-        return self._latency.expected_us()
 
     def foresee(
         self,
@@ -164,9 +157,8 @@ class Compensator:
             sent_us: (k,) when they were sent.
             stopped_us: (k,) when each will be replaced by a stop if no other has come; None: never.
         """
-        self._latency.measure(who, t2_us)
-        self._before[who] = self._newest[who]
-        self._newest[who] = command
+        self._before[who] = self.memory.newest[who]
+        self.memory.decided(who, command, t2_us)
         self._answered_us[who] = sent_us + LINK_US + self._dead_us
         self._stopped_us[who] = (
             NEVER_US if stopped_us is None else stopped_us + LINK_US + self._dead_us
@@ -176,19 +168,20 @@ class Compensator:
         """Return the rates (n,) [rad/s] at which the vehicles turn, by their setpoints alone."""
         answering_s = np.maximum(now_us - self._answered_us, 0) / US_PER_S
         fading = np.exp(-answering_s / self._response.yaw_rate_time_s)
-        rate: Vector = self._newest[:, 3] + (self._before[:, 3] - self._newest[:, 3]) * fading
+        before, newest = self._before[:, 3], self.memory.newest[:, 3]
+        rate: Vector = newest + (before - newest) * fading
         return rate
 
     def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
         """Return how the vehicles will move, and the setpoints (n, 4) that will be in effect."""
-        acts_us = now_us + self.expected_us() + LINK_US
+        acts_us = now_us + self.memory.latency.expected_us() + LINK_US
         newest_us = np.clip(self._answered_us, now_us, acts_us)
         stopped_us = np.clip(self._stopped_us, newest_us, acts_us)
         command = self._before
         for setpoint, begins_us, ends_us in (
             (self._before, now_us, newest_us),
-            (self._newest, newest_us, stopped_us),
-            (np.zeros_like(self._newest), stopped_us, acts_us),
+            (self.memory.newest, newest_us, stopped_us),
+            (np.zeros_like(command), stopped_us, acts_us),
         ):
             lasts = ends_us > begins_us
             if lasts.any():

@@ -15,11 +15,11 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import NETWORKS, load_part
-from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY
+from airl_mav.policy.layouts import DEPTH, GOAL, IN_FLIGHT, VELOCITY
 from airl_mav.training.config import NetworkSpec
 
-VECTORS = (VELOCITY, GOAL)
-VECTOR_INPUTS = 6
+VECTORS = (VELOCITY, GOAL, IN_FLIGHT)
+"""Inputs that join the convolutions, in this order; not every layout has all."""
 
 OWN_DENSE = (128, 128)
 """Units of the dense layers behind an extractor of the user's, where none are given."""
@@ -80,7 +80,7 @@ def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
 
 
 class DepthExtractor(BaseFeaturesExtractor):
-    """Convolutions over `depth` (n, 1, height, width), joined with `velocity` and `goal`.
+    """Convolutions over `depth` (n, 1, height, width), joined with `velocity`, `goal` and others.
 
     The image comes in scaled to 0..1, which stable-baselines3 does with uint8 images.
     """
@@ -88,14 +88,17 @@ class DepthExtractor(BaseFeaturesExtractor):
     def __init__(self, observation_space: spaces.Dict, spec: NetworkSpec) -> None:
         shape = observation_space[DEPTH].shape
         assert shape is not None  # noqa: S101 (a Box has a shape)
-        super().__init__(observation_space, flat_size(spec, *shape[1:]) + VECTOR_INPUTS)
+        vectors = [key for key in VECTORS if key in observation_space.spaces]
+        numbers = sum(spaces.flatdim(observation_space[key]) for key in vectors)
+        super().__init__(observation_space, flat_size(spec, *shape[1:]) + numbers)
+        self.vectors = vectors
         self.convolutions = _convolution_stack(spec, shape[1])
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features (n, features_dim)."""
         flat = self.convolutions(observations[DEPTH])
         # Under autocast the convolutions give bfloat16, the vectors are float32.
-        vectors = [observations[key].to(flat.dtype) for key in VECTORS]
+        vectors = [observations[key].to(flat.dtype) for key in self.vectors]
         return torch.cat([flat, *vectors], dim=1)
 
 

@@ -153,7 +153,9 @@ def test_one_decision_is_the_networks_best_score(exported: Path) -> None:
         LENS,
         seen.goal[None],
         seen.velocity[None],
-        *(np.array([angle]) for angle in (seen.roll, seen.pitch, seen.yaw)),
+        roll=np.array([seen.roll]),
+        pitch=np.array([seen.pitch]),
+        yaw=np.array([seen.yaw]),
     )
     scores = runtime.infer(encode_layout(SPEC, batch))
     forward, right, turn = commands(ActionSpec(), np.array([int(np.argmax(scores))]))[0]
