@@ -21,7 +21,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec, boxes
+from airl_mav.policy.layouts import DEPTH, GOAL, IN_FLIGHT, VELOCITY, ObservationSpec, boxes
 from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
 from airl_mav.training.export_request import ExportRequest, Taken
 from airl_mav.training.onnx_export import (
@@ -50,6 +50,25 @@ class _Network(nn.Module):
         self, depth: torch.Tensor, velocity: torch.Tensor, goal: torch.Tensor
     ) -> torch.Tensor:
         found: torch.Tensor = self.inner({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
+        return found
+
+
+class _ToldNetwork(nn.Module):
+    """The same of a network that is told of its own decisions."""
+
+    def __init__(self, inner: nn.Module) -> None:
+        super().__init__()
+        self.inner = inner
+
+    def forward(
+        self,
+        depth: torch.Tensor,
+        velocity: torch.Tensor,
+        goal: torch.Tensor,
+        in_flight: torch.Tensor,
+    ) -> torch.Tensor:
+        seen = {DEPTH: depth, VELOCITY: velocity, GOAL: goal, IN_FLIGHT: in_flight}
+        found: torch.Tensor = self.inner(seen)
         return found
 
 
@@ -88,18 +107,20 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         UsageError: The policy is of a kind that is not known.
     """
     policy: Any = model.policy
+    told = IN_FLIGHT in policy.observation_space.spaces
+    network = _ToldNetwork if told else _Network
     if hasattr(policy, "quantile_net"):
-        return _Network(_MeanOfQuantiles(policy.quantile_net))
+        return network(_MeanOfQuantiles(policy.quantile_net))
     if hasattr(policy, "q_net"):
-        return _Network(policy.q_net)
+        return network(policy.q_net)
     actor: Any = getattr(policy, "actor", None)
     if hasattr(actor, "latent_pi"):
         # SAC and its kin: the mode of the squashed Gaussian is the squashed mean.
-        return _Network(
+        return network(
             _Actor(actor, actor.features_extractor, actor.latent_pi, actor.mu, nn.Tanh())
         )
     if actor is not None:
-        return _Network(actor)
+        return network(actor)
     if hasattr(policy, "mlp_extractor"):
         # PPO and its kin: logits of discrete actions; else the mean, squashed or cut off.
         last: nn.Module = nn.Identity()
@@ -108,9 +129,11 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
+            if told:
+                raise UsageError("in_flight: accepted: none for a network with a memory of its own")
             head = nn.Sequential(hidden, policy.action_net, last)
             return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head)
-        return _Network(_Actor(policy, extractor, hidden, policy.action_net, last))
+        return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
 

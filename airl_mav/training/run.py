@@ -302,6 +302,8 @@ def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> Po
         goal_radius_m=environment.episode.goal_radius_m,
         altitude_m=environment.episode.altitude_m,
         hover_after_s=environment.episode.hover_after_s,
+        decisions=environment.decisions,
+        compensate=environment.compensate,
         algorithm=config.algorithm.name,
         training=Training(
             arena=environment.arena,
