@@ -1,9 +1,11 @@
 """Rewards of a decision, for n vehicles at a time.
 
-`shaped` is the default. `paper` is the paper's equation 2 to the letter: it does not train, its
-terms being a thousand times too large for any learner with a usual scale. `paper-scaled` is the
-same divided by 1000. Any other is the user's: a function of a `Step`, or a class, made without
-arguments, whose object is one. `costs` are taken off any of them.
+`shaped` is the default. `timed` is for decisions of unequal length, as latencies that vary make
+them: it charges the time, not the decision, and a failure three times as much. `paper` is the
+paper's equation 2 to the letter: it does not train, its terms being a thousand times too large for
+any learner with a usual scale. `paper-scaled` is the same divided by 1000. Any other is the user's:
+a function of a `Step`, or a class, made without arguments, whose object is one. `costs` are taken
+off any of them.
 """
 
 from __future__ import annotations
@@ -27,6 +29,12 @@ PROGRESS_1_M = 0.02
 
 DECISION_COST = 0.005
 """`shaped`: cost of every decision, so that faster is better."""
+
+TIME_COST_1_S = 0.015
+"""`timed`: cost of a second of flight."""
+
+FAILURE_COST = 3.0
+"""`timed`: cost of a collision or an empty battery; the goal is worth 1."""
 
 PAPER_BONUS = 1000.0
 
@@ -74,6 +82,13 @@ def shaped(step: Step) -> NDArray[np.float64]:
     return _ended(step) + PROGRESS_1_M * step.progress_m - DECISION_COST
 
 
+def timed(step: Step) -> NDArray[np.float64]:
+    """Return 1 for the goal, -3 for a failure, a little for progress, less for every second."""
+    passed_s = step.now.time_s - step.before.time_s
+    ended = step.success - FAILURE_COST * step.failure
+    return ended + PROGRESS_1_M * step.progress_m - TIME_COST_1_S * passed_s
+
+
 def paper(step: Step) -> NDArray[np.float64]:
     """Return r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
 
@@ -99,7 +114,12 @@ def _ended(step: Step) -> NDArray[np.float64]:
     return step.success.astype(np.float64) - step.failure
 
 
-SHIPPED: dict[str, Reward] = {"shaped": shaped, "paper-scaled": paper_scaled, "paper": paper}
+SHIPPED: dict[str, Reward] = {
+    "shaped": shaped,
+    "timed": timed,
+    "paper-scaled": paper_scaled,
+    "paper": paper,
+}
 
 
 def reward_of(name: str) -> Reward:

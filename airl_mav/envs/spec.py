@@ -18,7 +18,7 @@ from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.vehicle import Camera, load_vehicle
 
-SHIPPED_REWARDS = ("shaped", "paper-scaled", "paper")
+SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
 """See `envs.rewards`."""
 
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
@@ -215,7 +215,7 @@ class EnvironmentSpec(ProfileModel):
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
     reward: RewardName = Field(
         default="shaped",
-        description="reward: shaped, paper-scaled, paper, or your own as MODULE:NAME or"
+        description="reward: shaped, timed, paper-scaled, paper, or your own as MODULE:NAME or"
         " FILE.py:NAME",
     )
     costs: Costs = Field(
