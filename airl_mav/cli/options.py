@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -154,7 +155,7 @@ def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
             option = option_of(name)
             values |= {option: [option, "True"], f"--no-{option[2:]}": [option, "False"]}
     out: list[str] = []
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in zip_longest(words, words[1:]):
         spelled = following in ("None", "True", "False")
         out += [word] if spelled else values.get(word, [word])
     return out
