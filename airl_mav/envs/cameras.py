@@ -72,9 +72,10 @@ class Cameras(Stateful):
         return age
 
     def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return when the first frame taken from a time (n,) on is decoded [µs]."""
-        waited: NDArray[np.int64] = (self._first_us - time_us) % self.period_us
-        return time_us + waited + self.transport_us
+        """Return when the next frame is decoded after a time (n,) [µs] of each episode."""
+        since_us = (time_us - self.transport_us - self._first_us) % self.period_us
+        decoded: NDArray[np.int64] = time_us - since_us + self.period_us
+        return decoded
 
     def capture(
         self,

@@ -136,18 +136,20 @@ class SequentialTiming(Stateful):
 
 
 class PipelinedTiming(Stateful):
-    """A decision is followed by the next as soon as it is ready and there is a frame for it.
+    """A decision is followed by the next as soon as it is ready and there is a newer frame.
 
-    The frame is one that was taken since the decision began. The vehicle may not have taken the
-    new setpoint yet when the next decision begins: it is in flight.
+    The vehicle may not have taken the new setpoint yet when the next decision begins, nor those
+    before it: they are in flight.
     """
 
     def __init__(self, n: int, link_us: int) -> None:
         """Prepare n vehicles; `link_us` is the time from a setpoint sent to accepted [µs]."""
         self._link_us = link_us
-        self._left = np.zeros(n, np.int64)
-        """Ticks until the setpoint in flight is accepted; 0: none is."""
-        self._in_flight = np.zeros((n, 4))
+        # A decision lasts a tick at least.
+        room = max(-(-link_us // TICK_US), 1)
+        self._left = np.zeros((n, room), np.int64)
+        """Ticks until the setpoints in flight are accepted, the newest first; 0: none is."""
+        self._in_flight = np.zeros((n, room, 4))
 
     def begin(self, i: int) -> None:
         """Begin the flight of vehicle i: nothing is in flight."""
@@ -156,27 +158,36 @@ class PipelinedTiming(Stateful):
     def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
         """Fly one decision of every vehicle; see `Timing`."""
         fleet, cameras = vehicles.fleet, vehicles.cameras
-        began_us, now = fleet.time_us.copy(), self._left.copy()
-        vehicles.advance(now)
-        give(fleet, self._in_flight, now > 0)
+        began_us, now = fleet.time_us.copy(), np.zeros(len(t2_us), np.int64)
         # Ticks from the observation that is being decided on.
         sent, accepted = ticks_of(t2_us), ticks_of(t2_us + self._link_us)
-        ended = np.maximum(sent, ticks_of(cameras.next_decoded_us(began_us) - began_us))
+        # Up, or the frame would not be there yet.
+        frame = -((began_us - cameras.next_decoded_us(began_us)) // TICK_US)
+        ended = np.maximum(sent, frame)
         age = np.minimum(ticks_of(cameras.age_us(began_us + ended * TICK_US)), ended)
-        events = np.stack([ended - age, sent, np.minimum(accepted, ended)], axis=1)
-        each = np.arange(len(sent))
-        for event in np.argsort(events, axis=1, kind="stable").T:
-            until = np.maximum(events[each, event], now)
-            vehicles.advance(until - now)
-            now = until
-            if (event == 0).any():
-                vehicles.capture(event == 0)
-            if (event == 1).any():
-                setpoints[event == 1, 2] = vehicles.holding_altitude()[event == 1]
-            give(fleet, setpoints, (event == 2) & (accepted <= ended))
+        room = self._left.shape[1]
+        # The oldest in flight is the first to arrive.
+        due = np.column_stack([self._left[:, ::-1], ended - age, sent, accepted])
+        happens = due <= ended[:, None]
+        happens[:, :room] &= due[:, :room] > 0
+        due = np.minimum(due, ended[:, None])
+        each = np.arange(len(due))
+        for event in np.argsort(due, axis=1, kind="stable").T:
+            vehicles.advance(due[each, event] - now)
+            now, real = due[each, event], happens[each, event]
+            for k in range(room):
+                give(fleet, self._in_flight[:, room - 1 - k], (event == k) & real)
+            captured, decided = event == room, event == room + 1
+            if captured.any():
+                vehicles.capture(captured)
+            if decided.any():
+                setpoints[decided, 2] = vehicles.holding_altitude()[decided]
+            give(fleet, setpoints, (event == room + 2) & real)
         vehicles.advance(ended - now)
-        self._left[:] = np.maximum(accepted - ended, 0)
-        self._in_flight[:] = setpoints
+        self._left[:, 1:] = np.maximum(self._left[:, :-1] - ended[:, None], 0)
+        self._in_flight[:, 1:] = self._in_flight[:, :-1]
+        self._left[:, 0] = np.maximum(accepted - ended, 0)
+        self._in_flight[:, 0] = setpoints
         aged: Times = TICK_US * age
         return aged
 
