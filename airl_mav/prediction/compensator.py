@@ -38,6 +38,9 @@ controller."""
 REMEMBERED = 4
 """Images that are kept: the newest, and those that fill what it did not see."""
 
+SETPOINTS = 16
+"""Setpoints that are remembered: pipelined, many are sent before the first is answered."""
+
 NEVER_US = np.iinfo(np.int64).max
 
 
@@ -71,10 +74,10 @@ class Compensator:
         self._axes = np.zeros((n, REMEMBERED, 3, 3))
         self._kept = np.zeros(n, np.int64)
         """Images that each one has; the newest come first."""
-        self._before = np.zeros((n, 4))
-        """Setpoints before the newest: forward, right, down [m/s], yaw rate [rad/s]."""
-        self._answered_us = np.zeros(n, np.int64)
-        """When the vehicle begins to answer the newest one."""
+        self._setpoint = np.zeros((n, SETPOINTS, 4))
+        """The newest comes first: forward, right, down [m/s], yaw rate [rad/s]."""
+        self._answered_us = np.zeros((n, SETPOINTS), np.int64)
+        """When the vehicle begins to answer each."""
         self._stopped_us = np.full(n, NEVER_US, np.int64)
         """When the newest one expires, and the vehicle is told to hover."""
 
@@ -82,8 +85,7 @@ class Compensator:
         """Begin a flight of companion i, in a hover."""
         self.memory.begin(i)
         self._kept[i] = 0
-        self._before[i] = 0.0
-        self._answered_us[i], self._stopped_us[i] = 0, NEVER_US
+        self._setpoint[i], self._answered_us[i], self._stopped_us[i] = 0.0, 0, NEVER_US
 
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
@@ -92,7 +94,7 @@ class Compensator:
             "position": self._position,
             "axes": self._axes,
             "kept": self._kept,
-            "before": self._before,
+            "setpoint": self._setpoint,
             "answered_us": self._answered_us,
             "stopped_us": self._stopped_us,
         }
@@ -157,37 +159,38 @@ class Compensator:
             sent_us: (k,) when they were sent.
             stopped_us: (k,) when each will be replaced by a stop if no other has come; None: never.
         """
-        self._before[who] = self.memory.newest[who]
         self.memory.decided(who, command, t2_us)
-        self._answered_us[who] = sent_us + LINK_US + self._dead_us
+        for array in (self._setpoint, self._answered_us):
+            array[who, 1:] = array[who, :-1]
+        self._setpoint[who, 0] = command
+        self._answered_us[who, 0] = sent_us + LINK_US + self._dead_us
         self._stopped_us[who] = (
             NEVER_US if stopped_us is None else stopped_us + LINK_US + self._dead_us
         )
 
     def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
         """Return the rates (n,) [rad/s] at which the vehicles turn, by their setpoints alone."""
-        answering_s = np.maximum(now_us - self._answered_us, 0) / US_PER_S
-        fading = np.exp(-answering_s / self._response.yaw_rate_time_s)
-        before, newest = self._before[:, 3], self.memory.newest[:, 3]
-        rate: Vector = newest + (before - newest) * fading
+        turns, begins = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
+        rate: Vector = turns[0]
+        for turn, begins_us, ends_us in zip(turns, begins, [*begins[1:], now_us], strict=True):
+            answered_s = np.maximum(np.minimum(ends_us, now_us) - begins_us, 0) / US_PER_S
+            rate = turn + (rate - turn) * np.exp(-answered_s / self._response.yaw_rate_time_s)
         return rate
 
     def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
         """Return how the vehicles will move, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
-        newest_us = np.clip(self._answered_us, now_us, acts_us)
-        stopped_us = np.clip(self._stopped_us, newest_us, acts_us)
-        command = self._before
-        for setpoint, begins_us, ends_us in (
-            (self._before, now_us, newest_us),
-            (self.memory.newest, newest_us, stopped_us),
-            (np.zeros_like(command), stopped_us, acts_us),
-        ):
+        flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]
+        ends = [*self._answered_us.T[-2::-1], self._stopped_us, acts_us]
+        command, begins_us = flown[0], now_us
+        for setpoint, end_us in zip(flown, ends, strict=True):
+            ends_us = np.clip(end_us, begins_us, acts_us)
             lasts = ends_us > begins_us
             if lasts.any():
                 seconds = (ends_us - begins_us) / US_PER_S
                 motion = flown_on(motion, setpoint, self._response, seconds)
                 command = np.where(lasts[:, None], setpoint, command)
+            begins_us = ends_us
         return motion, command
 
     def _keep(
