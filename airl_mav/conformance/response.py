@@ -1,0 +1,104 @@
+"""The first-order response of a vehicle to velocity setpoints, from its step responses.
+
+After a dead time d a first-order lag with time constant T has done the share p of a step at
+d - T ln(1 - p). Dead time and time constants are the least-squares fit of that to when the flown
+steps were at 10, 50 and 90 %.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from airl_mav.conformance.reference import Reference, StoredStep
+from airl_mav.conformance.result import SCHEMA
+from airl_mav.conformance.steps import StepName
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
+from airl_mav.core.files import read_json
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import Response, VehicleProfile
+
+VELOCITY_STEPS: tuple[StepName, ...] = (
+    "north-2",
+    "north-2-stop",
+    "north-5",
+    "north-5-stop",
+    "east-2",
+    "forward-2",
+)
+"""Horizontal ones: a policy commands no others."""
+
+YAW_RATE_STEP: StepName = "yawspeed-30"
+
+DIGITS = 3
+"""Of the times [s] and of the drag: telemetry has no finer ones."""
+
+
+def load_steps(source: str) -> Mapping[StepName, StoredStep]:
+    """Return the step responses of a stored reference, or of a result of `airl conformance`.
+
+    Args:
+        source: Name or path (.toml) of a stored reference, or path (.json) of a result.
+
+    Raises:
+        UsageError: There is none, or it cannot be used.
+    """
+    path = Path(source)
+    if path.suffix != ".json":
+        return load_profile("conformance", source, Reference).steps
+    data = read_json(path, SCHEMA, "result of airl conformance")
+    accepted = set(StoredStep.model_fields)
+    # Overshoot and error may be negative in a result, and serve nothing here.
+    accepted -= {"overshoot_percent", "error"}
+    return {
+        step["name"]: validated(
+            StoredStep,
+            {name: value for name, value in step["median"].items() if name in accepted},
+            f"{path}: {step['name']}",
+        )
+        for step in data["steps"]
+    }
+
+
+def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) -> Response:
+    """Return the response of a vehicle that flew such steps.
+
+    Its dead time is that of the velocity. The yaw rate, which follows sooner, has one of its own in
+    the fit, so that its time constant is right. What the vehicle leans against is its linear drag.
+
+    Raises:
+        UsageError: No velocity step got to 90 %, or the step of the yaw rate did not.
+    """
+    dead_s, lag_s = _lag(steps, VELOCITY_STEPS)
+    _, turn_lag_s = _lag(steps, (YAW_RATE_STEP,))
+    return validated(
+        Response,
+        {
+            "dead_time_s": round(dead_s, DIGITS),
+            "velocity_time_s": round(lag_s, DIGITS),
+            "yaw_rate_time_s": round(turn_lag_s, DIGITS),
+            "drag_1_s": round(vehicle.drag.linear_n_s_m / vehicle.body.mass_kg, DIGITS),
+        },
+        "steps",
+    )
+
+
+def _lag(
+    steps: Mapping[StepName, StoredStep], names: tuple[StepName, ...]
+) -> tuple[float, float]:
+    """Return dead time and time constant [s] of the named steps together."""
+    lags, times_s = [], []
+    for name in names:
+        step = steps.get(name, StoredStep())
+        if step.t10_s is None or step.t50_s is None or step.rise_s is None:
+            continue
+        lags += [-math.log(1.0 - share) for share in (0.1, 0.5, 0.9)]
+        times_s += [step.t10_s, step.t50_s, step.t10_s + step.rise_s]
+    if not lags:
+        raise UsageError(f"steps: accepted: with {' or '.join(names)}, up to 90 % of it")
+    dead_s, lag_s = np.linalg.lstsq(np.vander(lags, 2, increasing=True), times_s, rcond=None)[0]
+    return float(dead_s), float(lag_s)
