@@ -137,12 +137,17 @@ def declare_gap(
     if compensated and load_vehicle(scenario.vehicle).response is None:
         compensated = False
         remarks += (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
+    pipelined = compensated and not _hovers(scenario, policy)
+    if compensated and not pipelined:
+        remarks += (f"{policy.name} hovers after its hold: its decisions are not pipelined.",)
     planned = [
         ("reference", "reference", policy, undelayed),
         ("target", "target", policy, target),
     ]
     if compensated:
-        planned += [(role, role, policy, target) for role in (COMPENSATED, PIPELINED)]
+        planned.append((COMPENSATED, COMPENSATED, policy, target))
+    if pipelined:
+        planned.append((PIPELINED, PIPELINED, policy, target))
     if other is not None:
         planned.append(("mitigated", "mitigated", other, target))
         if compensated:
@@ -185,6 +190,12 @@ def declare_gap(
         "remarks": list(remarks),
     }
     return Experiment("gap", f"{policy.name}-{target.name}", facts, tuple(cells), remarks)
+
+
+def _hovers(scenario: Scenario, policy: PolicyInfo) -> bool:
+    """Return whether the velocity is zeroed after a hold, which pipelined decisions have not."""
+    known = None if policy.card is None else policy.card.hover_after_s
+    return scenario.watchdog.hover_after_s is not None or known is not None
 
 
 def _mitigated(name: str) -> PolicyInfo | None:

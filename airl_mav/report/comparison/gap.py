@@ -33,7 +33,13 @@ from airl_mav.report.comparison.tables import (
 )
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
-from airl_mav.report.measures import ALL_MEASURES, FLIGHT_TIME, interval_of
+from airl_mav.report.measures import (
+    ALL_MEASURES,
+    COMPUTER_ENERGY,
+    ENERGY,
+    FLIGHT_TIME,
+    interval_of,
+)
 from airl_mav.report.run_tables import computer_power
 from airl_mav.report.table import NONE, Column, TableView, ms
 
@@ -47,6 +53,9 @@ WITHOUT, WITH = "without-mitigation", "with-mitigation"
 WITH_TRAINED, WITHOUT_TRAINED = "with-mitigation-trained", "without-mitigation-trained"
 COMPENSATED = "compensated"
 COST, HELP = "cost-on-reference", "mitigation-on-target"
+
+PARTS_OF_ENERGY = (ENERGY, COMPUTER_ENERGY)
+"""In the terminal there is room for their sum."""
 
 HEADLINED = (WITHOUT, COMPENSATED, WITH, WITH_TRAINED)
 """Gaps whose figures head an arena."""
@@ -250,7 +259,10 @@ def runs_table(comparison: Comparison, arena: str) -> TableView:
         Column("", number=False),
         Column("t2, mean\n[ms]"),
         Column("flights"),
-        *(Column(f"{measure.title}\n[{measure.unit}]") for measure in ALL_MEASURES),
+        *(
+            Column(f"{each.title}\n[{each.unit}]", page_only=each in PARTS_OF_ENERGY)
+            for each in ALL_MEASURES
+        ),
     )
     rows = []
     for run in comparison.group(arena):
