@@ -12,6 +12,7 @@ import sys
 import time
 from contextlib import nullcontext
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -30,7 +31,7 @@ from airl_mav.profiles.loading import profiles_dir
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
-from airl_mav.report.comparison.gap import columns_table, gaps_table
+from airl_mav.report.comparison.gap import gaps_table, runs_table
 from airl_mav.report.comparison.model import load_comparison, save_comparison
 from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
@@ -41,7 +42,9 @@ from tests.support.command_line import airl, option_words
 
 GAP_FILE = "gap.json"
 EPISODES = 24
-ROLES = ("reference", "target", "mitigated", "training", "mitigated-reference")
+RETRAINED = ("mitigated", "mitigated-compensated", "training", "mitigated-reference")
+NOT_RETRAINED = ("reference", "target", "compensated", "compensated-pipelined")
+ROLES = NOT_RETRAINED + RETRAINED
 
 
 def make_policy(
@@ -128,12 +131,16 @@ def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None
     out, _ = whole
     columns = columns_of(data_of(out))
     assert [column["role"] for column in columns] == list(ROLES)
-    assert [column["mark"] for column in columns] == list("ABCDE")
+    assert [column["mark"] for column in columns] == list("ABCDEFGH")
     runs = {c["role"]: json.loads((out / c["folder"] / "run.json").read_text()) for c in columns}
     policies = {role: info["setup"]["policy"]["name"] for role, info in runs.items()}
-    assert policies == dict.fromkeys(ROLES, "mitigated") | {
-        "reference": DEFAULT_POLICY,
-        "target": DEFAULT_POLICY,
+    names = dict.fromkeys(RETRAINED, "mitigated") | dict.fromkeys(NOT_RETRAINED, DEFAULT_POLICY)
+    assert policies == names
+    between = {role: info["setup"]["between_commands"] for role, info in runs.items()}
+    assert between == dict.fromkeys(ROLES, "persist") | {
+        "compensated": "persist, latency compensated",
+        "compensated-pipelined": "persist, pipelined decisions, latency compensated",
+        "mitigated-compensated": "persist, latency compensated",
     }
     means = {role: info["setup"]["injection"]["latency"]["mean_ms"] for role, info in runs.items()}
     assert means == dict.fromkeys(ROLES, 396.0) | {"reference": 11.0, "mitigated-reference": 11.0}
@@ -186,7 +193,10 @@ def test_t2_is_that_of_the_flights(whole: tuple[Path, str]) -> None:
     ("key", "target", "reference"),
     [
         ("without-mitigation", "target", "reference"),
+        ("compensated", "compensated", "reference"),
+        ("compensated-pipelined", "compensated-pipelined", "reference"),
         ("with-mitigation", "mitigated", "reference"),
+        ("both", "mitigated-compensated", "reference"),
         ("without-mitigation-trained", "target", "training"),
         ("with-mitigation-trained", "mitigated", "training"),
         ("mitigation-on-target", "mitigated", "target"),
@@ -235,6 +245,14 @@ def test_the_gap_appears(whole: tuple[Path, str]) -> None:
     assert gap["t2_percent"] == pytest.approx(3500.0, rel=0.02)
 
 
+def test_compensation_closes_most_of_the_gap(whole: tuple[Path, str]) -> None:
+    data = data_of(whole[0])
+    without, compensated = (gap_of(data, key) for key in ("without-mitigation", "compensated"))
+    for metric in ("flight_time_s", "distance_m", "energy_j"):
+        left = compensated[metric]["difference"]["value"]
+        assert left < 0.5 * without[metric]["difference"]["value"]
+
+
 def test_the_same_policy_has_the_same_gap_and_none_where_it_was_trained(
     whole: tuple[Path, str],
 ) -> None:
@@ -265,7 +283,6 @@ def test_the_paper_stands_beside_it(whole: tuple[Path, str]) -> None:
     trained = gap_of(data, "without-mitigation-trained")["published"]
     assert trained["flight_time_percent"] == pytest.approx(37.73, abs=0.02)
     flat = " ".join(text.split())
-    assert "paper paper paper paper" in flat
     assert "(85 - 73) / 73" in flat
     assert "against the delay-trained policy" in flat
 
@@ -282,6 +299,7 @@ def test_the_answer_is_one_of_the_numbers(whole: tuple[Path, str]) -> None:
     )
     rates = {c["role"]: 100.0 * c["success_rate"]["value"] for c in columns_of(data_of(out))}
     assert f"reaches {rates['target']:.1f} % of its goals, not {rates['reference']:.1f} %" in answer
+    assert "With its latency compensated it flies " in answer
     assert "mitigated there flies" in answer
     assert "against the conditions of its own training" in answer
 
@@ -295,13 +313,16 @@ def test_everything_fits_into_80_columns(whole: tuple[Path, str]) -> None:
 def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
     gap = load_comparison(whole[0], "gap")
     (arena,) = gap.groups
-    table = columns_table(gap, arena)
-    rows = {row[0]: row for row in table.rows}
-    quality = gap.runs[1].quality
-    assert quality.flight_time_s.value is not None
-    shown = rows["flight time [s]"][2].partition(" ")[0]
-    assert float(shown) == pytest.approx(quality.flight_time_s.value, abs=5e-3)
-    assert rows["flight time [s]"][6:] == ("24.08", "44.93", "32.44", "32.62")
+    table = runs_table(gap, arena)
+    column = [column.title for column in table.columns].index("flight time\n[s]")
+    rows = [row for row in table.rows if row[0] != "  paper"]
+    assert [row[0] for row in rows] == [run.mark for run in gap.runs]
+    for row, run in zip(rows, gap.runs, strict=True):
+        assert run.quality.flight_time_s.value is not None
+        shown = row[column].partition(" ")[0]
+        assert float(shown) == pytest.approx(run.quality.flight_time_s.value, abs=5e-3)
+    told = [(row[0], below[column]) for row, below in pairwise(table.rows) if below[0] == "  paper"]
+    assert told == [("A", "24.08"), ("B", "44.93"), ("E", "32.44"), ("G", "32.62")]
     first = gaps_table(gap, arena).rows[0]
     assert first[0] == "B against A\nno mitigation"
     difference = gap.contrasts[0].paired.flight_time_s.difference
@@ -362,7 +383,7 @@ def test_the_page_opens_offline_and_its_pictures_lie_beside_it(whole: tuple[Path
 
 def test_the_markdown_has_every_table(whole: tuple[Path, str]) -> None:
     text = (whole[0] / "gap.md").read_text()
-    assert text.count("\n| --- |") == 8  # Each by itself, the gaps, six in detail.
+    assert text.count("\n| --- |") == 11  # Each by itself, the gaps, nine in detail.
     for block in re.findall(r"(?:^\|.*\|\n)+", text, re.M):
         rows = [re.findall(r"(?<!\\)\|", line) for line in block.splitlines()]
         assert len({len(row) for row in rows}) == 1
@@ -399,7 +420,7 @@ def test_the_same_out_shows_it_again(whole: tuple[Path, str], mitigated: str) ->
     before = data_of(out)
     code, again = measure(mitigated, out=out)
     assert code == 0
-    assert again.count("(flown before)") == 5
+    assert again.count("(flown before)") == 8
     assert data_of(out) == before
     assert (
         again.partition("Each run by itself")[2].partition("gap  ")[0]
@@ -474,7 +495,7 @@ def test_without_mitigation_and_in_two_arenas(tmp_path: Path) -> None:
         ("no-obstacles", "system evaluation, No Obstacles (VI.B)"),
         ("static-obstacles", "mitigation, Static Obstacles (VII.B)"),
     ):
-        assert [c["role"] for c in columns_of(data, arena)] == ["reference", "target"]
+        assert [c["role"] for c in columns_of(data, arena)] == list(NOT_RETRAINED)
         assert data["extra"]["published_tables"][arena] == paper
     assert len(data["answers"]) == 2
     assert " in no-obstacles " in data["answers"][0]
@@ -482,7 +503,7 @@ def test_without_mitigation_and_in_two_arenas(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == [
         f"{arena}-{role}"
         for arena in ("no-obstacles", "static-obstacles")
-        for role in ("reference", "target")
+        for role in sorted(NOT_RETRAINED)
     ]
 
 
@@ -495,7 +516,7 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
     code, _ = measure("none", out=tmp_path / "out", latency=latency, episodes=3)
     assert code == 0
     data = data_of(tmp_path / "out")
-    a, b = columns_of(data)
+    a, b, *_ = columns_of(data)
     # The reference is undelayed: no workload of it is as late as a measured latency says.
     assert a["stages"]["t2"]["mean"] == 1e3
     assert b["stages"]["t2"]["mean"] == pytest.approx(150e3, rel=0.02)
@@ -546,6 +567,7 @@ def _unknown(name: str) -> PolicyInfo:
         ({"arena": ("no-obstacles", "no-obstacles")}, "each arena once"),
         ({"arena": ()}, "--arena"),
         ({"arena": ("nowhere",)}, "nowhere"),
+        ({"compensate": True}, "--compensate True: accepted: left out"),
     ],
 )
 def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str) -> None:
@@ -555,6 +577,25 @@ def test_what_cannot_be_used(tmp_path: Path, options: dict[str, Any], words: str
         measure(**asked)
     assert "\n" not in f"{caught.value}"
     assert not out.exists()
+
+
+def roles_of(**asked: Any) -> tuple[list[str], tuple[str, ...]]:
+    scenario = Scenario(**({"level": "gym", "computer": "ras-pi-4"} | asked))
+    gap = declare_gap(scenario, mitigated="none")
+    return [cell.role for cell in gap.cells], gap.remarks
+
+
+def test_it_compensates_where_that_can_be(tmp_path: Path) -> None:
+    assert roles_of()[0] == list(NOT_RETRAINED)
+    assert roles_of(compensate=False) == (["reference", "target"], ())
+    profile = (profiles_dir() / "vehicles" / "quad.toml").read_text()
+    (tmp_path / "unknown.toml").write_text(profile.partition("[response]")[0])
+    roles, (remark,) = roles_of(vehicle=str(tmp_path / "unknown.toml"))
+    assert roles == ["reference", "target"]
+    assert "response of vehicle" in remark
+    roles, (remark,) = roles_of(watchdog={"hover_after_s": 0.06})
+    assert roles == ["reference", "target", "compensated"]
+    assert "not pipelined" in remark
 
 
 # --- how the conditions of a training are read
