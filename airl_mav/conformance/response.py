@@ -87,9 +87,7 @@ def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) 
     )
 
 
-def _lag(
-    steps: Mapping[StepName, StoredStep], names: tuple[StepName, ...]
-) -> tuple[float, float]:
+def _lag(steps: Mapping[StepName, StoredStep], names: tuple[StepName, ...]) -> tuple[float, float]:
     """Return dead time and time constant [s] of the named steps together."""
     lags, times_s = [], []
     for name in names:

@@ -133,24 +133,16 @@ def declare_gap(
     target = _target(scenario)
     undelayed = _reference(reference, reference_workload, target)
     training, remarks = _training(other, target)
-    compensated = scenario.compensate is None
-    if compensated and load_vehicle(scenario.vehicle).response is None:
-        compensated = False
-        remarks += (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
-    pipelined = compensated and not _hovers(scenario, policy)
-    if compensated and not pipelined:
-        remarks += (f"{policy.name} hovers after its hold: its decisions are not pipelined.",)
+    ways, more = _ways_of_compensation(scenario, policy)
+    remarks += more
     planned = [
         ("reference", "reference", policy, undelayed),
         ("target", "target", policy, target),
+        *((role, role, policy, target) for role in ways),
     ]
-    if compensated:
-        planned.append((COMPENSATED, COMPENSATED, policy, target))
-    if pipelined:
-        planned.append((PIPELINED, PIPELINED, policy, target))
     if other is not None:
         planned.append(("mitigated", "mitigated", other, target))
-        if compensated:
+        if ways:
             planned.append((BOTH, BOTH, other, target))
         for number, place in enumerate(training, start=1):
             name = "training" if number == 1 else f"training-{number}"
@@ -192,10 +184,19 @@ def declare_gap(
     return Experiment("gap", f"{policy.name}-{target.name}", facts, tuple(cells), remarks)
 
 
-def _hovers(scenario: Scenario, policy: PolicyInfo) -> bool:
-    """Return whether the velocity is zeroed after a hold, which pipelined decisions have not."""
-    known = None if policy.card is None else policy.card.hover_after_s
-    return scenario.watchdog.hover_after_s is not None or known is not None
+def _ways_of_compensation(
+    scenario: Scenario, policy: PolicyInfo
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the roles in which the policy is flown compensated on the target, and remarks."""
+    if scenario.compensate is not None:
+        return (), ()
+    if load_vehicle(scenario.vehicle).response is None:
+        return (), (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
+    on_card = None if policy.card is None else policy.card.hover_after_s
+    if (scenario.watchdog.hover_after_s, on_card) != (None, None):
+        told = f"{policy.name} hovers after its hold: its decisions are not pipelined."
+        return (COMPENSATED,), (told,)
+    return (COMPENSATED, PIPELINED), ()
 
 
 def _mitigated(name: str) -> PolicyInfo | None:
