@@ -6,6 +6,7 @@ block of decisions at a time.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,7 +25,37 @@ NOT_BEGUN = -1
 """Seed of a slot in which no episode has begun."""
 
 
-class DelayDraws(Stateful):
+class DrawnAhead(Stateful):
+    """Draws of n episodes, made ahead a block at a time."""
+
+    def __init__(self, n: int) -> None:
+        """Prepare n slots."""
+        self._seeds = np.full(n, NOT_BEGUN, np.int64)
+        self._blocks = np.zeros(n, np.int64)
+        """Blocks drawn in the slot's episode."""
+
+    @abstractmethod
+    def begin(self, i: int, seed: int) -> Any:
+        """Start the episode of slot i."""
+
+    @abstractmethod
+    def _draw_block(self, i: int) -> None:
+        """Draw the next block of slot i, and count it."""
+
+    def _held(self) -> Mapping[str, Any]:
+        return {"seeds": self._seeds, "blocks": self._blocks}
+
+    def set_state(self, state: State) -> None:
+        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
+        super().set_state(state)
+        for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
+            blocks = int(self._blocks[i])
+            self.begin(i, int(self._seeds[i]))
+            while self._blocks[i] < blocks:
+                self._draw_block(i)
+
+
+class DelayDraws(DrawnAhead):
     """t2 of every decision of n episodes [µs]."""
 
     def __init__(
@@ -38,12 +69,10 @@ class DelayDraws(Stateful):
             native_us: t2 when nothing is injected [µs].
             draw: See `samplers.latency_generator`.
         """
+        super().__init__(n)
         self._injections = tuple(injections)
         self._native_us = native_us
         self._draw = draw
-        self._seeds = np.full(n, NOT_BEGUN, np.int64)
-        self._blocks = np.zeros(n, np.int64)
-        """Blocks drawn in the slot's episode."""
         self._samplers: list[LatencySampler | None] = [None] * n
         self._block = np.full((n, BLOCK), native_us, np.int64)
 
@@ -71,15 +100,3 @@ class DelayDraws(Stateful):
         if sampler is not None:
             self._block[i] = [sampler.sample_us() for _ in range(BLOCK)]
             self._blocks[i] += 1
-
-    def _held(self) -> Mapping[str, Any]:
-        return {"seeds": self._seeds, "blocks": self._blocks}
-
-    def set_state(self, state: State) -> None:
-        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
-        super().set_state(state)
-        for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
-            blocks = int(self._blocks[i])
-            self.begin(i, int(self._seeds[i]))
-            for _ in range(blocks):
-                self._draw_block(i)

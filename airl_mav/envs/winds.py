@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,26 +10,23 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
-from airl_mav.envs.draws import NOT_BEGUN
+from airl_mav.envs.draws import DrawnAhead
 from airl_mav.envs.fleet import Fleet, Verdict
-from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.vehicle.wind import BLOCK, Wind, wind_of_episode
 
 
-class Winds(Stateful):
+class Winds(DrawnAhead):
     """The wind of n episodes; from the seed of each the same history of gusts as the plant's."""
 
     def __init__(self, n: int, settings: WindSettings) -> None:
         """Prepare n slots."""
+        super().__init__(n)
         self.calm = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
         """Whether no wind blows in any episode."""
         self._settings = settings
         self._gusty = settings.gust_m_s > 0.0
         self._winds: list[Wind | None] = [None] * n
-        self._seeds = np.full(n, NOT_BEGUN, np.int64)
-        self._blocks = np.zeros(n, np.int64)
-        """Blocks drawn in the slot's episode."""
         self._air = np.zeros((n, BLOCK if self._gusty else 1, 3))
         """As `flight.advance` takes it: the present block."""
 
@@ -73,15 +69,3 @@ class Winds(Stateful):
         if wind is not None:
             self._air[i] = wind.ahead()
             self._blocks[i] += 1
-
-    def _held(self) -> Mapping[str, Any]:
-        return {"seeds": self._seeds, "blocks": self._blocks}
-
-    def set_state(self, state: State) -> None:
-        """Restore a saved state by repeating its draws. Raises UsageError if it does not fit."""
-        super().set_state(state)
-        for i in np.flatnonzero(self._seeds != NOT_BEGUN).tolist():
-            blocks = int(self._blocks[i])
-            self.begin(i, int(self._seeds[i]))
-            for _ in range(blocks - 1):
-                self._draw_block(i)

@@ -120,7 +120,7 @@ def aircraft_table(found: Roofline) -> TableView:
         Column("computer", number=False),
         Column("on board", "g"),
         Column("draws", "W"),
-        Column("take-off", "kg"),
+        Column("take-off mass", "kg"),
         Column("power", "W"),
         Column("missions"),
     )
