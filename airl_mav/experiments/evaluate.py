@@ -28,6 +28,8 @@ NOT_THE_POLICYS_OWN = (
     "hold_s",
     "altitude_m",
     "max_speed_m_s",
+    "decisions",
+    "compensate",
     "time_limit_s",
     "watchdog",
 )
