@@ -139,7 +139,8 @@ class PipelinedTiming(Stateful):
     """A decision is followed by the next as soon as it is ready and there is a newer frame.
 
     The vehicle may not have taken the new setpoint yet when the next decision begins, nor those
-    before it: they are in flight.
+    before it: they are in flight. A frame that was on its way when a decision began is taken as it
+    begins: it is too new by the time of its transport at most.
     """
 
     def __init__(self, n: int, link_us: int) -> None:
