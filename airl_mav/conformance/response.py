@@ -12,13 +12,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from pydantic import BaseModel, TypeAdapter
 
 from airl_mav.conformance.reference import Reference, StoredStep
 from airl_mav.conformance.result import SCHEMA
 from airl_mav.conformance.steps import StepName
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
-from airl_mav.core.files import read_json
+from airl_mav.core.files import read_typed
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import Response, VehicleProfile
 
@@ -38,6 +39,19 @@ DIGITS = 3
 """Of the times [s] and of the drag: telemetry has no finer ones."""
 
 
+class _FlownStep(BaseModel):
+    """A step of a result, as far as it is needed."""
+
+    name: StepName
+    median: dict[str, float | None]
+
+
+class _Flown(BaseModel):
+    """A result of `airl conformance`, as far as it is needed."""
+
+    steps: list[_FlownStep]
+
+
 def load_steps(source: str) -> Mapping[StepName, StoredStep]:
     """Return the step responses of a stored reference, or of a result of `airl conformance`.
 
@@ -50,17 +64,14 @@ def load_steps(source: str) -> Mapping[StepName, StoredStep]:
     path = Path(source)
     if path.suffix != ".json":
         return load_profile("conformance", source, Reference).steps
-    data = read_json(path, SCHEMA, "result of airl conformance")
-    accepted = set(StoredStep.model_fields)
-    # Overshoot and error may be negative in a result, and serve nothing here.
-    accepted -= {"overshoot_percent", "error"}
+    found = read_typed(path, TypeAdapter(_Flown), SCHEMA, "result of airl conformance")
     return {
-        step["name"]: validated(
+        step.name: validated(
             StoredStep,
-            {name: value for name, value in step["median"].items() if name in accepted},
-            f"{path}: {step['name']}",
+            {name: step.median.get(name) for name in ("t10_s", "t50_s", "rise_s")},
+            f"{path}: {step.name}",
         )
-        for step in data["steps"]
+        for step in found.steps
     }
 
 
