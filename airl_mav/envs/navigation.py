@@ -94,6 +94,7 @@ class Navigation(Stateful):
         trace: Trace | None = None,
         computer_w: float = 0.0,
         battery_charge: float = 1.0,
+        compensator: Compensator | None = None,
     ) -> None:
         """Load the profiles.
 
@@ -109,6 +110,8 @@ class Navigation(Stateful):
             trace: Records the flights; None records nothing, and changes nothing.
             computer_w: What the computer on board of that `vehicle` draws from the pack [W].
             battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
+            compensator: Carries forward what is seen, of n companions; None: that of the vehicle,
+                where `spec` compensates.
 
         Raises:
             UsageError: A profile cannot be used, or the camera does not serve the layout.
@@ -170,9 +173,10 @@ class Navigation(Stateful):
             self._timing = SequentialTiming(
                 self.cameras, self._link_us, self._hold_us, self._hover_us
             )
-        self._compensator: Compensator | None = None
-        if spec.compensate:
-            self._compensator = Compensator(n, self.vehicle, self.intrinsics)
+        if compensator is None and spec.compensate:
+            compensator = Compensator(n, self.vehicle, self.intrinsics)
+        self._compensator = compensator
+        if compensator is not None:
             self._foreseen_mm = np.zeros_like(self.cameras.image)
             self._foreseen = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
         self._memory: DecisionMemory | None = None

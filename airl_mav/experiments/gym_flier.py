@@ -101,7 +101,7 @@ class GymFlier:
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (no logs here)
         """Load the policy; see `fliers.Flier`."""
         scenario = self.scenario
-        environment, pilots = environment_of(scenario), _pilots(scenario)
+        environment, pilots = environment_of(scenario), pilots_of(scenario)
 
         def fly(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
             index_of = {episode.seed: episode.index for episode in episodes}
@@ -166,7 +166,7 @@ class GymFlier:
         return FlownEpisode(record, trajectory, latency)
 
 
-def _pilots(scenario: ResolvedScenario) -> Pilots:
+def pilots_of(scenario: ResolvedScenario) -> Pilots:
     """Return who decides for all vehicles."""
     loaded = scenario.fresh_policy(scenario.scenario.seed)
     if isinstance(loaded, LearnedPolicy):

@@ -36,10 +36,7 @@ LINK_US = round(4.0 * US_PER_MS)
 controller."""
 
 REMEMBERED = 4
-"""Images that are kept: the newest, and those that fill what it did not see."""
-
-SETPOINTS = 16
-"""Setpoints that are remembered: pipelined, many are sent before the first is answered."""
+"""Images that are kept by default; more do not fly better (docs/results.md)."""
 
 NEVER_US = np.iinfo(np.int64).max
 
@@ -47,8 +44,17 @@ NEVER_US = np.iinfo(np.int64).max
 class Compensator:
     """Carries forward what n companions see."""
 
-    def __init__(self, n: int, vehicle: VehicleProfile, intrinsics: Intrinsics) -> None:
+    def __init__(
+        self,
+        n: int,
+        vehicle: VehicleProfile,
+        intrinsics: Intrinsics,
+        *,
+        remembered: int = REMEMBERED,
+    ) -> None:
         """Prepare n companions of one vehicle, whose camera has these intrinsics.
+
+        So many images are `remembered`: the newest, and those that fill what it did not see.
 
         Raises:
             FieldError: The vehicle's profile does not say how it answers setpoints.
@@ -69,14 +75,16 @@ class Compensator:
         self.memory = DecisionMemory(n)
         """The setpoints and latencies so far."""
         shape = (intrinsics.height, intrinsics.width)
-        self._depth_mm = np.zeros((n, REMEMBERED, *shape), np.uint16)
-        self._position = np.zeros((n, REMEMBERED, 3))
-        self._axes = np.zeros((n, REMEMBERED, 3, 3))
+        self._depth_mm = np.zeros((n, remembered, *shape), np.uint16)
+        self._position = np.zeros((n, remembered, 3))
+        self._axes = np.zeros((n, remembered, 3, 3))
         self._kept = np.zeros(n, np.int64)
         """Images that each one has; the newest come first."""
-        self._setpoint = np.zeros((n, SETPOINTS, 4))
+        # Pipelined, one is sent with every frame at most, and many before the first is answered.
+        room = (LINK_US + self._dead_us) // vehicle.camera.period_us + 3
+        self._setpoint = np.zeros((n, room, 4))
         """The newest comes first: forward, right, down [m/s], yaw rate [rad/s]."""
-        self._answered_us = np.zeros((n, SETPOINTS), np.int64)
+        self._answered_us = np.zeros((n, room), np.int64)
         """When the vehicle begins to answer each."""
         self._stopped_us = np.full(n, NEVER_US, np.int64)
         """When the newest one expires, and the vehicle is told to hover."""
@@ -201,7 +209,7 @@ class Compensator:
             array[i, 1:] = array[i, :-1]
         pose = self._mount.pose(position, quaternion)
         self._depth_mm[i, 0], self._position[i, 0], self._axes[i, 0] = depth_mm, *pose
-        self._kept[i] = min(self._kept[i] + 1, REMEMBERED)
+        self._kept[i] = min(self._kept[i] + 1, self._depth_mm.shape[1])
 
 
 class _Mount:
