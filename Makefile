@@ -82,6 +82,7 @@ bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-pyt
 	$(BIN)/python benchmarks/bench_depth.py
 	$(BIN)/python benchmarks/bench_stack.py
 	$(BIN)/python benchmarks/bench_policy.py
+	$(BIN)/python benchmarks/bench_compensation.py
 	$(BIN)/python benchmarks/bench_stamps.py
 	$(BIN)/python benchmarks/bench_envs.py $(RIVALS)
 
