@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -19,8 +20,10 @@ from rich.console import Console
 
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.run import load_run
 from airl_mav.report.comparison import show
+from airl_mav.scenario.model import Scenario
 from tests.support.processes import ROOT
 
 SCRIPTS = ROOT / "scripts" / "studies"
@@ -232,6 +235,54 @@ def test_system_evaluation_is_the_gap_of_every_arena(tmp_path: Path) -> None:
     # 37.37 s against 25.29 s, and 34.44 s against 30.258 s in the paper.
     assert "+47.8" in text
     assert "+13.8" in text
+
+
+def test_compensation_says_what_flies_how(tmp_path: Path) -> None:
+    """The rows of a right model are what `airl evaluate` flies; those of wrong ones are others."""
+    few: dict[str, Any] = {"FACTORS": (0.5,), "LATENCIES": (0.5,), "IMAGES": (1,)}
+    with patch.multiple(importlib.import_module("compensation"), **few):
+        config = (SCRIPTS / "compensation.toml").read_text()
+        code, text = study("compensation", config, tmp_path / "out", "--episodes", "3")
+    assert code == 0
+    lines = (tmp_path / "out" / "compensation.md").read_text().splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if "|" in line]
+    rows = {row[0]: row[1:] for row in cells[2:]}
+    assert len(rows) == 3 + 4 + 1 + 1 + 3
+    assert all(row in text for row in rows)
+    times = {}
+    for compensate in (None, False, True):
+        asked = Scenario(
+            level="gym",
+            seed=900_000,
+            episodes=3,
+            latency="11ms" if compensate is None else "396ms",
+            compensate=compensate,
+        )
+        with patch.object(show, "write_document", lambda _, folder: folder / "matrix.html"):
+            evaluate(asked, ["static-obstacles"], out=tmp_path / f"{compensate}")
+        (path,) = (tmp_path / f"{compensate}").rglob("episodes.jsonl")
+        flown = flights(path.parent).values()
+        times[compensate] = [flight["quality"]["flight_time_s"] for flight in flown]
+    for name, compensate in (("not compensated", False), ("compensated", True)):
+        assert rows[name][2] == "3"
+        change = 100.0 * (np.mean(times[compensate]) / np.mean(times[None]) - 1.0)
+        assert rows[name][1].startswith(f"{change:+.1f} ")
+    wrong = [row for name, row in rows.items() if " x 0.5" in name]
+    assert len({tuple(row) for row in (*wrong, rows["compensated"])}) > 3
+
+
+def test_expected_latencies_of_the_study() -> None:
+    compensation = importlib.import_module("compensation")
+    rng = np.random.default_rng(1)
+    measured = rng.integers(100_000, 900_000, 40)
+    high, half = compensation.Quantile(1), compensation.Scaled(1, 0.5)
+    assert high.expected_us() == half.expected_us() == 0
+    for k, each in enumerate(measured, start=1):
+        newest = measured[max(0, k - 32) : k]
+        for latency in (high, half):
+            latency.measure(np.array([0]), np.array([each]))
+        assert high.expected_us()[0] == int(np.quantile(newest, 0.9))
+        assert half.expected_us()[0] == pytest.approx(0.5 * newest.mean(), abs=1.0)
 
 
 def test_an_arena_twice_gets_one_line(tmp_path: Path) -> None:
