@@ -3,11 +3,9 @@
 Only the batch twin knows so much: nothing of this flies. It is there to be imitated
 (`training.imitation`).
 
-An episode begins with a map: how far everything that stands is from each place, and from it the
-time to the goal on the best way there, which keeps a distance where there is room (the eikonal
-equation, solved by fast sweeping: Zhao, Math. Comp. 74(250), 2005). A decision tries actions of the
-set: each is flown ahead with a simple model of the vehicle, to the end of its hold and then to a
-stand, past the obstacles where they will be. Of those that touch nothing the one with the least
+An episode begins with a map of the way to the goal (`envs.goal_map`). A decision tries actions of
+the set: each is flown ahead with a simple model of the vehicle, to the end of its hold and then to
+a stand, past the obstacles where they will be. Of those that touch nothing the one with the least
 time to go wins (a dynamic window approach: Fox, Burgard, Thrun, IEEE Robotics & Automation
 Magazine 4(1), 1997).
 """
@@ -21,29 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Shape
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch
+from airl_mav.envs.goal_map import FAR, Body, Map, beside, map_of, read_at
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Delay
 from airl_mav.latency.injection import Injection
-
-CELLS = 125
-"""Cells of the map along the longer side of an arena, at most."""
-
-FINEST_M = 0.4
-"""Least side of a cell [m]."""
-
-COMFORT_M = 1.2
-"""Gap to what stands from which on the way there is as good as any [m]."""
-
-SLOWEST = 0.25
-"""Share of the speed on the map where the vehicle just fits."""
-
-BLOCKED = 0.02
-"""The same where it does not: small, so that the way out is still downhill."""
 
 STEP_S = 0.1
 """Step of the flight ahead [s]."""
@@ -69,34 +52,6 @@ TURN_S = 0.4
 
 LATENCIES = 64
 """Draws that the mean latency is of."""
-
-_BOX = int(Shape.BOX)
-_FAR = 1e9
-
-
-class Map(NamedTuple):
-    """What an episode's planning needs of its arena; cells (rows north, columns east)."""
-
-    north: float
-    """Of the first cell's centre [m]."""
-    east: float
-    cell: float
-    """Side of a cell [m]."""
-    gap: NDArray[np.float64]
-    """From a cell's centre to the nearest thing that stands [m]; negative inside."""
-    to_go: NDArray[np.float64]
-    """Time to the goal at 1 m/s [s]."""
-
-
-class Body(NamedTuple):
-    """The vehicle, as the planner flies it."""
-
-    radius: float
-    half_height: float
-    altitude: float
-    """Height that it holds [m]."""
-    top_speed: float
-    """Of the action set [m/s]."""
 
 
 class Timing(NamedTuple):
@@ -159,125 +114,6 @@ def _mean_t2_us(injection: Injection, delay: Delay) -> float:
     return float(np.mean([sampler.sample_us() for _ in range(LATENCIES)]))
 
 
-def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
-    """Return the map of arena i."""
-    south, north, west, east = batch.bounds[i, :4]
-    cell = max(FINEST_M, max(north - south, east - west) / CELLS)
-    shape = math.ceil((north - south) / cell), math.ceil((east - west) / cell)
-    gap, to_go = np.empty(shape), np.full(shape, _FAR)
-    first = south + 0.5 * cell, west + 0.5 * cell
-    _fill_gaps(batch, i, body, first, cell, gap)
-    _fill_times(gap, body.radius, first, cell, (batch.goal[i, 0], batch.goal[i, 1]), to_go)
-    return Map(first[0], first[1], cell, gap, to_go)
-
-
-@kernel
-def _beside(
-    batch: ArenaBatch, i: int, obstacle: int, body: Body, north: float, east: float
-) -> float:
-    """Return the distance [m] from a place at flight altitude to an obstacle, seen from above."""
-    half_size = batch.half_size[i, obstacle]
-    center = batch.center[i, obstacle]
-    if abs(-body.altitude - center[2]) > half_size[2] + body.half_height + 0.3:
-        return _FAR  # above or below
-    dx, dy = north - center[0], east - center[1]
-    if batch.shape[i, obstacle] != _BOX:
-        gap: float = math.sqrt(dx * dx + dy * dy) - half_size[0]
-        return gap
-    c, s = math.cos(batch.yaw[i, obstacle]), math.sin(batch.yaw[i, obstacle])
-    gx, gy = abs(c * dx + s * dy) - half_size[0], abs(c * dy - s * dx) - half_size[1]
-    beside: float = math.sqrt(max(gx, 0.0) ** 2 + max(gy, 0.0) ** 2) + min(0.0, max(gx, gy))
-    return beside
-
-
-@kernel
-def _fill_gaps(
-    batch: ArenaBatch,
-    i: int,
-    body: Body,
-    first: tuple[float, float],
-    cell: float,
-    gap: NDArray[np.float64],
-) -> None:
-    bounds = batch.bounds[i]
-    for row in range(gap.shape[0]):
-        north = first[0] + row * cell
-        for column in range(gap.shape[1]):
-            east = first[1] + column * cell
-            least = min(
-                min(north - bounds[0], bounds[1] - north), min(east - bounds[2], bounds[3] - east)
-            )
-            for obstacle in range(batch.n_static[i]):
-                least = min(least, _beside(batch, i, obstacle, body, north, east))
-            gap[row, column] = least
-
-
-@kernel
-def _fill_times(
-    gap: NDArray[np.float64],
-    radius: float,
-    first: tuple[float, float],
-    cell: float,
-    goal: tuple[float, float],
-    to_go: NDArray[np.float64],
-) -> None:
-    """Solve the eikonal equation from the goal outwards; `to_go` comes in as far as can be."""
-    rows, columns = gap.shape
-    slow = np.empty((rows, columns))
-    for row in range(rows):
-        for column in range(columns):
-            room = gap[row, column] - radius
-            share = SLOWEST + (1.0 - SLOWEST) * room / COMFORT_M
-            slow[row, column] = 1.0 / (BLOCKED if room < 0.0 else min(1.0, share))
-    goal_row = min(max(int((goal[0] - first[0]) / cell + 0.5), 0), rows - 1)
-    goal_column = min(max(int((goal[1] - first[1]) / cell + 0.5), 0), columns - 1)
-    to_go[goal_row, goal_column] = 0.0
-    changed = 1.0
-    sweep = 0
-    while changed > 1e-2 and sweep < 200:
-        if sweep % 4 == 0:
-            changed = 0.0
-        for k in range(rows):
-            row = k if sweep % 4 < 2 else rows - 1 - k
-            for m in range(columns):
-                column = m if sweep % 2 == 0 else columns - 1 - m
-                a = min(
-                    to_go[row - 1, column] if row > 0 else _FAR,
-                    to_go[row + 1, column] if row < rows - 1 else _FAR,
-                )
-                b = min(
-                    to_go[row, column - 1] if column > 0 else _FAR,
-                    to_go[row, column + 1] if column < columns - 1 else _FAR,
-                )
-                least = min(a, b)
-                if least >= _FAR:
-                    continue
-                f = cell * slow[row, column]
-                found = least + f
-                if abs(a - b) < f:
-                    found = 0.5 * (a + b + math.sqrt(2.0 * f * f - (a - b) ** 2))
-                if found < to_go[row, column]:
-                    changed = max(changed, to_go[row, column] - found)
-                    to_go[row, column] = found
-        sweep += 1
-        if sweep % 4 != 0:
-            changed = 1.0
-
-
-@kernel
-def _read(known: Map, field: NDArray[np.float64], north: float, east: float) -> float:
-    """Return a field of the map at a place, between its cells."""
-    rows, columns = field.shape
-    x = min(max((north - known.north) / known.cell, 0.0), rows - 1.001)
-    y = min(max((east - known.east) / known.cell, 0.0), columns - 1.001)
-    row, column = int(x), int(y)
-    u, v = x - row, y - column
-    near = (1.0 - v) * field[row, column] + v * field[row, column + 1]
-    far = (1.0 - v) * field[row + 1, column] + v * field[row + 1, column + 1]
-    found: float = (1.0 - u) * near + u * far
-    return found
-
-
 @kernel
 def _follow_movers(batch: ArenaBatch, i: int, time_s: float, places: NDArray[np.float64]) -> None:
     """Write where the moving obstacles will be: places (steps, movers, 2) north, east [m].
@@ -306,7 +142,7 @@ def _to_movers(
 
     Those that are farther than matters are passed over.
     """
-    least = _FAR
+    least = FAR
     for j in range(places.shape[0]):
         obstacle = batch.n_static[i] + j
         dx, dy = north - places[j, 0], east - places[j, 1]
@@ -315,7 +151,7 @@ def _to_movers(
         if dx * dx + dy * dy < reach * reach:
             # As if the vehicle were elsewhere, not the obstacle.
             x, y = dx + batch.center[i, obstacle, 0], dy + batch.center[i, obstacle, 1]
-            least = min(least, _beside(batch, i, obstacle, body, x, y))
+            least = min(least, beside(batch, i, obstacle, body, x, y))
     return least
 
 
@@ -374,11 +210,11 @@ def best_command(
                     after = 1.0 - math.exp(-LOOK_S / RESPONSE_S)
                     ahead_x = x + wx * LOOK_S + (vx - wx) * RESPONSE_S * after
                     ahead_y = y + wy * LOOK_S + (vy - wy) * RESPONSE_S * after
-                    to_go = _read(known, known.to_go, ahead_x, ahead_y) / body.top_speed
-                    north = _read(known, known.to_go, ahead_x + known.cell, ahead_y)
-                    north -= _read(known, known.to_go, ahead_x - known.cell, ahead_y)
-                    east = _read(known, known.to_go, ahead_x, ahead_y + known.cell)
-                    east -= _read(known, known.to_go, ahead_x, ahead_y - known.cell)
+                    to_go = read_at(known, known.to_go, ahead_x, ahead_y) / body.top_speed
+                    north = read_at(known, known.to_go, ahead_x + known.cell, ahead_y)
+                    north -= read_at(known, known.to_go, ahead_x - known.cell, ahead_y)
+                    east = read_at(known, known.to_go, ahead_x, ahead_y + known.cell)
+                    east -= read_at(known, known.to_go, ahead_x, ahead_y - known.cell)
                     off = math.atan2(-east, -north) - nose
                     cost += to_go + TURN_S * abs(math.atan2(math.sin(off), math.cos(off)))
                 forward, right, rate = 0.0, 0.0, 0.0
@@ -389,7 +225,7 @@ def best_command(
             vx += share * (cn * forward - sn * right - vx)
             vy += share * (sn * forward + cn * right - vy)
             x, y, nose, t = x + STEP_S * vx, y + STEP_S * vy, nose + STEP_S * rate, t + STEP_S
-            standing = _read(known, known.gap, x, y) - body.radius
+            standing = read_at(known, known.gap, x, y) - body.radius
             moving = _to_movers(batch, i, body, x, y, places[step]) - body.radius
             step += 1
             if min(standing, moving) < LEAST_GAP_M:
