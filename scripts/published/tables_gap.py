@@ -27,10 +27,20 @@ def _gap(record: Record, target: str, reference: str, arena: str = DEFAULT) -> G
     return record.gaps[f"{arena}-{target} against {arena}-{reference}"]
 
 
+_ON_THE_TARGET = {
+    "target": "default policy, Raspberry Pi",
+    "compensated": "... its latency compensated in flight",
+    "compensated-pipelined": "... and decisions pipelined",
+    "mitigated": "mitigated policy, Raspberry Pi",
+    "mitigated-compensated": "... its latency compensated in flight",
+}
+
+
 @block("gap-short", "gap")
 def gap_short(records: Records) -> str:
-    runs, record = _letters(records), records["gap"]
-    a = runs["a"]
+    record = records["gap"]
+    runs = {role: record.runs[f"{DEFAULT}-{role}"] for role in ("reference", *_ON_THE_TARGET)}
+    a = runs["reference"]
     first = (
         f"{rate(a)} %",
         f"{number(a.flight_time_s, 2)} s",
@@ -39,14 +49,13 @@ def gap_short(records: Records) -> str:
         "",
     )
     rows: list[tuple[str, ...]] = [("default policy, workstation", *first)]
-    for title, run, gap in (
-        ("default policy, Raspberry Pi", runs["b"], _gap(record, "target", "reference")),
-        ("mitigated policy, Raspberry Pi", runs["c"], _gap(record, "mitigated", "reference")),
-    ):
-        rows.append((title, f"{rate(run)} %", *_changes(gap)))
+    for role, title in _ON_THE_TARGET.items():
+        rows.append((title, f"{rate(runs[role])} %", *_changes(_gap(record, role, "reference"))))
     trained = _gap(record, "mitigated", "training")
     points = f"{both(trained.success_rate, 1, '+')} points"
-    rows.append(("... against the conditions of its own training", points, *_changes(trained)))
+    rows.append(
+        ("mitigated, against the conditions of its own training", points, *_changes(trained))
+    )
     return table(("", "success", "flight time", "distance", "energy", "pairs"), rows)
 
 
@@ -82,6 +91,9 @@ def mitigation_runs(records: Records) -> str:
 
 _GAPS = (
     ("without mitigation, reference undelayed (b, a)", "target", "reference"),
+    ("compensated in flight, reference undelayed", "compensated", "reference"),
+    ("... decisions pipelined", "compensated-pipelined", "reference"),
+    ("mitigated and compensated, reference undelayed", "mitigated-compensated", "reference"),
     ("with mitigation, reference undelayed (c, a)", "mitigated", "reference"),
     ("without mitigation, reference delay-trained (b, d)", "target", "training"),
     ("with mitigation, reference delay-trained (c, d)", "mitigated", "training"),
@@ -116,10 +128,10 @@ SAME_PERCENT = 0.05
 @block("gap-lockstep", "gap-lockstep")
 def gap_lockstep(records: Records) -> str:
     rows = []
-    for title, target, reference in _GAPS[:4]:
+    for title, target, reference in _GAPS[:-1]:
         gap = _gap(records["gap-lockstep"], target, reference)
         cells = (both(getattr(gap, measure), 1, "+") for measure in MEASURES)
-        rows.append((title.rpartition(" (")[0], *cells, f"{gap.flight_time_s.n}"))
+        rows.append((title.partition(" (")[0], *cells, f"{gap.flight_time_s.n}"))
     heads = ("success [points]", "flight time [%]", "distance [%]", "energy [%]", "pairs")
     return table(("gap at `lockstep`", *heads), rows, 5)
 
@@ -221,6 +233,34 @@ def _share(figure: Figure, reference: Figure) -> str:
     if figure.value is None or not reference.value:
         return NONE
     return f"{100.0 * (figure.value - reference.value) / reference.value:+.0f} %"
+
+
+# --- compensation
+
+
+_LATE = ("11ms", "150ms", "396ms", "542ms", "949ms")
+
+_WAYS = (
+    ("compensation", DEFAULT),
+    ("compensation", f"{DEFAULT}--compensated"),
+    ("compensation-pipelined", DEFAULT),
+)
+
+
+@block("compensation", "compensation", "compensation-pipelined")
+def compensation(records: Records) -> str:
+    rows = []
+    for late in _LATE:
+        cells: list[str] = []
+        for record, name in _WAYS:
+            run = records[record].runs[f"{name}-{late}"]
+            cells.append(f"{rate(run)} %")
+            cells.append(
+                f"{number(run.flight_time_s, 2)} s, {number(run.distance_m, 1)} m",
+            )
+        rows.append((late.replace("ms", " ms"), *cells))
+    heads = ("as it is", "", "compensated", "", "compensated, pipelined", "")
+    return table(("t2", *heads), rows, 6)
 
 
 # --- degradation
