@@ -324,9 +324,8 @@ class Navigation(Stateful):
             self.kinematics(),
         )
         self._foreseen_mm[who] = image[who]
-        self._foreseen.position[who] = state.position[who]
-        self._foreseen.velocity[who] = state.velocity[who]
-        self._foreseen.quaternion[who] = state.quaternion[who]
+        for kept, found in zip(vars(self._foreseen).values(), vars(state).values(), strict=True):
+            kept[who] = found[who]
 
     def _held(self) -> Mapping[str, Any]:
         held: dict[str, Any] = {

@@ -207,6 +207,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
         "width_px": 32,
         "horizontal_fov_deg": 90.0,
         "range_m": 20.0,
+        "in_flight": [],
     }
 
 
