@@ -31,6 +31,9 @@ FRAME_WAIT_S = 0.1
 ONE = np.zeros(1, np.intp)
 """The only companion of its compensator."""
 
+OLDEST_FRAME_US = US_PER_S
+"""A frame that claims to be older, or from the future, is stamped by another clock [µs]."""
+
 WAITING = "waiting for a frame"
 """What the pilot tells the watchdog that it is at."""
 
@@ -141,7 +144,7 @@ class Pilot:
     ) -> Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
         frame, depth_mm = seen.frame, seen.frame.depth_mm
-        age_us = np.array([now_us - frame.capture_time_us])
+        age_us = np.array([age_of(seen, now_us)])
         if self.compensator is not None:
             images, states = self.compensator.foresee(
                 ONE,
@@ -157,3 +160,13 @@ class Pilot:
             *(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64)),
             InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
         )
+
+
+def age_of(seen: ReceivedFrame, now_us: int) -> int:
+    """Return how long ago a frame was taken, as far as this companion can tell [µs].
+
+    A camera on another machine may stamp by a clock of its own. Then its frame is taken to be as
+    old as it has been here.
+    """
+    age_us = now_us - seen.frame.capture_time_us
+    return age_us if 0 <= age_us <= OLDEST_FRAME_US else now_us - seen.received_us

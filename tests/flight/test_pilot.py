@@ -459,3 +459,20 @@ def test_watchdog_stops_watching(watched: list[Flight]) -> None:
 
 def test_guard_that_never_started_can_be_stopped() -> None:
     Flight(SimClock(), Script()).guard.stop()
+
+
+@pytest.mark.parametrize(
+    ("stamped_us", "age_s"), [(3_000, 0.0035), (-5_000_000, 0.0), (3_600_000_000, 0.0)]
+)
+def test_a_frame_stamped_by_another_clock_is_as_old_as_it_has_been_here(
+    stamped_us: int, age_s: float
+) -> None:
+    clock = SimClock()
+    policy = Script(forward())
+    flight = Flight(clock, policy, PilotSettings(hold_s=0.0))
+    flight.frames = FakeFrames(clock, age_us=stamped_us)
+    flight.pilot.frames = flight.frames
+    flight.fly()
+    told = policy.seen[0].in_flight
+    assert told is not None
+    assert told.age_s == pytest.approx(age_s, abs=1e-9)
