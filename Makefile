@@ -59,7 +59,7 @@ kernels: $(ALL)
 .PHONY: test
 test: $(ALL)  ## Everything CI checks
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not nightly"
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not nightly" --durations 25
 
 .PHONY: nightly
 nightly: $(ALL)  ## All tests, with the long ones of stops and kills

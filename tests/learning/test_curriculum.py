@@ -185,6 +185,7 @@ class Dies(TrainingProgress):
             raise KeyboardInterrupt
 
 
+@pytest.mark.nightly
 def test_what_was_learned_in_a_zone_is_kept_and_the_same_after_a_kill(tmp_path: Path) -> None:
     """Every goal is reached at once, so that each zone takes a window of episodes."""
     config = TrainingConfig.model_validate(

@@ -126,6 +126,7 @@ def config(name: str, **changes: Any) -> TrainingConfig:
     return TrainingConfig.model_validate(values | changes)
 
 
+@pytest.mark.nightly
 def test_dagger_learns_within_seconds(tmp_path: Path) -> None:
     """Chance reaches no goal in static-obstacles; after 3200 decisions more than half are."""
     asked = config("dagger")

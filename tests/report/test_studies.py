@@ -222,16 +222,14 @@ def test_system_evaluation_is_the_gap_of_every_arena(tmp_path: Path) -> None:
     )
     assert code == 0
     names = [
-        (f"{arena}-reference", f"{arena}-{role}")
-        for arena in ("no-obstacles", "static-obstacles")
-        for role in ("target", "compensated", "compensated-pipelined")
+        (f"{arena}-reference", f"{arena}-target") for arena in ("no-obstacles", "static-obstacles")
     ]
     check_contrasts(tmp_path / "out", "gap", set(names))
     gap = comparison(tmp_path / "out", "gap")
     t2_ms = [run["stages"]["t2"]["mean"] / 1e3 for run in gap["runs"]]
-    assert t2_ms == pytest.approx([11.0, *[396.0] * 3, 10.0, *[542.0] * 3], rel=0.05)
+    assert t2_ms == pytest.approx([11.0, 396.0, 10.0, 542.0], rel=0.05)
     policies = [run["setup"]["policy"]["name"] for run in gap["runs"]]
-    assert policies == ["no-obstacles"] * 4 + ["greedy"] * 4
+    assert policies == ["no-obstacles"] * 2 + ["greedy"] * 2
     # 37.37 s against 25.29 s, and 34.44 s against 30.258 s in the paper.
     assert "+47.8" in text
     assert "+13.8" in text
