@@ -31,29 +31,27 @@ class Options(ProfileModel):
     )
 
 
-class DqnOptions(Options):
+class TargetOptions(Options):
+    """Options of the algorithms with a target network."""
+
+    tau: float | None = quantity(
+        "share of the online network in an update of the target network",
+        "1",
+        gt=0,
+        le=1,
+        default=None,
+    )
+
+
+class DqnOptions(TargetOptions):
     """Options of `dqn`."""
 
     max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-    tau: float | None = quantity(
-        "share of the online network in an update of the target network",
-        "1",
-        gt=0,
-        le=1,
-        default=None,
-    )
 
 
-class ReplayOptions(Options):
+class ReplayOptions(TargetOptions):
     """Options of the algorithms with a replay memory of stable-baselines3."""
 
-    tau: float | None = quantity(
-        "share of the online network in an update of the target network",
-        "1",
-        gt=0,
-        le=1,
-        default=None,
-    )
     train_freq: int | None = quantity(
         "steps of each vehicle between two rounds of updates", "1", ge=1, le=10**6, default=None
     )
