@@ -52,6 +52,19 @@ def wait_until(condition: Callable[[], Any], what: str, timeout_s: float = PATIE
     return value
 
 
+def run_alone(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a program in an interpreter of its own, where every warning is an error."""
+    return subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        cwd=folder,
+        env={"PYTHONPATH": str(ROOT), "HOME": str(folder)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
 def has_ended(pid: int) -> bool:
     """Return whether a process is gone, as a condition to wait for."""
     return not is_running(pid)

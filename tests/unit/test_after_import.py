@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from airl_mav.core.after_import import after_import
-from tests.support.processes import ROOT
+from tests.support.processes import run_alone
 
 
 @pytest.fixture
@@ -71,15 +70,7 @@ spec = gymnasium.spec("airl/Navigation-v0")
 print(spec.entry_point, spec.vector_entry_point)
 assert "numba" not in sys.modules
 """
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_alone(program, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [
         "airl_mav.envs.single:NavigationEnv",

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.support.processes import ROOT
+from tests.support.processes import run_alone
 
 HEAVY = (
     "airl_mav.arena",
@@ -66,26 +64,10 @@ assert not found, found
 @pytest.mark.parametrize("block", ["", BLOCK], ids=["looked for", "blocked"])
 @pytest.mark.parametrize("work", ["import companion\n", EVERY_MODULE, COMMAND])
 def test_imports_nothing_heavy(tmp_path: Path, work: str, block: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", block + work + REPORT],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_alone(block + work + REPORT, tmp_path)
     assert done.returncode == 0, done.stderr
 
 
 def test_the_check_itself_can_fail(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", BLOCK + "import airl_mav.arena.generate\n"],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_alone(BLOCK + "import airl_mav.arena.generate\n", tmp_path)
     assert "is not for the companion" in done.stderr

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -41,7 +40,7 @@ from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import ReceivedFrame
 from companion.mission import check_camera
 from tests.support.policy_kit import SPEC, export_tiny, noise
-from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, running
+from tests.support.processes import SITL_WITHOUT_REPORT, run_alone, running
 
 LENS = Intrinsics.from_fov(64, 48, math.radians(90.0))
 POLICIES = {"discrete": ("DQN", "arc-25"), "continuous": ("SAC", "velocity")}
@@ -541,15 +540,7 @@ NOT_ON_A_DRONE = {
 
 def test_onnx_flies_without_torch_and_without_a_word(exported: Path, tmp_path: Path) -> None:
     code = ALONE.format(absent=NOT_ON_A_DRONE, folder=str(exported / "discrete"))
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    done = run_alone(code, tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout + done.stderr == ""
 
