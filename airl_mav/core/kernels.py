@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba import njit
+
+from airl_mav.core.cache import writable_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -57,16 +58,9 @@ def _choose_cache() -> None:
     if numba.config.CACHE_DIR:
         return  # NUMBA_CACHE_DIR: the user has chosen
     package = Path(__file__).resolve().parents[1]
-    name = f"{_CACHE_NAME}{_sources_digest(package.parent)}"
-    for parent in (package / "__pycache__", Path.home() / ".cache" / "airl-mav"):
-        folder = parent / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            numba.config.CACHE_DIR = str(folder)
-            return
+    folder = writable_folder(f"{_CACHE_NAME}{_sources_digest(package.parent)}")
+    if folder is not None:
+        numba.config.CACHE_DIR = str(folder)
 
 
 _choose_cache()

@@ -1,6 +1,6 @@
 """The MAVLink 2 codec: the only module that touches pymavlink.
 
-Of pymavlink only the generated `common` dialect is used: message classes, constants and the
+Of pymavlink only the generated dialect (`dialect`) is used: message classes, constants and the
 decoder of one whole frame. Framing is done here. When receiving, because pymavlink's own parser
 discards everything that a damaged header claims as its payload, and waits for it to arrive. When
 streaming, because creating and packing a message object costs several times as much as `Layout`
@@ -16,10 +16,16 @@ import struct
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from operator import itemgetter
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from pymavlink.dialects.v20 import common as dialect
 from pymavlink.generator import mavcrc
+
+from firmware_sim.mavlink.dialect import load
+
+if TYPE_CHECKING:
+    from pymavlink.dialects.v20 import development as dialect
+else:
+    dialect = load()
 
 __all__ = [
     "COMPONENT_ID",
@@ -40,7 +46,7 @@ WireMessage: TypeAlias = dialect.MAVLink_message
 """A decoded message, or one to be packed."""
 
 Values: TypeAlias = Sequence[float]
-"""The fields of a message in the order of common.xml, ints where a field is one. Arrays are
+"""The fields of a message in the order of their definition, ints where a field is one. Arrays are
 unrolled; extension fields (the last ones) may be left out and are zero then."""
 
 SYSTEM_ID = 1

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.dialects.v20 import common as dialect
-from pymavlink.dialects.v20 import development
 
 from firmware_sim.mavlink.codec import Decoder, Encoder, message_id, param_value, payload
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -81,8 +81,8 @@ def test_unknown_incompatibility_flags_are_refused() -> None:
 
 
 def test_messages_that_the_dialect_lacks_are_counted_apart() -> None:
-    modern = development.MAVLink(None, 245, 190)
-    frame = development.MAVLink_available_modes_message(1, 1, 0, 0, 0, b"X").pack(modern)
+    other = ardupilotmega.MAVLink(None, 245, 190)
+    frame = ardupilotmega.MAVLink_hwstatus_message(5_000, 1).pack(other)
     decoder = Decoder(datagrams=True)
     assert sequences(decoder.feed(frame + client().pack(ping(3)))) == [3]
     assert (decoder.unknown, decoder.malformed) == (1, 0)

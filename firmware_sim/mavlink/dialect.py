@@ -1,0 +1,87 @@
+"""The MAVLink messages that are spoken here, as a module made by pymavlink's own generator.
+
+pymavlink's `development` set has all of `common`, but not the newest messages that PX4 sends:
+EVENT, COMPONENT_METADATA, TIME_ESTIMATE_TO_TARGET and others. Those stand in
+`newer_messages.xml`, and both together are generated at the first import after an install (a
+fraction of a second) and kept beside the compiled kernels. A later start imports the module as it
+would import pymavlink's own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import pymavlink
+
+from airl_mav.core.cache import writable_folder
+
+NEWER = Path(__file__).with_name("newer_messages.xml")
+"""Messages that pymavlink's definitions lack."""
+
+DEFINITIONS = Path(pymavlink.__file__).parent / "dialects" / "v20"
+INCLUDED = ("minimal", "standard", "common", "development")
+"""pymavlink's definitions that `development` consists of, each including the one before."""
+
+_NAME = "airl_mavlink_dialect"
+
+
+def load() -> ModuleType:
+    """Return the module of the dialect: what `pymavlink.dialects.v20.common` is for `common`.
+
+    Raises:
+        ImportError: pymavlink is installed without its message definitions.
+    """
+    present = sys.modules.get(_NAME)
+    if present is not None:
+        return present
+    folder = writable_folder(f"mavlink-{_digest()}")
+    if folder is not None:
+        return _imported(generated(folder))
+    with tempfile.TemporaryDirectory() as temporary:
+        return _imported(generated(Path(temporary)))
+
+
+def _digest() -> str:
+    """Return a digest of what the module is made from."""
+    digest = hashlib.sha256(NEWER.read_bytes())
+    for name in INCLUDED:
+        # Size and time tell an upgrade of pymavlink as well as half a megabyte of text would.
+        try:
+            seen = (DEFINITIONS / f"{name}.xml").stat()
+        except OSError as error:
+            raise ImportError(f"pymavlink lacks its message definitions: {error}") from error
+        digest.update(f"{name} {seen.st_size} {seen.st_mtime_ns}".encode())
+    return digest.hexdigest()[:16]
+
+
+def generated(folder: Path) -> Path:
+    """Return the module's file in a folder; it is made if it is not there."""
+    path = folder / f"{_NAME}.py"
+    if not path.is_file():
+        # Only here: a start that finds the module must not wait for the generator's import.
+        from firmware_sim.mavlink.dialect_generator import generate
+
+        with tempfile.TemporaryDirectory(dir=folder) as temporary:
+            made = Path(temporary) / path.name
+            generate(NEWER, DEFINITIONS, INCLUDED, made)
+            made.replace(path)  # whole, also where several processes make it at once
+    return path
+
+
+def _imported(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(_NAME, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path}: cannot be imported")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[_NAME] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[_NAME]
+        raise
+    return module
