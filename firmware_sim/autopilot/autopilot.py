@@ -24,7 +24,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     Severity,
 )
-from firmware_sim.autopilot.commander import READINESS, Event, Flight, Phase, transition
+from firmware_sim.autopilot.commander import READINESS, Ask, Event, Flight, Phase, transition
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
 from firmware_sim.autopilot.failsafe import FailsafeTimers
@@ -38,14 +38,6 @@ _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
-
-_MODE_EVENT = {
-    Mode.HOLD: Event.HOLD,
-    Mode.TAKEOFF: Event.TAKEOFF,
-    Mode.LAND: Event.LAND,
-    Mode.RETURN: Event.RETURN,
-    Mode.POSITION: Event.POSITION,
-}
 
 
 class BuiltinAutopilot:
@@ -126,14 +118,14 @@ class BuiltinAutopilot:
                 self._state, time_us, control.thrust, descending=control.descending
             ):
                 self._handle(Event.LANDED)
-            elif self._guidance.takeoff_done(self._state):
-                self._handle(Event.TAKEOFF_DONE)
+            elif self._guidance.is_done(self._state):
+                self._handle(Event.MODE_DONE)
         elif phase is _GROUND and self._land_detector.lifted(self._state, self._controller.thrust):
             self._handle(Event.LIFTED)
 
     # --- commander
 
-    def _handle(self, event: Event) -> Result:
+    def _handle(self, event: Ask | Event) -> Result:
         before = self.flight
         step = transition(before, event)
         self.flight, self._status = step.flight, _status(step.flight)
@@ -206,20 +198,19 @@ class BuiltinAutopilot:
     def takeoff(self, altitude_m: float | None) -> Result:
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
         default = self.parameters["MIS_TAKEOFF_ALT"]
-        self._guidance.takeoff_altitude_m = default if altitude_m is None else altitude_m
+        self._guidance.context.takeoff_altitude_m = default if altitude_m is None else altitude_m
         if altitude_m is None:
             text = f"Using default takeoff altitude: {default:.1f} m"
             self._say(Message(Severity.INFO, text))
-        return self._handle(Event.TAKEOFF)
+        return self._handle(Ask(Mode.TAKEOFF))
 
     def set_mode(self, mode: Mode) -> Result:
         """Ask for a mode."""
         if mode is Mode.OFFBOARD:
-            fresh = self._failsafe.setpoint_fresh(self._now_us)
-            return self._handle(Event.OFFBOARD if fresh else Event.OFFBOARD_BLIND)
+            return self._handle(Ask(mode, self._failsafe.setpoint_fresh(self._now_us)))
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
-        return self._handle(_MODE_EVENT[mode])
+        return self._handle(Ask(mode))
 
     def set_home_here(self) -> Result:
         """Make the present position home."""
@@ -230,7 +221,7 @@ class BuiltinAutopilot:
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
-        self._guidance.offer(setpoint)
+        self._guidance.context.setpoint = setpoint
         self._failsafe.setpoint(time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint, time_us)

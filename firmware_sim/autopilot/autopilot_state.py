@@ -41,6 +41,17 @@ class Mode(IntEnum):
     measured to brake and to descend to the ground."""
 
 
+MODE_NAMES = {
+    Mode.HOLD: "Hold",
+    Mode.TAKEOFF: "Takeoff",
+    Mode.OFFBOARD: "Offboard",
+    Mode.LAND: "Land",
+    Mode.RETURN: "Return",
+    Mode.POSITION: "Position",
+}
+"""As PX4's texts name them."""
+
+
 class Landed(IntEnum):
     """Landing detector."""
 

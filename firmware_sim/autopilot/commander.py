@@ -2,15 +2,16 @@
 
 Who may arm, which mode follows which, what is refused and with which text: as PX4 does it
 (measured on PX4 1.16 with MAVSDK 4.1). Timers and measurements that produce events live in
-`failsafe.py`; what a mode flies lives in `guidance.py`.
+`failsafe.py`; what a mode flies lives in `modes/`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
+from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Message, Mode, Result, Severity
 
 
 class Phase(IntEnum):
@@ -26,8 +27,16 @@ class Phase(IntEnum):
     """Armed, flying."""
 
 
+class Ask(NamedTuple):
+    """The user asks for a mode."""
+
+    mode: Mode
+    available: bool = True
+    """Whether the mode has what it needs; offboard: a fresh setpoint."""
+
+
 class Event(Enum):
-    """Everything that can happen to a flight."""
+    """Everything else that can happen to a flight."""
 
     READY = auto()
     """The estimator has converged."""
@@ -39,21 +48,12 @@ class Event(Enum):
     DISARM = auto()
     KILL = auto()
     """Forced disarm."""
-    HOLD = auto()
-    TAKEOFF = auto()
-    OFFBOARD = auto()
-    """Offboard requested, setpoints are fresh."""
-    OFFBOARD_BLIND = auto()
-    """Offboard requested without a fresh setpoint."""
-    LAND = auto()
-    RETURN = auto()
-    POSITION = auto()
     LIFTED = auto()
     """The landing detector sees flight."""
     LANDED = auto()
     """The landing detector sees ground."""
-    TAKEOFF_DONE = auto()
-    """Take-off altitude reached."""
+    MODE_DONE = auto()
+    """The mode has reached its end; take-off: its altitude."""
     DISARM_TIMEOUT = auto()
     """Armed on the ground for COM_DISARM_PRFLT."""
     LANDED_TIMEOUT = auto()
@@ -129,7 +129,6 @@ def _critical(text: str) -> Message:
 _IGNORE = Row()
 _TEMP = Result.TEMPORARILY_REJECTED
 _NO_ARM = Row(result=_TEMP, text=_critical("Arming denied: Resolve system health failures first"))
-_NO_OFFBOARD = Row(result=_TEMP, text=_critical("Switching to Offboard is currently not available"))
 _NOT_LANDED = Row(result=_TEMP, text=_critical("Disarming denied: not landed"))
 _B, _S, _G, _A = Phase
 _ARMED = Row(phase=_G, text=_info("Armed by external command"))
@@ -142,6 +141,22 @@ def _ask(mode: Mode, text: Message | None = None) -> Row:
     return Row(choice=Choice.ASK, mode=mode, text=text)
 
 
+def _unavailable(mode: Mode) -> Row:
+    text = f"Switching to {MODE_NAMES[mode]} is currently not available"
+    return Row(result=_TEMP, text=_critical(text))
+
+
+def _asked(mode: Mode) -> tuple[Row, Row, Row, Row]:
+    # Also on the ground and disarmed: accepted, the vehicle stays (as PX4 does it).
+    text = _FLYING_TEXT.get(mode)
+    return (_ask(mode), _ask(mode), _ask(mode, text), _ask(mode, text))
+
+
+def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
+    # Disarmed, PX4 grants every mode, and refuses to arm in one that lacks what it needs.
+    return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
+
+
 def _force(mode: Mode, text: str = "Failsafe activated") -> Row:
     return Row(choice=Choice.FORCE, mode=mode, text=_critical(text))
 
@@ -150,14 +165,16 @@ def _disarm(text: str) -> Row:
     return Row(phase=_S, choice=Choice.RESTORE, text=_info(text))
 
 
-_LANDING = _ask(Mode.LAND, _info("Landing at current position"))
+_FLYING_TEXT = {Mode.LAND: _info("Landing at current position")}
+"""What an armed vehicle says when it is asked for a mode."""
+
 _CUT = Row(phase=_S, choice=Choice.RESTORE, text=_critical("Failsafe activated: disarmed"))
 _LOW_RETURN = _force(Mode.RETURN, "Critical battery, returning now")
 _LOW_LAND = _force(Mode.LAND, "Critical battery, landing now")
 _DISARMED = _disarm("Disarmed by external command")
 _UNUSED = _disarm("Disarmed by auto preflight disarming")
 
-TABLE: dict[Event, tuple[Row, Row, Row, Row]] = {
+TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.READY: (Row(phase=_S), _IGNORE, _IGNORE, _IGNORE),
     # In the air there is no way back to the ground state: the estimate is flown as it is.
     Event.NOT_READY: (_IGNORE, Row(phase=_B), _IGNORE, _IGNORE),
@@ -165,17 +182,9 @@ TABLE: dict[Event, tuple[Row, Row, Row, Row]] = {
     Event.ARM_BLIND: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
     Event.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
     Event.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
-    Event.HOLD: (_ask(Mode.HOLD),) * 4,
-    # On the ground, disarmed: accepted, the vehicle stays (as PX4 does it).
-    Event.TAKEOFF: (_ask(Mode.TAKEOFF),) * 4,
-    Event.OFFBOARD: (_ask(Mode.OFFBOARD),) * 4,
-    Event.OFFBOARD_BLIND: (_ask(Mode.OFFBOARD), _ask(Mode.OFFBOARD), _NO_OFFBOARD, _NO_OFFBOARD),
-    Event.LAND: (_ask(Mode.LAND), _ask(Mode.LAND), _LANDING, _LANDING),
-    Event.RETURN: (_ask(Mode.RETURN),) * 4,
-    Event.POSITION: (_ask(Mode.POSITION),) * 4,
     Event.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
     Event.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
-    Event.TAKEOFF_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
+    Event.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
     Event.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
     Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm("Disarmed by landing"), _IGNORE),
     # On the ground the loss only drops out of offboard: nothing may take off by failsafe.
@@ -187,6 +196,8 @@ TABLE: dict[Event, tuple[Row, Row, Row, Row]] = {
     Event.SETPOINT_BACK: (_IGNORE, _IGNORE, _BACK, _BACK),
     Event.BATTERY_RETURN: (_IGNORE, _IGNORE, _IGNORE, _LOW_RETURN),
     Event.BATTERY_LAND: (_IGNORE, _IGNORE, _IGNORE, _LOW_LAND),
+    **{Ask(mode): _asked(mode) for mode in Mode},
+    **{Ask(mode, available=False): _asked_in_vain(mode) for mode in Mode},
 }
 """[event][phase]: what an event does in BOOT, STANDBY, GROUND and AIR; a test checks every pair."""
 
@@ -214,7 +225,7 @@ class Step:
     text: Message | None
 
 
-def transition(flight: Flight, event: Event) -> Step:
+def transition(flight: Flight, event: Ask | Event) -> Step:
     """Return what an event does to a flight."""
     row = TABLE[event][flight.phase]
     phase = flight.phase if row.phase is None else row.phase

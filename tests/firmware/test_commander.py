@@ -13,6 +13,7 @@ from firmware_sim.autopilot.autopilot_state import Mode, Result, Severity
 from firmware_sim.autopilot.commander import (
     READINESS,
     TABLE,
+    Ask,
     Event,
     Flight,
     Phase,
@@ -33,10 +34,13 @@ INTENDED = "intended"
 ARMED = (Severity.INFO, "Armed by external command")
 DISARMED = (Severity.INFO, "Disarmed by external command")
 NO_ARM = (Severity.CRITICAL, "Arming denied: Resolve system health failures first")
-NO_OFFBOARD = (Severity.CRITICAL, "Switching to Offboard is currently not available")
 NOT_LANDED = (Severity.CRITICAL, "Disarming denied: not landed")
 FAILSAFE = (Severity.CRITICAL, "Failsafe activated")
+LANDING = (Severity.INFO, "Landing at current position")
 CUT = (Severity.CRITICAL, "Failsafe activated: disarmed")
+
+EVENTS: list[Ask | Event] = [*Event, *(Ask(*each) for each in product(Mode, (True, False)))]
+
 
 # (event, phase) -> next phase, mode, failsafe after (None = as before), answer, text
 Expected = tuple[Phase, "Mode | str", "bool | None", Result, "tuple[Severity, str] | None"]
@@ -58,9 +62,13 @@ def forced(phase: Phase, mode: Mode, text: tuple[Severity, str] = FAILSAFE) -> E
     return (phase, mode, True, OK, text)
 
 
-EXPECTED: dict[tuple[Event, Phase], Expected] = {
+def unavailable(mode: Mode) -> tuple[Severity, str]:
+    return (Severity.CRITICAL, f"Switching to {mode.name.title()} is currently not available")
+
+
+EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {
     # Everything that is not listed below changes nothing and says nothing.
-    **{(event, phase): quiet(phase) for event, phase in product(Event, Phase)},
+    **{(event, phase): quiet(phase) for event, phase in product(EVENTS, Phase)},
     # Armable once the estimator has converged, and no longer when it loses it; never in flight.
     (Event.READY, BOOT): (STANDBY, SAME, None, OK, None),
     (Event.NOT_READY, STANDBY): (BOOT, SAME, None, OK, None),
@@ -75,24 +83,19 @@ EXPECTED: dict[tuple[Event, Phase], Expected] = {
     (Event.KILL, GROUND): disarmed(DISARMED),
     (Event.KILL, AIR): disarmed(DISARMED),
     # Modes may be chosen at any time, a take-off on the ground too.
-    **{(Event.HOLD, p): asked(p, Mode.HOLD) for p in Phase},
-    **{(Event.TAKEOFF, p): asked(p, Mode.TAKEOFF) for p in Phase},
-    **{(Event.OFFBOARD, p): asked(p, Mode.OFFBOARD) for p in Phase},
-    **{(Event.RETURN, p): asked(p, Mode.RETURN) for p in Phase},
-    **{(Event.POSITION, p): asked(p, Mode.POSITION) for p in Phase},
-    (Event.LAND, BOOT): asked(BOOT, Mode.LAND),
-    (Event.LAND, STANDBY): asked(STANDBY, Mode.LAND),
-    (Event.LAND, GROUND): asked(GROUND, Mode.LAND, (Severity.INFO, "Landing at current position")),
-    (Event.LAND, AIR): asked(AIR, Mode.LAND, (Severity.INFO, "Landing at current position")),
-    # Offboard without a setpoint: on the ground disarmed yes, else no.
-    (Event.OFFBOARD_BLIND, BOOT): asked(BOOT, Mode.OFFBOARD),
-    (Event.OFFBOARD_BLIND, STANDBY): asked(STANDBY, Mode.OFFBOARD),
-    (Event.OFFBOARD_BLIND, GROUND): (GROUND, SAME, None, NO, NO_OFFBOARD),
-    (Event.OFFBOARD_BLIND, AIR): (AIR, SAME, None, NO, NO_OFFBOARD),
+    **{(Ask(m), p): asked(p, m) for m, p in product(Mode, Phase)},
+    (Ask(Mode.LAND), GROUND): asked(GROUND, Mode.LAND, LANDING),
+    (Ask(Mode.LAND), AIR): asked(AIR, Mode.LAND, LANDING),
+    # A mode that lacks what it needs (offboard: a setpoint): on the ground disarmed yes, else no.
+    **{(Ask(m, available=False), p): asked(p, m) for m, p in product(Mode, (BOOT, STANDBY))},
+    **{
+        (Ask(m, available=False), p): (p, SAME, None, NO, unavailable(m))
+        for m, p in product(Mode, (GROUND, AIR))
+    },
     # The flight itself.
     (Event.LIFTED, GROUND): (AIR, SAME, None, OK, (Severity.INFO, "Takeoff detected")),
     (Event.LANDED, AIR): (GROUND, SAME, None, OK, (Severity.INFO, "Landing detected")),
-    (Event.TAKEOFF_DONE, AIR): asked(AIR, Mode.HOLD),
+    (Event.MODE_DONE, AIR): asked(AIR, Mode.HOLD),
     (Event.DISARM_TIMEOUT, GROUND): disarmed(
         (Severity.INFO, "Disarmed by auto preflight disarming")
     ),
@@ -132,16 +135,16 @@ FLIGHTS = [
 
 
 def test_every_event_has_a_row_for_every_phase() -> None:
-    assert list(TABLE) == list(Event)
+    assert set(TABLE) == set(EVENTS)
     assert all(len(rows) == len(Phase) for rows in TABLE.values())
 
 
-@pytest.mark.parametrize("event", list(Event), ids=lambda e: e.name)
-def test_every_cell(event: Event) -> None:
+@pytest.mark.parametrize("event", EVENTS, ids=str)
+def test_every_cell(event: Ask | Event) -> None:
     for flight in FLIGHTS:
         phase, mode, failsafe, result, text = EXPECTED[event, flight.phase]
         step = transition(flight, event)
-        where = f"{event.name} in {flight}"
+        where = f"{event} in {flight}"
         after = step.flight
         assert after.phase is phase, where
         choices = {SAME: flight.mode, RESTORED: flight.after_disarm, INTENDED: flight.intended}
@@ -153,8 +156,8 @@ def test_every_cell(event: Event) -> None:
         assert said == text, where
 
 
-@pytest.mark.parametrize("event", list(Event), ids=lambda e: e.name)
-def test_a_refusal_changes_nothing(event: Event) -> None:
+@pytest.mark.parametrize("event", EVENTS, ids=str)
+def test_a_refusal_changes_nothing(event: Ask | Event) -> None:
     for flight in FLIGHTS:
         step = transition(flight, event)
         if step.result is not OK:
@@ -186,24 +189,17 @@ def test_readiness_is_told_wherever_it_counts(flight: Flight, healthy: bool) -> 
 
 # --- any order of events
 
-USER_MODES = {
-    Event.HOLD: Mode.HOLD,
-    Event.TAKEOFF: Mode.TAKEOFF,
-    Event.OFFBOARD: Mode.OFFBOARD,
-    Event.LAND: Mode.LAND,
-    Event.RETURN: Mode.RETURN,
-    Event.POSITION: Mode.POSITION,
-}
 PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN}
 FORCING = {e for e in Event if e.name.startswith(("SETPOINT_LOST", "BATTERY"))}
 
 
-@given(st.lists(st.sampled_from(list(Event)), max_size=60))
-def test_invariants(events: list[Event]) -> None:
+@given(st.lists(st.sampled_from(EVENTS), max_size=60))
+def test_invariants(events: list[Ask | Event]) -> None:
     flight = Flight()
     lasting = Mode.HOLD
     for event in events:
-        before, flight = flight, transition(flight, event).flight
+        step = transition(flight, event)
+        before, flight = flight, step.flight
         # Nothing is armed that was not ready and asked to arm.
         if before.phase < GROUND <= flight.phase:
             assert (event, before.phase) == (Event.ARM, STANDBY)
@@ -219,16 +215,16 @@ def test_invariants(events: list[Event]) -> None:
         if flight.failsafe:
             assert flight.phase >= GROUND
             assert before.failsafe or event in FORCING
-            assert event not in USER_MODES
+            assert not isinstance(event, Ask) or step.result is NO
         else:
             assert flight.mode is flight.intended
         # What disarming returns to: the last lasting mode that was asked for and granted.
-        if event in USER_MODES or event is Event.OFFBOARD_BLIND:
-            granted = event is not Event.OFFBOARD_BLIND or before.phase < GROUND
-            mode = USER_MODES.get(event, Mode.OFFBOARD)
-            if granted and mode not in PASSING:
-                lasting = mode
-        elif event is Event.TAKEOFF_DONE and before.phase is AIR:
+        if isinstance(event, Ask):
+            granted = event.available or before.phase < GROUND
+            assert (step.result is OK) is granted
+            if granted and event.mode not in PASSING:
+                lasting = event.mode
+        elif event is Event.MODE_DONE and before.phase is AIR:
             lasting = Mode.HOLD
         assert flight.after_disarm is lasting
         if before.phase >= GROUND > flight.phase:
@@ -241,8 +237,10 @@ def test_invariants(events: list[Event]) -> None:
         assert transition(flight, Event.KILL).flight.phase < GROUND
 
 
-@given(st.lists(st.sampled_from(list(Event)), max_size=30))
-def test_a_flight_that_loses_its_setpoints_gets_back_what_was_asked(events: list[Event]) -> None:
+@given(st.lists(st.sampled_from(EVENTS), max_size=30))
+def test_a_flight_that_loses_its_setpoints_gets_back_what_was_asked(
+    events: list[Ask | Event],
+) -> None:
     flight = Flight()
     for event in events:
         flight = transition(flight, event).flight

@@ -1,0 +1,27 @@
+"""Flight modes, one file each: what a mode flies. To add one: write its file, enter it below."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.modes.hold import Hold
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode
+from firmware_sim.autopilot.modes.land import Land
+from firmware_sim.autopilot.modes.offboard import Offboard
+from firmware_sim.autopilot.modes.position import Position
+from firmware_sim.autopilot.modes.return_to_launch import ReturnToLaunch
+from firmware_sim.autopilot.modes.takeoff import Takeoff
+
+MODES: Mapping[Mode, Callable[[FlightContext], FlightMode]] = MappingProxyType(
+    {
+        Mode.HOLD: Hold,
+        Mode.TAKEOFF: Takeoff,
+        Mode.OFFBOARD: Offboard,
+        Mode.LAND: Land,
+        Mode.RETURN: ReturnToLaunch,
+        Mode.POSITION: Position,
+    }
+)
+"""What flies each mode."""

@@ -1,0 +1,58 @@
+"""Land: stop, then descend there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from airl_mav.control.cascade import Demand
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.modes.interface import (
+    FREE,
+    NAN,
+    FlightContext,
+    FlightMode,
+    Place,
+    here,
+    over,
+    triple,
+)
+
+STANDING_M_S = 0.3
+"""From this horizontal speed on the descent keeps to a place [m/s]."""
+
+
+class Land(FlightMode):
+    """Descends where the vehicle came to rest, slower and slower as PX4 does."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._place = Place((0.0, 0.0, 0.0), 0.0)
+        self._stopping = False
+
+    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+        """Begin at the present place."""
+        self._place, self._stopping = here(state), True
+
+    def demand(self, state: Vector, _time_us: int, /) -> Demand:
+        """Stop first, then hold that place; descend all the while."""
+        speed = landing_speed(self._context.value, self._context.height(state))
+        if self._stopping:
+            north, east, _ = triple(state, V)
+            if math.hypot(north, east) > STANDING_M_S:
+                self._place = self._place._replace(position=triple(state, P))
+                return Demand(FREE, (0.0, 0.0, speed), self._place.yaw, NAN)
+            self._stopping = False
+        return over(self._place, speed)
+
+
+def landing_speed(value: Callable[[str], float], height_m: float) -> float:
+    """Return how fast to descend [m/s]: PX4 slows down linearly between two heights [m]."""
+    low, high = value("MPC_LAND_ALT2"), value("MPC_LAND_ALT1")
+    slow, fast = value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")
+    if height_m <= low:
+        return slow
+    if height_m >= high:
+        return fast
+    return slow + (fast - slow) / (high - low) * (height_m - low)

@@ -1,0 +1,67 @@
+"""Take-off: climb above the place where it began."""
+
+from __future__ import annotations
+
+from airl_mav.control.cascade import Demand
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.climb import ClimbLimits
+from firmware_sim.autopilot.error_state import V
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, Place, here, over
+
+
+class Takeoff(FlightMode):
+    """Climbs to `FlightContext.takeoff_altitude_m`, gently near the ground."""
+
+    lifts = True
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._place = Place((0.0, 0.0, 0.0), 0.0)
+
+    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+        """Begin the climb at the present place."""
+        self._context.climb.restart(max(0.0, -state.item(V + 2)))
+        self._place = here(state)
+
+    def demand(self, state: Vector, time_us: int, /) -> Demand:
+        """Climb on."""
+        # The trajectory stays where the vehicle is: it must not wait below the ground while the
+        # thrust ramps up, nor be chased after it.
+        climb = self._context.climb
+        climb.height_m = self._context.height(state)
+        climb_on(self._context, time_us, near_ground=True)
+        return over(self._place, -climb.speed_m_s)
+
+    def destination(self, state: Vector, /) -> Place | None:
+        """Return the altitude above the place where it began, once it is near: hold goes on."""
+        if not self.is_done(state):
+            return None
+        north, east, _ = self._place.position
+        down = self._context.home[2] - self._context.takeoff_altitude_m
+        return Place((north, east, down), self._place.yaw)
+
+    def is_done(self, state: Vector, /) -> bool:
+        """Return whether the take-off has come near its altitude, by PX4's acceptance radius.
+
+        Source: PX4 1.16, MissionBlock; half of an altitude that is smaller than the radius.
+        """
+        altitude, radius = self._context.takeoff_altitude_m, self._context.value("NAV_MC_ALT_RAD")
+        near = altitude / 2.0 if altitude < radius else radius
+        return self._context.height(state) > altitude - near
+
+
+def climb_on(context: FlightContext, time_us: int, *, near_ground: bool) -> None:
+    """Advance the trajectory towards the take-off altitude, gently where that is near the ground.
+
+    The limits are those of PX4's FlightTaskAuto.
+    """
+    climb, target, value = context.climb, context.takeoff_altitude_m, context.value
+    jerk = value("MPC_JERK_AUTO")
+    if target > climb.height_m:
+        speed, acceleration = value("MPC_Z_V_AUTO_UP"), value("MPC_ACC_UP_MAX")
+        if near_ground and climb.height_m < value("MPC_LAND_ALT1"):
+            speed = value("MPC_TKO_SPEED")
+            acceleration = min(acceleration, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
+    else:
+        speed, acceleration = value("MPC_Z_V_AUTO_DN"), value("MPC_ACC_DOWN_MAX")
+    climb.towards(target, ClimbLimits(speed, acceleration, jerk), time_us)
