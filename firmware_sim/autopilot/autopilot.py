@@ -31,6 +31,8 @@ from firmware_sim.autopilot.failsafe import FailsafeTimers
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
@@ -49,6 +51,8 @@ class BuiltinAutopilot:
         """Boot: not armable until the estimator, whose filter `new_filter` makes, has converged."""
         self.parameters = parameters
         """The parameter store."""
+        self.plans = Plans()
+        """The mission, the geofence and the rally points that are stored aboard."""
         value = parameters.value
         self.estimator = Estimator(value, new_filter)
         """For consistency checks."""
@@ -262,6 +266,7 @@ class BuiltinAutopilot:
             gps=self._gps,
             home=self._home,
             origin=self.estimator.origin,
+            mission=progress(self.plans),
         )
         return self._snapshot
 

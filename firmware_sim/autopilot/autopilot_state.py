@@ -138,6 +138,22 @@ class CommanderStatus(NamedTuple):
     failsafe: bool
 
 
+class MissionProgress(NamedTuple):
+    """How far the mission has come."""
+
+    current: int = 0
+    """Index of the item that is flown, or will be when the mission goes on."""
+    total: int = 0
+    """Number of items; 0 = no mission is stored."""
+    mission_id: int = 0
+    """PX4's opaque id of the mission; 0 = none, as of the two below."""
+    fence_id: int = 0
+    rally_points_id: int = 0
+
+
+NO_MISSION = MissionProgress()
+
+
 class AutopilotState(NamedTuple):
     """One consistent snapshot after a tick."""
 
@@ -165,3 +181,4 @@ class AutopilotState(NamedTuple):
     """The point of the globe where local NED is zero; None before the first fix."""
     load: float = 0.0
     """Share of the tick spent computing, 0..1."""
+    mission: MissionProgress = NO_MISSION

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.interfaces import SensorSample
 
 
@@ -45,6 +46,11 @@ class AutopilotPort(Protocol):
     @property
     def parameters(self) -> ParameterStore:
         """The parameter store."""
+        ...
+
+    @property
+    def plans(self) -> Plans:
+        """The mission, the geofence and the rally points that are stored aboard."""
         ...
 
     @property

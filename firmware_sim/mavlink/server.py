@@ -10,7 +10,7 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.senders import Senders
-from firmware_sim.mavlink.services import handle, params, peers
+from firmware_sim.mavlink.services import handle, missions, params, peers
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
 from firmware_sim.mavlink.streams.status import system_time
@@ -134,7 +134,9 @@ class MavlinkServer:
                     session.announced_origin = state.origin
                     link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
             if session.context is not None:
+                session.context.now_us = now_us
                 params.send_pending(session.context)
+                missions.send_pending(session.context)
             if state is not None:
                 link.stream_due(due, state, payloads)
             link.flush()

@@ -1,10 +1,9 @@
-"""Time, ping, missions, files, heartbeats and texts."""
+"""Time, ping, files, heartbeats and texts."""
 
 from __future__ import annotations
 
 import math
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
@@ -50,31 +49,6 @@ def test_ping(rig: Rig) -> None:
     assert (answer.target_system, answer.target_component) == CLIENT_IDS
     rig.bench.run(3.0)
     assert np.diff([m.seq for m in rig.client.received("PING")]).tolist() == [1, 1]
-
-
-@pytest.mark.parametrize("kind", [0, 1, 2])
-def test_there_are_no_missions(rig: Rig, kind: int) -> None:
-    def ask(message: Any, answer: str) -> Any:
-        (found,) = [m for m in rig.exchange(message) if m.get_type() == answer]
-        assert (found.target_system, found.target_component) == CLIENT_IDS
-        assert found.mission_type == kind
-        return found
-
-    listed = ask(dialect.MAVLink_mission_request_list_message(1, 1, kind), "MISSION_COUNT")
-    assert listed.count == 0
-    for message, result in (
-        (dialect.MAVLink_mission_count_message(1, 1, 3, kind), 3),  # UNSUPPORTED
-        (dialect.MAVLink_mission_count_message(1, 190, 0, kind), 0),
-        (dialect.MAVLink_mission_clear_all_message(1, 0, kind), 0),
-        (dialect.MAVLink_mission_request_int_message(1, 1, 0, kind), 13),  # INVALID_SEQUENCE
-        (dialect.MAVLink_mission_write_partial_list_message(1, 1, 0, 1, kind), 3),
-    ):
-        assert ask(message, "MISSION_ACK").type == result
-    assert not [
-        m
-        for m in rig.exchange(dialect.MAVLink_mission_request_list_message(2, 1, kind))
-        if m.get_type() == "MISSION_COUNT"
-    ]
 
 
 @pytest.mark.parametrize("opcode", [0, 1, 2, 3, 4, 14, 15])

@@ -25,6 +25,8 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
     Vector,
 )
+from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import ParameterValue
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
@@ -85,6 +87,7 @@ class KinematicAutopilot:
 
     def __init__(self, parameters: Parameters | None = None, start_us: int = 0) -> None:
         self.parameters = parameters or Parameters()
+        self.plans = Plans()
         self.time_us = start_us
         self.ready_us = start_us + READY_US
         self.position = np.zeros(3)
@@ -211,6 +214,7 @@ class KinematicAutopilot:
             home=self.home,
             origin=self.origin,
             load=0.123,
+            mission=progress(self.plans),
         )
 
     # --- flying ---

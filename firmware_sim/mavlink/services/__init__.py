@@ -10,6 +10,7 @@ from firmware_sim.mavlink.services import (
     absent,
     commands,
     data_streams,
+    missions,
     params,
     peers,
     setpoints,
@@ -38,8 +39,15 @@ HANDLERS: Mapping[str, tuple[Callable[[WireMessage], bool], Handler]] = MappingP
         "PING": (_for_anyone, peers.handle_ping),
         "TIMESYNC": (_for_anyone, peers.handle_timesync),
         "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, absent.handle_file_transfer),
-        "MISSION_REQUEST_LIST": (absent.is_for_planner, absent.handle_download),
-        **dict.fromkeys(absent.MISSION_RESULTS, (absent.is_for_planner, absent.acknowledge)),
+        "MISSION_REQUEST_LIST": (missions.is_addressed, missions.handle_list),
+        "MISSION_REQUEST": (missions.is_addressed, missions.handle_request),
+        "MISSION_REQUEST_INT": (missions.is_addressed, missions.handle_request),
+        "MISSION_ACK": (missions.is_addressed, missions.handle_ack),
+        "MISSION_COUNT": (missions.is_addressed, missions.handle_count),
+        "MISSION_ITEM": (missions.is_addressed, missions.handle_item),
+        "MISSION_ITEM_INT": (missions.is_addressed, missions.handle_item),
+        "MISSION_CLEAR_ALL": (missions.is_addressed, missions.handle_clear),
+        "MISSION_SET_CURRENT": (missions.is_addressed, missions.handle_set_current),
     }
 )
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
+from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
 
 ANY = 0
 """System or component id of a broadcast."""
@@ -28,6 +29,8 @@ class Context:
     """Sends a message on all links."""
     next_parameter: int | None = None
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
+    transfer: MissionTransfer = field(default_factory=MissionTransfer)
+    """The link's part in the mission protocol."""
 
 
 def for_vehicle(message: WireMessage) -> bool:

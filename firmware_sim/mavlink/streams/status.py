@@ -17,9 +17,13 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
+    | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
 )
-"""Of a real PX4's 0xE8FF only what is true here: no missions, fence, rally points, FTP, attitude
-setpoints or flight termination."""
+"""Of a real PX4's 0xE8FF only what is true here: no FTP, attitude setpoints or flight
+termination."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
 """The PX4 release whose behaviour is emulated: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
@@ -35,6 +39,12 @@ _UID = 0x4149_524C_4D41_5601
 
 _MAVLINK_VERSION = 3
 """HEARTBEAT.mavlink_version of all MAVLink 1 and 2 systems."""
+
+_NO_MISSION = 0xFFFF
+"""MISSION_CURRENT.total where no mission is stored."""
+
+_UNKNOWN_STATE = 0
+"""MISSION_CURRENT's mission_state and mission_mode: PX4 leaves them."""
 
 _NO_ERRORS = (0, 0, 0, 0, 0, 0)
 """SYS_STATUS: drop rate, communication errors, errors 1..4."""
@@ -130,10 +140,12 @@ def estimator_status(state: AutopilotState) -> Values:
     return estimate.time_us, flags, *ratios, math.hypot(north, east), down
 
 
-def mission_current(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
-    """There is no mission."""
-    sequence, total = 0, 0
-    return sequence, total, dialect.MISSION_STATE_NO_MISSION
+def mission_current(state: AutopilotState) -> Values:
+    """The current item, how many there are, and the ids of what is stored; PX4 says no more."""
+    mission = state.mission
+    total = mission.total or _NO_MISSION
+    ids = (mission.mission_id, mission.fence_id, mission.rally_points_id)
+    return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
 
 
 def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder

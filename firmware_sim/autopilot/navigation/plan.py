@@ -1,0 +1,208 @@
+"""What a ground station stores aboard: the mission, the geofence, rally points.
+
+Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+from airl_mav.core.frames import Geodetic
+
+
+class NavCommand(IntEnum):
+    """The MAV_CMD of plan items that the autopilot gives a meaning; the numbers are MAVLink's."""
+
+    WAYPOINT = 16
+    LOITER_UNLIM = 17
+    LOITER_TIME = 19
+    RETURN_TO_LAUNCH = 20
+    LAND = 21
+    TAKEOFF = 22
+    LOITER_TO_ALT = 31
+    ROI = 80
+    VTOL_TAKEOFF = 84
+    VTOL_LAND = 85
+    DELAY = 93
+    CONDITION_DELAY = 112
+    CONDITION_DISTANCE = 114
+    DO_JUMP = 177
+    DO_CHANGE_SPEED = 178
+    DO_SET_HOME = 179
+    DO_LAND_START = 189
+    DO_SET_ROI_LOCATION = 195
+    DO_SET_ROI_WPNEXT_OFFSET = 196
+    DO_SET_ROI_NONE = 197
+    DO_CONTROL_VIDEO = 200
+    DO_SET_ROI = 201
+    DO_DIGICAM_CONTROL = 202
+    DO_MOUNT_CONFIGURE = 204
+    DO_MOUNT_CONTROL = 205
+    DO_SET_CAM_TRIGG_DIST = 206
+    DO_SET_ACTUATOR = 187
+    DO_GRIPPER = 211
+    DO_SET_CAM_TRIGG_INTERVAL = 214
+    OBLIQUE_SURVEY = 260
+    SET_CAMERA_MODE = 530
+    SET_CAMERA_ZOOM = 531
+    SET_CAMERA_FOCUS = 532
+    SET_CAMERA_SOURCE = 534
+    DO_GIMBAL_MANAGER_PITCHYAW = 1000
+    DO_GIMBAL_MANAGER_CONFIGURE = 1001
+    IMAGE_START_CAPTURE = 2000
+    IMAGE_STOP_CAPTURE = 2001
+    DO_TRIGGER_CONTROL = 2003
+    VIDEO_START_CAPTURE = 2500
+    VIDEO_STOP_CAPTURE = 2501
+    DO_VTOL_TRANSITION = 3000
+    CONDITION_GATE = 4501
+    FENCE_RETURN_POINT = 5000
+    FENCE_POLYGON_VERTEX_INCLUSION = 5001
+    FENCE_POLYGON_VERTEX_EXCLUSION = 5002
+    FENCE_CIRCLE_INCLUSION = 5003
+    FENCE_CIRCLE_EXCLUSION = 5004
+    RALLY_POINT = 5100
+    DO_WINCH = 42600
+
+
+class Frame(IntEnum):
+    """MAV_FRAME of plan items."""
+
+    GLOBAL = 0
+    MISSION = 2
+    """No place: seven parameters."""
+    GLOBAL_RELATIVE_ALT = 3
+    GLOBAL_INT = 5
+    GLOBAL_RELATIVE_ALT_INT = 6
+
+
+class Kind(IntEnum):
+    """MAV_MISSION_TYPE."""
+
+    MISSION = 0
+    FENCE = 1
+    RALLY = 2
+
+
+MOST_ITEMS = {Kind.MISSION: 65_534, Kind.FENCE: 64, Kind.RALLY: 32}
+"""How many items a list may have, as in PX4's SITL."""
+
+POSITION_COMMANDS = frozenset(
+    {
+        NavCommand.WAYPOINT,
+        NavCommand.LOITER_UNLIM,
+        NavCommand.LOITER_TIME,
+        NavCommand.LAND,
+        NavCommand.TAKEOFF,
+        NavCommand.LOITER_TO_ALT,
+        NavCommand.VTOL_TAKEOFF,
+        NavCommand.VTOL_LAND,
+    }
+)
+"""Commands that have a place to fly to (MissionBlock::item_contains_position)."""
+
+_RELATIVE = (Frame.GLOBAL_RELATIVE_ALT, Frame.GLOBAL_RELATIVE_ALT_INT)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanItem:
+    """One item of a mission, fence or list of rally points."""
+
+    command: int
+    """MAV_CMD."""
+    frame: int
+    """MAV_FRAME."""
+    params: tuple[float, float, float, float]
+    """Parameters 1..4; angles in degrees as on the wire, NaN = not given."""
+    x: float
+    """Latitude [deg]; in the frame MISSION parameter 5."""
+    y: float
+    """Longitude [deg]; in the frame MISSION parameter 6."""
+    z: float
+    """Altitude [m], by the frame above mean sea level or above home; else parameter 7."""
+    autocontinue: bool = True
+    """Whether the mission goes on by itself once the item is reached."""
+
+    @property
+    def has_position(self) -> bool:
+        """Whether there is a place to fly to."""
+        return self.command in POSITION_COMMANDS
+
+    @property
+    def altitude_is_relative(self) -> bool:
+        """Whether the altitude counts from home."""
+        return self.frame in _RELATIVE
+
+    def place(self, home_altitude_m: float) -> Geodetic:
+        """Return where it is, for a home at an altitude above mean sea level [m]."""
+        above = home_altitude_m if self.altitude_is_relative else 0.0
+        return Geodetic(self.x, self.y, self.z + above)
+
+
+class Stored(NamedTuple):
+    """One list of items."""
+
+    items: tuple[PlanItem, ...] = ()
+    identity: int = 0
+    """PX4's opaque id of the list, a checksum; 0 = empty."""
+    revision: int = 0
+    """Rises with every change."""
+
+
+class Plans:
+    """All that is stored aboard, and how far the mission has come: PX4's dataman.
+
+    It lives as long as the autopilot, through landings and disarming.
+    """
+
+    def __init__(self) -> None:
+        self._stored = {kind: Stored() for kind in Kind}
+        self.current = 0
+        """Index of the mission item that is flown, or will be when the mission goes on."""
+        self.set_current_count = 0
+        """Rises whenever a client chooses the current item."""
+        self.reached = -1
+        """Index of the newest item that was reached; -1 = none in this run."""
+        self.jumps_done: dict[int, int] = {}
+        """How often each DO_JUMP has been carried out, by index."""
+        self.jumped = -1
+        """Index of the newest DO_JUMP whose count has changed; -1 = none."""
+        self.receiving = False
+        """Whether a list is being uploaded, on any link."""
+
+    def stored(self, kind: Kind) -> Stored:
+        """Return a list."""
+        return self._stored[kind]
+
+    @property
+    def mission(self) -> tuple[PlanItem, ...]:
+        """The mission's items."""
+        return self._stored[Kind.MISSION].items
+
+    def store(
+        self, kind: Kind, items: tuple[PlanItem, ...], identity: int, current: int = -1
+    ) -> None:
+        """Replace a list.
+
+        `current` is the mission item to begin with; -1 = the present index, if there is such an
+        item.
+        """
+        self._stored[kind] = Stored(items, identity, self._stored[kind].revision + 1)
+        if kind is Kind.MISSION:
+            self.current = current if current >= 0 else min(self.current, max(0, len(items) - 1))
+            self.jumps_done.clear()
+            self.jumped = -1
+            self.reached = -1
+
+    def clear(self, kind: Kind) -> None:
+        """Forget a list."""
+        self.store(kind, (), 0, 0)
+
+    def set_current(self, index: int) -> None:
+        """Choose the mission item to go on with, as a client asks. Raises IndexError."""
+        if not 0 <= index < len(self.mission):
+            raise IndexError(f"mission item {index}: there are {len(self.mission)}")
+        self.current = index
+        self.set_current_count += 1

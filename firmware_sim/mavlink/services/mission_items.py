@@ -1,0 +1,244 @@
+"""Plan items on the wire: MISSION_ITEM and MISSION_ITEM_INT to and from `plan.PlanItem`.
+
+What is stored of an item, what is refused and what a download returns follow PX4 1.16
+(MavlinkMissionManager::parse_mavlink_mission_item, format_mavlink_mission_item).
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
+from firmware_sim.mavlink.codec import WireMessage, dialect
+
+_N = NavCommand
+
+_GLOBAL_FRAMES = (Frame.GLOBAL, Frame.GLOBAL_RELATIVE_ALT)
+_INT_FRAMES = (Frame.GLOBAL_INT, Frame.GLOBAL_RELATIVE_ALT_INT)
+
+_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX, _ROI_LOCATION = 0, 1, 2, 3
+"""MAV_ROI."""
+
+_Kept = Callable[[float], float]
+
+
+def _as_is(value: float) -> float:
+    return value
+
+
+def _nothing(value: float) -> float:  # noqa: ARG001 - a parameter that PX4 does not keep
+    return 0.0
+
+
+def _flag(value: float) -> float:
+    return 1.0 if value > 0.0 else 0.0
+
+
+def _heading(value: float) -> float:
+    return value % 360.0
+
+
+def _whole(value: float) -> float:
+    return float(int(value)) if math.isfinite(value) else 0.0
+
+
+def _rounded(value: float) -> float:
+    return float(int(value + 0.5)) if math.isfinite(value) else 0.0
+
+
+_PLACES: Mapping[int, tuple[_Kept, _Kept, _Kept, _Kept]] = MappingProxyType(
+    {
+        _N.WAYPOINT: (_as_is, _as_is, _nothing, _heading),
+        _N.LOITER_UNLIM: (_nothing, _nothing, _as_is, _heading),
+        _N.LOITER_TIME: (_as_is, _flag, _as_is, _flag),
+        _N.LAND: (_nothing, _whole, _nothing, _heading),
+        _N.TAKEOFF: (_nothing, _nothing, _nothing, _heading),
+        _N.LOITER_TO_ALT: (_flag, _as_is, _nothing, _flag),
+        _N.ROI: (_nothing, _nothing, _nothing, _nothing),
+        _N.DO_SET_ROI: (_nothing, _nothing, _nothing, _nothing),
+        _N.DO_SET_ROI_LOCATION: (_nothing, _nothing, _nothing, _nothing),
+        _N.VTOL_TAKEOFF: (_nothing, _nothing, _nothing, _heading),
+        _N.VTOL_LAND: (_nothing, _nothing, _nothing, _heading),
+        _N.CONDITION_GATE: (_nothing, _nothing, _nothing, _nothing),
+        _N.FENCE_RETURN_POINT: (_nothing, _nothing, _nothing, _nothing),
+        _N.FENCE_POLYGON_VERTEX_INCLUSION: (_rounded, _nothing, _nothing, _nothing),
+        _N.FENCE_POLYGON_VERTEX_EXCLUSION: (_rounded, _nothing, _nothing, _nothing),
+        _N.FENCE_CIRCLE_INCLUSION: (_as_is, _nothing, _nothing, _nothing),
+        _N.FENCE_CIRCLE_EXCLUSION: (_as_is, _nothing, _nothing, _nothing),
+        _N.RALLY_POINT: (_nothing, _nothing, _nothing, _nothing),
+    }
+)
+"""Commands with a place, and what a download returns of their parameters 1..4."""
+
+_WITHOUT_PLACE = frozenset(
+    {
+        _N.RETURN_TO_LAUNCH,
+        _N.ROI,
+        _N.DELAY,
+        _N.CONDITION_DELAY,
+        _N.CONDITION_DISTANCE,
+        _N.DO_JUMP,
+        _N.DO_CHANGE_SPEED,
+        _N.DO_SET_HOME,
+        _N.DO_SET_ACTUATOR,
+        _N.DO_LAND_START,
+        _N.DO_SET_ROI,
+        _N.DO_SET_ROI_WPNEXT_OFFSET,
+        _N.DO_SET_ROI_NONE,
+        _N.DO_CONTROL_VIDEO,
+        _N.DO_DIGICAM_CONTROL,
+        _N.DO_MOUNT_CONFIGURE,
+        _N.DO_MOUNT_CONTROL,
+        _N.DO_SET_CAM_TRIGG_DIST,
+        _N.DO_SET_CAM_TRIGG_INTERVAL,
+        _N.OBLIQUE_SURVEY,
+        _N.DO_GRIPPER,
+        _N.DO_WINCH,
+        _N.SET_CAMERA_MODE,
+        _N.SET_CAMERA_FOCUS,
+        _N.SET_CAMERA_SOURCE,
+        _N.DO_GIMBAL_MANAGER_PITCHYAW,
+        _N.DO_GIMBAL_MANAGER_CONFIGURE,
+        _N.IMAGE_START_CAPTURE,
+        _N.IMAGE_STOP_CAPTURE,
+        _N.DO_TRIGGER_CONTROL,
+        _N.VIDEO_START_CAPTURE,
+        _N.VIDEO_STOP_CAPTURE,
+        _N.DO_VTOL_TRANSITION,
+    }
+)
+"""Commands of the frame MISSION."""
+
+_NOT_IN_MISSIONS = frozenset(
+    {
+        _N.FENCE_POLYGON_VERTEX_INCLUSION,
+        _N.FENCE_POLYGON_VERTEX_EXCLUSION,
+        _N.FENCE_CIRCLE_INCLUSION,
+        _N.FENCE_CIRCLE_EXCLUSION,
+        _N.RALLY_POINT,
+    }
+)
+_POLYGONS = (_N.FENCE_POLYGON_VERTEX_INCLUSION, _N.FENCE_POLYGON_VERTEX_EXCLUSION)
+
+_CHECKED = struct.Struct("<BHB4f4s4sf")
+"""What PX4's checksum covers: frame, command, autocontinue, parameters 1..4, x, y, z."""
+
+
+def is_int(message: WireMessage) -> bool:
+    """Return whether an item came as MISSION_ITEM_INT."""
+    return bool(message.get_type() == "MISSION_ITEM_INT")
+
+
+def parse(message: WireMessage) -> PlanItem | int:
+    """Return the item of a MISSION_ITEM(_INT), or the MAV_MISSION_RESULT that refuses it."""
+    frame, command, integer = message.frame, message.command, is_int(message)
+    params = (message.param1, message.param2, message.param3, message.param4)
+    x, y = float(message.x), float(message.y)
+    roi = command in (_N.ROI, _N.DO_SET_ROI)
+    if frame in _GLOBAL_FRAMES or (integer and frame in _INT_FRAMES):
+        if command not in _PLACES:
+            return int(dialect.MAV_MISSION_UNSUPPORTED)
+        if roi and _whole(message.param1) not in (_ROI_NONE, _ROI_LOCATION):
+            return int(dialect.MAV_MISSION_INVALID_PARAM1)
+        if integer:
+            x, y = x * 1e-7, y * 1e-7
+    elif frame == Frame.MISSION:
+        if command not in _WITHOUT_PLACE:
+            return int(dialect.MAV_MISSION_UNSUPPORTED)
+        if roi and _whole(message.param1) not in (_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX):
+            return int(dialect.MAV_MISSION_INVALID_PARAM1)
+    else:
+        return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
+    if command == _N.ROI:
+        command = int(_N.DO_SET_ROI)
+    return PlanItem(command, frame, params, x, y, float(message.z), bool(message.autocontinue))
+
+
+def belongs(item: PlanItem, kind: Kind) -> bool:
+    """Return whether an item may be part of such a list; a polygon has at least 3 vertices."""
+    if kind is Kind.MISSION:
+        return item.command not in _NOT_IN_MISSIONS
+    if kind is Kind.FENCE and item.command in _POLYGONS:
+        return _rounded(item.params[0]) >= 3
+    return True
+
+
+def format_item(
+    item: PlanItem,
+    kind: Kind,
+    index: int,
+    target: tuple[int, int],
+    *,
+    current: bool,
+    integer: bool,
+) -> WireMessage:
+    """Return the MISSION_ITEM_INT (or MISSION_ITEM) that a download returns."""
+    x: float = item.x
+    y: float = item.y
+    if item.frame == Frame.MISSION:
+        frame, params = int(Frame.MISSION), item.params
+        if item.command == _N.DO_JUMP:
+            params = (_whole(params[0]), _whole(params[1]), params[2], params[3])
+        x, y = (_fit(x), _fit(y)) if integer else (x, y)
+    else:
+        # PX4 does not keep the frame of a fence's points: it says global.
+        frame = _frame(
+            relative=item.altitude_is_relative and kind is not Kind.FENCE, integer=integer
+        )
+        kept = _PLACES[item.command]
+        first, second, third, fourth = (f(p) for f, p in zip(kept, item.params, strict=True))
+        params = (first, second, third, fourth)
+        x, y = (_fit(x * 1e7), _fit(y * 1e7)) if integer else (x, y)
+    build = (
+        dialect.MAVLink_mission_item_int_message
+        if integer
+        else dialect.MAVLink_mission_item_message
+    )
+    return build(
+        *target,
+        index,
+        frame,
+        item.command,
+        int(current),
+        int(item.autocontinue),
+        *params,
+        x,
+        y,
+        item.z,
+        int(kind),
+    )
+
+
+def _frame(*, relative: bool, integer: bool) -> int:
+    if integer:
+        return int(Frame.GLOBAL_RELATIVE_ALT_INT if relative else Frame.GLOBAL_INT)
+    return int(Frame.GLOBAL_RELATIVE_ALT if relative else Frame.GLOBAL)
+
+
+def _fit(value: float) -> int:
+    """Return a coordinate as an int32."""
+    if not math.isfinite(value):
+        return 0
+    return max(-(2**31), min(2**31 - 1, round(value)))
+
+
+def checksum(message: WireMessage, previous: int) -> int:
+    """Return PX4's checksum of a list with one more item: its opaque id (CRC-32, no inversion)."""
+    pack = struct.Struct("<i" if is_int(message) else "<f").pack
+    covered = _CHECKED.pack(
+        message.frame,
+        message.command,
+        message.autocontinue,
+        message.param1,
+        message.param2,
+        message.param3,
+        message.param4,
+        pack(message.x),
+        pack(message.y),
+        message.z,
+    )
+    return zlib.crc32(covered, previous ^ 0xFFFF_FFFF) ^ 0xFFFF_FFFF

@@ -1,0 +1,336 @@
+"""The mission protocol: missions, the geofence and rally points, up, down, cleared, chosen.
+
+Answers, refusals and texts follow PX4 1.16 (MavlinkMissionManager). Each link has one transfer at
+a time; an upload blocks uploads on all links. What PX4 passes over in silence (an item out of
+turn, MISSION_WRITE_PARTIAL_LIST) has no answer here either.
+https://mavlink.io/en/services/mission.html
+"""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage, dialect
+from firmware_sim.mavlink.services import mission_items
+from firmware_sim.mavlink.services.context import ANY, Context, sender
+from firmware_sim.mavlink.services.mission_transfer import RETRY_US, TIMEOUT_US, Activity
+
+_IDLE, _SENDING, _RECEIVING = Activity.IDLE, Activity.SENDING, Activity.RECEIVING
+_PLANNERS = (COMPONENT_ID, ANY, dialect.MAV_COMP_ID_MISSIONPLANNER)
+
+ALL: int = dialect.MAV_MISSION_TYPE_ALL
+_ACCEPTED: int = dialect.MAV_MISSION_ACCEPTED
+_ERROR: int = dialect.MAV_MISSION_ERROR
+
+REPEATS = 10
+"""How often MISSION_ITEM_REACHED is sent again, each after REPEAT_US."""
+REPEAT_US = 1_000_000
+
+
+def is_addressed(message: WireMessage) -> bool:
+    """Return whether a message is for this vehicle's missions."""
+    return bool(message.target_system == SYSTEM_ID and message.target_component in _PLANNERS)
+
+
+# --- downloads
+
+
+def handle_list(message: WireMessage, context: Context) -> bool:
+    """MISSION_REQUEST_LIST: begin a download with the number of items."""
+    transfer = context.transfer
+    partner = sender(message)
+    if transfer.activity is _SENDING and transfer.index == transfer.count:
+        # All items were sent: a client that came back need not have acknowledged them.
+        transfer.activity = _IDLE
+    again = (
+        transfer.activity is _SENDING
+        and transfer.kind == message.mission_type
+        and transfer.partner == partner
+    )
+    if transfer.activity is not _IDLE and not again:
+        text = "Mission download request ignored, already active"
+        context.announce(Message(Severity.INFO, text))
+        return True
+    transfer.activity, transfer.kind = _SENDING, message.mission_type
+    transfer.index, transfer.partner = 0, partner
+    transfer.count = len(_items(context, transfer.kind))
+    transfer.sent_us = transfer.heard_us = context.now_us
+    identity = _identity(context, transfer.kind)
+    context.link.send(
+        dialect.MAVLink_mission_count_message(*partner, transfer.count, transfer.kind, identity)
+    )
+    return True
+
+
+def handle_request(message: WireMessage, context: Context) -> bool:
+    """MISSION_REQUEST and MISSION_REQUEST_INT: send an item of the running download."""
+    transfer = context.transfer
+    transfer.integer = message.get_type() == "MISSION_REQUEST_INT"
+    if sender(message) != transfer.partner:
+        _complain(context, "WPM: REJ. CMD: partner id mismatch")
+        return True
+    if transfer.activity is _RECEIVING:
+        _complain(context, "WPM: REJ. CMD: Busy")
+        return True
+    if transfer.activity is _IDLE or transfer.kind != message.mission_type:
+        return False
+    transfer.heard_us = context.now_us
+    index = message.seq
+    if index == transfer.index < transfer.count:
+        transfer.index += 1
+    elif index != transfer.index - 1:
+        return _break_off(context, "WPM: REJ. CMD: Req. WP was unexpected")
+    if index >= len(_items(context, transfer.kind)):
+        return _break_off(context, "WPM: REJ. CMD: Req. WP was unexpected")
+    _send_item(context, index)
+    return True
+
+
+def handle_ack(message: WireMessage, context: Context) -> bool:
+    """MISSION_ACK: the end of a download, or a client's word on our requests."""
+    transfer = context.transfer
+    if sender(message) != transfer.partner:
+        _complain(context, "REJ. WP CMD: partner id mismatch")
+        return True
+    if transfer.activity is _SENDING and transfer.kind == message.mission_type:
+        transfer.activity = _IDLE
+        return True
+    if transfer.activity is not _RECEIVING:
+        return False
+    if message.type == dialect.MAV_MISSION_UNSUPPORTED:
+        # The client knows only the other kind of item.
+        transfer.integer = not transfer.integer
+        _request(context)
+    elif message.type == dialect.MAV_MISSION_OPERATION_CANCELLED:
+        _end_upload(context)
+    return True
+
+
+# --- uploads
+
+
+def handle_count(message: WireMessage, context: Context) -> bool:
+    """MISSION_COUNT: begin an upload; a count of 0 clears the list."""
+    transfer, partner = context.transfer, sender(message)
+    if transfer.activity is _SENDING:
+        _complain(context, "WPM: IGN MISSION_COUNT: Busy")
+        _acknowledge(context, partner, _ERROR)
+        return True
+    transfer.heard_us = context.now_us
+    if transfer.activity is _RECEIVING:
+        if partner != transfer.partner:
+            _acknowledge(context, partner, _ERROR)
+        elif transfer.index:
+            _complain(context, "WPM: REJ. CMD: Busy")
+            _acknowledge(context, partner, _ERROR)
+        else:
+            _request(context)  # it seems that our request was lost
+        return True
+    return _begin_upload(message, context)
+
+
+def _begin_upload(message: WireMessage, context: Context) -> bool:
+    transfer, partner, plans = context.transfer, sender(message), context.port.plans
+    if plans.receiving:
+        _acknowledge(context, partner, _ERROR)
+        return True
+    transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
+    known = transfer.kind in MOST_ITEMS
+    if message.count > (MOST_ITEMS[Kind(transfer.kind)] if known else 0):
+        _acknowledge(context, partner, dialect.MAV_MISSION_NO_SPACE)
+    elif message.count == 0:
+        if known:
+            plans.clear(Kind(transfer.kind))
+        _acknowledge(context, partner, _ACCEPTED)
+    else:
+        plans.receiving = True
+        transfer.activity = _RECEIVING
+        transfer.index, transfer.count, transfer.current = 0, message.count, -1
+        transfer.items = []
+        _request(context)
+    return True
+
+
+def handle_item(message: WireMessage, context: Context) -> bool:
+    """MISSION_ITEM and MISSION_ITEM_INT: store an item and ask for the next."""
+    transfer, partner = context.transfer, sender(message)
+    transfer.integer = mission_items.is_int(message)
+    if partner != transfer.partner:
+        _complain(context, "REJ. MIS ITEM: partner id mismatch")
+        return True
+    if message.mission_type != transfer.kind:
+        _acknowledge(context, partner, _ERROR)
+        return True
+    if transfer.activity is _SENDING:
+        _complain(context, "IGN MISSION_ITEM: Busy")
+        _acknowledge(context, partner, _ERROR)
+        return True
+    if transfer.activity is _IDLE:
+        if transfer.index == message.seq + 1:
+            # The last item once more: our acknowledgement was lost.
+            _acknowledge(context, partner, _ACCEPTED, transfer.checksum)
+        else:
+            _complain(context, "IGN MISSION_ITEM: No transfer")
+            _acknowledge(context, partner, _ERROR)
+        return True
+    transfer.heard_us = context.now_us
+    if message.seq != transfer.index:
+        return False
+    return _take_item(message, context)
+
+
+def _take_item(message: WireMessage, context: Context) -> bool:
+    transfer = context.transfer
+    item, kind = mission_items.parse(message), Kind(transfer.kind)
+    if isinstance(item, int):
+        _complain(context, "IGN MISSION_ITEM: Invalid item")
+        _acknowledge(context, transfer.partner, item)
+        _end_upload(context)
+        return True
+    transfer.checksum = mission_items.checksum(message, transfer.checksum)
+    if not mission_items.belongs(item, kind):
+        _acknowledge(context, transfer.partner, _ERROR)
+        _end_upload(context)
+        return True
+    transfer.items.append(item)
+    if message.current:
+        transfer.current = message.seq
+    transfer.index += 1
+    if transfer.index < transfer.count:
+        _request(context)
+        return True
+    plans = context.port.plans
+    if transfer.checksum != plans.stored(kind).identity:
+        # The same list again changes nothing, not even the item to go on with.
+        plans.store(kind, tuple(transfer.items), transfer.checksum, transfer.current)
+    _end_upload(context)
+    _acknowledge(context, transfer.partner, _ACCEPTED, transfer.checksum)
+    return True
+
+
+# --- the rest
+
+
+def handle_clear(message: WireMessage, context: Context) -> bool:
+    """MISSION_CLEAR_ALL: forget one list, or all."""
+    transfer, kind = context.transfer, message.mission_type
+    if transfer.activity is not _IDLE:
+        _complain(context, "WPM: IGN CLEAR CMD: Busy")
+        return True
+    transfer.kind = kind
+    for cleared in Kind:
+        if kind in (cleared, ALL):
+            context.port.plans.clear(cleared)
+    _acknowledge(context, sender(message), _ACCEPTED)
+    return True
+
+
+def handle_set_current(message: WireMessage, context: Context) -> bool:
+    """MISSION_SET_CURRENT: choose the item to go on with; the mode does not change."""
+    plans = context.port.plans
+    if context.transfer.activity is not _IDLE:
+        _complain(context, "WPM: IGN WP CURR CMD: Busy")
+    elif message.seq >= len(plans.mission):
+        _complain(context, "WPM: WP CURR CMD: Not in list")
+    else:
+        plans.set_current(message.seq)
+        context.transfer.told_current = -1
+    return True
+
+
+def send_pending(context: Context) -> None:
+    """Ask again, give up, and tell of the mission's progress. To be called every tick."""
+    transfer, plans = context.transfer, context.port.plans
+    if transfer.activity is not _IDLE:
+        _check_timeouts(context)
+    if plans.current != transfer.told_current:
+        transfer.told_current = plans.current
+        context.link.send_stream("MISSION_CURRENT", context.port.state())
+    if plans.reached != transfer.told_reached:
+        transfer.told_reached, transfer.repeats = plans.reached, -1
+        transfer.repeated_us = context.now_us - REPEAT_US
+    if transfer.told_reached >= 0 and transfer.repeats < REPEATS:
+        _tell_reached(context)
+    jumped = (plans.jumped, plans.jumps_done.get(plans.jumped, 0))
+    if jumped != transfer.told_jumped:
+        transfer.told_jumped = jumped
+        if jumped[0] >= 0 and transfer.activity is _IDLE and transfer.partner[0] >= 0:
+            transfer.kind = int(Kind.MISSION)
+            _send_item(context, jumped[0])
+
+
+def _check_timeouts(context: Context) -> None:
+    transfer, now_us = context.transfer, context.now_us
+    if now_us - transfer.heard_us > TIMEOUT_US:
+        _complain(context, "Operation timeout")
+        _end_upload(context)
+    elif transfer.activity is _RECEIVING and now_us - transfer.sent_us > RETRY_US:
+        _request(context)
+
+
+def _tell_reached(context: Context) -> None:
+    transfer = context.transfer
+    if context.now_us - transfer.repeated_us >= REPEAT_US:
+        transfer.repeated_us = context.now_us
+        transfer.repeats += 1
+        context.link.send(dialect.MAVLink_mission_item_reached_message(transfer.told_reached))
+
+
+def _items(context: Context, kind: int) -> tuple[object, ...]:
+    return context.port.plans.stored(Kind(kind)).items if kind in MOST_ITEMS else ()
+
+
+def _identity(context: Context, kind: int) -> int:
+    return context.port.plans.stored(Kind(kind)).identity if kind in MOST_ITEMS else 0
+
+
+def _request(context: Context) -> None:
+    transfer = context.transfer
+    transfer.sent_us = context.now_us
+    build = (
+        dialect.MAVLink_mission_request_int_message
+        if transfer.integer
+        else dialect.MAVLink_mission_request_message
+    )
+    context.link.send(build(*transfer.partner, transfer.index, transfer.kind))
+
+
+def _send_item(context: Context, index: int) -> None:
+    transfer, kind = context.transfer, Kind(context.transfer.kind)
+    plans = context.port.plans
+    transfer.sent_us = context.now_us
+    context.link.send(
+        mission_items.format_item(
+            plans.stored(kind).items[index],
+            kind,
+            index,
+            transfer.partner,
+            current=index == plans.current,
+            integer=transfer.integer,
+        )
+    )
+
+
+def _acknowledge(context: Context, target: tuple[int, int], result: int, identity: int = 0) -> None:
+    context.link.send(
+        dialect.MAVLink_mission_ack_message(*target, result, context.transfer.kind, identity)
+    )
+
+
+def _complain(context: Context, text: str) -> None:
+    context.announce(Message(Severity.CRITICAL, text))
+
+
+def _break_off(context: Context, text: str) -> bool:
+    context.transfer.activity = _IDLE
+    _acknowledge(context, context.transfer.partner, _ERROR)
+    _complain(context, text)
+    return True
+
+
+def _end_upload(context: Context) -> None:
+    transfer = context.transfer
+    if transfer.activity is _RECEIVING:
+        context.port.plans.receiving = False
+    transfer.activity = _IDLE
+    transfer.items = []
