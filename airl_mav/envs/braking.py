@@ -28,7 +28,7 @@ from airl_mav.envs.arenas import ArenaBatch, empty_batch
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.profiles.loading import profile_digest
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile
 
 SCHEMA = 1
@@ -166,7 +166,7 @@ def measure_braking(vehicle: VehicleProfile) -> Braking:
 
 def twin_of(vehicle: VehicleProfile) -> Vehicle:
     """Return the batch twin's constants of a vehicle on its own parameters."""
-    return vehicle_of(vehicle, parameter_values(vehicle.autopilot_parameters()).__getitem__)
+    return vehicle_of(vehicle, flown_values(vehicle.autopilot_parameters()).__getitem__)
 
 
 def open_space(n: int, obstacles: int = 0) -> ArenaBatch:

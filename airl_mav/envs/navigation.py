@@ -45,7 +45,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import Camera, VehicleProfile
 from airl_mav.vehicle.spread import draw_airframe
 
@@ -139,7 +139,7 @@ class Navigation(Stateful):
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
         self._arena_seed = arena_seed
         self._trace = trace
-        parameters = parameter_values(self.vehicle.autopilot_parameters())
+        parameters = flown_values(self.vehicle.autopilot_parameters())
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__, computer_w)
         self._charge = battery_charge
         rules = spec.episode

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
-from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile
 
 
@@ -56,7 +56,7 @@ def max_acceleration(vehicle: VehicleProfile) -> float:
     The lesser of what the tilt limit of its autopilot permits, g tan(tilt), and what the thrust
     does, sqrt((F / m)² - g²).
     """
-    tilt_max_deg = parameter_values(vehicle.parameters)["MPC_TILTMAX_AIR"]
+    tilt_max_deg = flown_values(vehicle.parameters)["MPC_TILTMAX_AIR"]
     lift = vehicle.thrust_n / vehicle.body.mass_kg
     by_thrust = math.sqrt(lift**2 - GRAVITY_M_S2**2)
     return min(GRAVITY_M_S2 * math.tan(tilt_max_deg * DEG), by_thrust)

@@ -1,49 +1,100 @@
-"""PX4-named parameters of the flight controller, from `parameters.toml`: names, defaults, ranges.
+"""PX4's parameters, from `parameters.csv`: names, types, defaults, ranges, and what is flown here.
 
 The rehearsal's flight controller serves them over MAVLink; training reads its gains from them.
+Source of names, types, units, ranges and defaults: PX4 1.16, its parameter reference; the defaults
+are those of its SITL with airframe 10016, as measured. It leaves where the rotors are
+(CA_ROTORn_PX, _PY) to the airframe: here as in vehicles/quad.
+
+PX4 stores what it is given, also out of range. So does this flight controller; what flies is the
+stored value, held within bounds that the control code can fly (`ParameterSpec.flown`).
 """
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.loading import read_toml
+
+OFF = "0|"
+"""In front of a lower flown bound: zero is flown as well, it turns off what the parameter does."""
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterSpec:
-    """One parameter: its type follows from the default (int = INT32, float = REAL32)."""
+class ParameterSpec(NamedTuple):
+    """One parameter: its type follows from the default (int = INT32, float = FLOAT)."""
 
     name: str
     default: int | float
     low: float
+    """PX4's range; -inf and inf where PX4 has no limit."""
     high: float
     unit: str
+    flown_low: float
+    """Bounds of what is flown. They may be wider than PX4's range, or narrower."""
+    flown_high: float
+    zero_is_off: bool
+    """Whether zero is flown although it lies below `flown_low`."""
     meaning: str
+    """What it does here; empty: it is stored and returned, and has no effect."""
+
+    def flown(self, value: float) -> float:
+        """Return what is flown when `value` is stored."""
+        if value == 0.0 and self.zero_is_off:
+            return 0.0
+        return min(self.flown_high, max(self.flown_low, float(value)))
+
+    @property
+    def is_used(self) -> bool:
+        """Whether it has an effect here."""
+        return bool(self.meaning)
 
 
-SPECS = tuple(
-    ParameterSpec(name, *rest)
-    for name, rest in read_toml(Path(__file__).with_suffix(".toml")).items()
-)
+def _spec(row: Mapping[str, str]) -> ParameterSpec:
+    number = int if row["type"] == "INT32" else float
+    low = float(row["min"] or -math.inf)
+    high = float(row["max"] or math.inf)
+    flown_min = row["flown_min"]
+    return ParameterSpec(
+        name=row["name"],
+        default=number(row["default"]),
+        low=low,
+        high=high,
+        unit=row["unit"],
+        flown_low=float(flown_min.removeprefix(OFF) or low),
+        flown_high=float(row["flown_max"] or high),
+        zero_is_off=flown_min.startswith(OFF),
+        meaning=row["meaning"],
+    )
+
+
+def _read(path: Path) -> tuple[ParameterSpec, ...]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return tuple(map(_spec, csv.DictReader(file)))
+
+
+SPECS = _read(Path(__file__).with_suffix(".csv"))
 """In ascending order of the names."""
+
+SPEC_BY_NAME: Mapping[str, ParameterSpec] = {spec.name: spec for spec in SPECS}
+
+_DEFAULTS = {spec.name: spec.default for spec in SPECS}
+_FLOWN_DEFAULTS = {spec.name: spec.flown(spec.default) for spec in SPECS}
 
 
 def parameter_values(overrides: Mapping[str, int | float]) -> dict[str, int | float]:
     """Return the values of all parameters: the defaults, and a vehicle profile's overrides.
 
-    Raises UsageError for an override that is unknown or out of range.
+    Raises UsageError for an override that is unknown or out of PX4's range.
     """
-    values = {spec.name: spec.default for spec in SPECS}
-    specs = {spec.name: spec for spec in SPECS}
+    values = dict(_DEFAULTS)
     for name, value in overrides.items():
-        spec = specs.get(name)
+        spec = SPEC_BY_NAME.get(name)
         if spec is None:
             raise UsageError(f"parameters.{name}: no such parameter")
-        if not spec.low <= value <= spec.high:
+        if not (math.isfinite(value) and spec.low <= value <= spec.high):
             raise UsageError(
                 f"parameters.{name} = {value}: accepted: "
                 f"{spec.low:g} <= value <= {spec.high:g} {spec.unit}".rstrip()
@@ -52,3 +103,10 @@ def parameter_values(overrides: Mapping[str, int | float]) -> dict[str, int | fl
             raise UsageError(f"parameters.{name} = {value}: accepted: a whole number")
         values[name] = type(spec.default)(value)
     return values
+
+
+def flown_values(overrides: Mapping[str, int | float]) -> dict[str, float]:
+    """Return what is flown of `parameter_values`; raises as it does."""
+    stored = parameter_values(overrides)
+    flown = {name: SPEC_BY_NAME[name].flown(stored[name]) for name in overrides}
+    return _FLOWN_DEFAULTS | flown

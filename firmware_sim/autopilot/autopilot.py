@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class BuiltinAutopilot:
         self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
-        parameters.on_change(self._read_gains)
+        parameters.on_change(self._parameters_changed)
         self.flight = Flight()
         """The commander's state."""
         self._status = _status(self.flight)
@@ -80,6 +80,7 @@ class BuiltinAutopilot:
         """Called with every accepted setpoint and its time of receipt, if set."""
         self.on_message: Callable[[Message], None] | None = None
         """Called with every text for the operator, if set."""
+        self._say_all(parameters.take_texts())
 
     # --- towards the plant
 
@@ -158,8 +159,13 @@ class BuiltinAutopilot:
             self._guidance.at_home(self._state)
             self._snapshot = None
 
-    def _read_gains(self) -> None:
+    def _parameters_changed(self) -> None:
         self._controller.set_gains(Gains.from_parameters(self.parameters.value))
+        self._say_all(self.parameters.take_texts())
+
+    def _say_all(self, messages: Sequence[Message]) -> None:
+        for message in messages:
+            self._say(message)
 
     @property
     def _now_us(self) -> int:

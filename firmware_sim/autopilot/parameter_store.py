@@ -1,64 +1,136 @@
-"""The store of parameters that MAVLink reads and writes."""
+"""The store of parameters that MAVLink reads and writes, and the bounded view that is flown."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
-from airl_mav.profiles.parameters import SPECS, parameter_values
+from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
+from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.port import ParameterValue
 
-_BY_NAME = {spec.name: i for i, spec in enumerate(SPECS)}
+_INDEX = {spec.name: i for i, spec in enumerate(SPECS)}
+FLOAT32_RELATIVE = 1e-6
+"""Values that differ by no more than this share are the same as MAVLink carries them."""
+
+_INT32_LOW, _INT32_HIGH = -(2**31), 2**31 - 1
 
 
 class Parameters:
-    """A vehicle's parameters. Implements `port.ParameterStore`."""
+    """A vehicle's parameters. Implements `port.ParameterStore`.
 
-    def __init__(self, overrides: Mapping[str, int | float] | None = None) -> None:
-        """Start from the defaults and a vehicle profile's overrides; see `parameter_values`."""
+    As in PX4, whatever is set is stored as given. Flight code sees it within the bounds that can
+    be flown.
+    """
+
+    def __init__(
+        self,
+        overrides: Mapping[str, int | float] | None = None,
+        stored: Mapping[str, int | float] | None = None,
+    ) -> None:
+        """Start from the defaults.
+
+        Args:
+            overrides: Those of a vehicle profile, checked; see `parameter_values`. They are this
+                vehicle's defaults.
+            stored: Values that users have set before, as they were given. Unknown names, and what
+                does not fit a parameter's type, are left out.
+
+        Raises:
+            UsageError: An override is unknown or out of range.
+        """
         values = parameter_values(overrides or {})
+        self._defaults = dict(values)
         self._values = list(values.values())
-        self._floats = {name: float(value) for name, value in values.items()}
-        self.value: Callable[[str], float] = self._floats.__getitem__
-        """Returns a value; fast enough for flight code that asks at every tick. Raises KeyError if
-        the name is unknown."""
+        self._flown = flown_values(overrides or {})
+        self.value: Callable[[str], float] = self._flown.__getitem__
+        """Returns a value as it is flown; fast enough for flight code that asks at every tick.
+        Raises KeyError if the name is unknown."""
         self._listeners: list[Callable[[], None]] = []
+        self._bounded: set[str] = {name for name in values if self._is_bounded(name)}
+        """Parameters whose stored value is flown bounded, and said to be."""
+        self._texts: list[Message] = [self._bounded_text(name) for name in sorted(self._bounded)]
+        for name, value in (stored or {}).items():
+            self._store(name, value)
 
     def on_change(self, listener: Callable[[], None]) -> None:
         """Call `listener` after every change."""
         self._listeners.append(listener)
+
+    def take_texts(self) -> list[Message]:
+        """Return what is to be told of values that are not flown as stored, since the last call.
+
+        Each is told once, and again only after it was flown as stored.
+        """
+        taken, self._texts = self._texts, []
+        return taken
 
     def __len__(self) -> int:
         """Return the number of parameters."""
         return len(SPECS)
 
     def __getitem__(self, name: str) -> float:
-        """Return a value as a float. Raises KeyError for an unknown name."""
-        return self._floats[name]
+        """Return a value as it is flown. Raises KeyError for an unknown name."""
+        return self._flown[name]
 
     def by_name(self, name: str) -> ParameterValue | None:
-        """Return a parameter, or None when there is no such name."""
-        index = _BY_NAME.get(name)
+        """Return a parameter as stored, or None when there is no such name."""
+        index = _INDEX.get(name)
         return None if index is None else self.by_index(index)
 
     def by_index(self, index: int) -> ParameterValue | None:
-        """Return a parameter, or None when the index is out of range."""
+        """Return a parameter as stored, or None when the index is out of range."""
         if not 0 <= index < len(SPECS):
             return None
         return ParameterValue(SPECS[index].name, self._values[index], index)
 
     def set(self, name: str, value: int | float) -> ParameterValue | None:
-        """Store a value, clamped to the range, and return what is stored now.
+        """Store a value as given, and return what is stored now; None when there is no such name.
 
-        A value that is not finite changes nothing.
+        What is no number of the parameter's type (NaN, infinite, beyond an INT32) changes nothing.
         """
-        index = _BY_NAME.get(name)
-        if index is None:
-            return None
+        if self._store(name, value):
+            self._changed()
+        return self.by_name(name)
+
+    def reset(self) -> None:
+        """Return to the defaults, a vehicle profile's overrides included."""
+        for name, value in self._defaults.items():
+            self._store(name, value)
+        self._changed()
+
+    def changed(self) -> dict[str, int | float]:
+        """Return the parameters that differ from the vehicle's defaults."""
+        pairs = zip(self._defaults.items(), self._values, strict=True)
+        return {name: value for (name, default), value in pairs if value != default}
+
+    def _changed(self) -> None:
+        for listener in self._listeners:
+            listener()
+
+    def _store(self, name: str, value: int | float) -> bool:
+        index = _INDEX.get(name)
+        if index is None or not math.isfinite(value):
+            return False
         spec = SPECS[index]
-        if value == value and abs(value) != float("inf"):
-            kind = type(spec.default)
-            stored = kind(min(spec.high, max(spec.low, value)))
-            self._values[index], self._floats[name] = stored, float(stored)
-            for listener in self._listeners:
-                listener()
-        return self.by_index(index)
+        stored = type(spec.default)(value)
+        if isinstance(stored, int) and not _INT32_LOW <= stored <= _INT32_HIGH:
+            return False
+        self._values[index] = stored
+        self._flown[name] = spec.flown(stored)
+        if not self._is_bounded(name):
+            self._bounded.discard(name)
+        elif name not in self._bounded:
+            self._bounded.add(name)
+            self._texts.append(self._bounded_text(name))
+        return True
+
+    def _is_bounded(self, name: str) -> bool:
+        stored = self._values[_INDEX[name]]
+        return SPEC_BY_NAME[name].is_used and not math.isclose(
+            self._flown[name], stored, rel_tol=FLOAT32_RELATIVE
+        )
+
+    def _bounded_text(self, name: str) -> Message:
+        value, flown = self._values[_INDEX[name]], self._flown[name]
+        return Message(Severity.WARNING, f"{name} {value:g} is flown as {flown:g}")

@@ -36,7 +36,7 @@ class ParameterStore(Protocol):
         ...
 
     def set(self, name: str, value: int | float) -> ParameterValue | None:
-        """Store a value (clamped to the parameter's range) and return what is stored now."""
+        """Store a value as given, and return what is stored now."""
         ...
 
 

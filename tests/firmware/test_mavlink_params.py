@@ -67,7 +67,7 @@ def test_set_is_told_to_all_links(rig: Rig) -> None:
     (heard,) = rig.station.received("PARAM_VALUE")
     assert (heard.param_id, heard.param_value) == ("MIS_TAKEOFF_ALT", 7.5)
     (answer,) = set_parameter(rig, "MIS_TAKEOFF_ALT", struct.pack("<f", 500.0), 9)
-    assert answer.param_value == 80.0  # what is stored now
+    assert answer.param_value == 500.0  # as given, also where it is out of range
     (answer,) = set_parameter(rig, "NAV_DLL_ACT", struct.pack("<i", -3), 6)
     assert as_int(answer) == -3
     assert rig.autopilot.parameters.values["NAV_DLL_ACT"] == -3

@@ -47,11 +47,10 @@ DEFAULT_PARAMETERS: dict[str, int | float] = {
     "TEST_NEGATIVE": -1,
     "TEST_SIGNALLING": -5_000_000,  # as a float: a signalling NaN
 }
-LIMITS = {"MIS_TAKEOFF_ALT": (0.0, 80.0)}
 
 
 class Parameters:
-    """A parameter store: names sorted, values clamped."""
+    """A parameter store: names sorted, values as given."""
 
     def __init__(self, values: dict[str, int | float] | None = None) -> None:
         self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
@@ -76,9 +75,7 @@ class Parameters:
     def set(self, name: str, value: int | float) -> ParameterValue | None:
         if name not in self.values:
             return None
-        low, high = LIMITS.get(name, (-math.inf, math.inf))
-        kind = type(self.values[name])
-        self.values[name] = kind(min(max(value, low), high))
+        self.values[name] = type(self.values[name])(value)
         return self.by_name(name)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ from pydantic.fields import FieldInfo
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.loading import Kind, list_profiles, load_profile, profiles_dir
-from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from airl_mav.profiles.parameters import SPECS, ParameterSpec, flown_values
 from airl_mav.profiles.vehicle import Momentum, Regression, VehicleProfile
 from firmware_sim.autopilot.parameter_store import Parameters
 
@@ -344,24 +345,92 @@ def test_an_unknown_name_is_nothing() -> None:
 
 
 @given(st.sampled_from(SPECS), st.floats(width=32) | st.integers(-(2**31), 2**31 - 1))
-def test_set_clamps_keeps_the_type_and_ignores_what_is_not_finite(
-    spec: ParameterSpec, value: float
-) -> None:
+def test_a_value_is_stored_as_given_and_flown_in_bounds(spec: ParameterSpec, value: float) -> None:
     store = Parameters()
     heard: list[float] = []
     store.on_change(lambda: heard.append(store[spec.name]))
     stored = store.set(spec.name, value)
     assert stored is not None
     assert type(stored.value) is type(spec.default)
-    if not math.isfinite(value):
+    whole = isinstance(spec.default, int)
+    if not math.isfinite(value) or (whole and not -(2**31) <= math.trunc(value) < 2**31):
         assert stored.value == spec.default
         assert heard == []
         return
-    clamped = min(spec.high, max(spec.low, value))
-    expected = math.trunc(clamped) if isinstance(spec.default, int) else clamped
-    assert stored.value == expected
+    assert stored.value == (math.trunc(value) if whole else value)
     assert store.by_name(spec.name) == stored
-    assert heard == [float(expected)]  # once, after the change
+    flown = store[spec.name]
+    assert heard == [flown]  # once, after the change
+    assert store.value(spec.name) == flown
+    off = spec.zero_is_off and stored.value == 0.0
+    assert off or spec.flown_low <= flown <= spec.flown_high
+    if spec.flown_low <= stored.value <= spec.flown_high:
+        assert flown == stored.value
+
+
+def test_all_of_px4s_parameters_exist_with_their_types() -> None:
+    assert len(SPECS) == 877
+    types = [type(spec.default) for spec in SPECS]
+    assert (types.count(int), types.count(float)) == (275, 602)  # as a PX4 1.16 SITL has them
+
+
+def test_what_is_used_has_flown_bounds_that_are_numbers_around_the_default() -> None:
+    for spec in SPECS:
+        if spec.is_used:
+            assert math.isfinite(spec.flown_low), spec.name
+            assert math.isfinite(spec.flown_high), spec.name
+        assert spec.flown(spec.default) == spec.default, spec.name
+
+
+def test_that_a_value_is_not_flown_as_stored_is_told_once() -> None:
+    store = Parameters()
+    store.set("MPC_TILTMAX_AIR", 500.0)
+    store.set("MPC_TILTMAX_AIR", 600.0)
+    store.set("WV_YRATE_MAX", -1e9)  # has no effect here: nothing is bounded
+    assert [text.text for text in store.take_texts()] == ["MPC_TILTMAX_AIR 500 is flown as 89"]
+    assert store.take_texts() == []
+    store.set("MPC_TILTMAX_AIR", 45.0)
+    store.set("MPC_TILTMAX_AIR", 700.0)
+    assert [text.text for text in store.take_texts()] == ["MPC_TILTMAX_AIR 700 is flown as 89"]
+
+
+def test_a_filter_is_off_at_zero_and_never_slower_than_can_be_flown() -> None:
+    store = Parameters()
+    for value, flown in ((0.0, 0.0), (1e-30, 5.0), (-3.0, 5.0), (20.0, 20.0)):
+        store.set("IMU_GYRO_CUTOFF", value)
+        assert store["IMU_GYRO_CUTOFF"] == flown
+
+
+def test_a_bound_that_a_float_reaches_is_not_told() -> None:
+    store = Parameters()
+    single = struct.unpack("<f", struct.pack("<f", 0.1))[0]
+    store.set("MC_ROLLRATE_D", single)  # a hair above 0.1, the greatest that is flown
+    assert store.take_texts() == []
+
+
+def test_reset_returns_to_the_vehicles_values() -> None:
+    store = Parameters({"MPC_XY_P": 1.5})
+    store.set("MPC_XY_P", 1.0)
+    store.set("SDLOG_MODE", 2)
+    assert store.changed() == {"MPC_XY_P": 1.0, "SDLOG_MODE": 2}
+    store.reset()
+    assert store.changed() == {}
+    assert store["MPC_XY_P"] == 1.5
+
+
+def test_stored_values_are_taken_over_as_given_and_the_rest_is_left_out() -> None:
+    stored = {"MPC_XY_P": 99.0, "NO_SUCH": 1, "SDLOG_MODE": 2**31, "MPC_Z_P": math.nan}
+    store = Parameters({"MPC_XY_P": 1.5}, stored)
+    assert store.changed() == {"MPC_XY_P": 99.0}
+    assert store["MPC_XY_P"] == 2.0
+
+
+def test_what_a_profile_may_name_is_all_of_px4_in_its_range() -> None:
+    assert flown_values({"SDLOG_MODE": 2})["SDLOG_MODE"] == 2.0
+    assert flown_values({"MPC_XY_VEL_MAX": 0.0})["MPC_XY_VEL_MAX"] > 0.0
+    for name, value in (("MPC_XY_P", 9.0), ("NO_SUCH", 1), ("SDLOG_MODE", 0.5)):
+        with pytest.raises(UsageError, match=f"parameters.{name}"):
+            flown_values({name: value})
 
 
 def test_every_listener_hears_every_change() -> None:
