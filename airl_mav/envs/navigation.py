@@ -24,6 +24,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, batch_of, put_arena
 from airl_mav.envs.cameras import Cameras
+from airl_mav.envs.companions import Companions
 from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
@@ -40,7 +41,6 @@ from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, observe
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
@@ -175,17 +175,9 @@ class Navigation(Stateful):
             )
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
-        self._compensator = compensator
-        if compensator is not None:
-            self._foreseen_mm = np.zeros_like(self.cameras.image)
-            self._foreseen = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
-        self._memory: DecisionMemory | None = None
-        if self._compensator is not None:
-            self._memory = self._compensator.memory
-        elif spec.in_flight:
-            self._memory = DecisionMemory(n)
-        self._age_us = np.zeros(n, np.int64)
-        """Of the frames, when their decisions begin."""
+        self._companions = Companions(
+            n, self.intrinsics, compensator=compensator, told=bool(spec.in_flight)
+        )
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
         """Start episodes: each in a hover above its start, the first frame taken.
@@ -204,8 +196,7 @@ class Navigation(Stateful):
             self._begin(i, int(seed), zone)
             who[i] = True
         self.capture(who)
-        self._age_us[who] = 0
-        self._foresee(who)
+        self._look_ahead(who)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         arena = self._arena(seed, zone)
@@ -234,21 +225,15 @@ class Navigation(Stateful):
         self._telemetry.begin(i, seed)
         self.cameras.begin(i, seed)
         self._timing.begin(i)
-        if self._compensator is not None:
-            self._compensator.begin(i)
-        elif self._memory is not None:
-            self._memory.begin(i)
+        self._companions.begin(i)
 
     def see(self) -> Observation:
         """Return the present observations of all vehicles, with a leading axis (n,).
 
         Where latency is compensated, they are those of when the decision is expected to act.
         """
-        image, state = self.cameras.image, self.kinematics()
-        if self._compensator is not None:
-            image, state = self._foreseen_mm, self._foreseen
-        told = None if self._memory is None else self._memory.in_flight(self._age_us)
-        return observe(image, self.intrinsics, state, self._batch.goal, told)
+        image, state = self._companions.seen(self.cameras.image, self.kinematics())
+        return observe(image, self.intrinsics, state, self._batch.goal, self._companions.told())
 
     def observe(self) -> Encoded:
         """Return the present observations of all vehicles in the environment's layout."""
@@ -298,34 +283,21 @@ class Navigation(Stateful):
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
-        self._age_us[:] = self._timing.fly(self, setpoints, t2_us)
+        self._companions.aged(self._timing.fly(self, setpoints, t2_us))
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
         if self._trace is not None:
             self._trace.decided(self.fleet, setpoints, t2_us, self._transport_us, self._link_us)
-        everyone = np.arange(self.n)
-        if self._compensator is not None:
-            sent_us = began_us + TICK_US * ticks_of(t2_us)
-            hover_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
-            self._compensator.decided(everyone, setpoints, t2_us, sent_us, hover_us)
-        elif self._memory is not None:
-            self._memory.decided(everyone, setpoints, t2_us)
-        self._foresee(self.fleet.verdict == Verdict.FLYING)
+        sent_us = began_us + TICK_US * ticks_of(t2_us)
+        stop_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
+        self._companions.decided(setpoints, t2_us, sent_us, stop_us)
+        self._look_ahead(self.fleet.verdict == Verdict.FLYING)
 
-    def _foresee(self, who: NDArray[np.bool_]) -> None:
-        """Carry what is seen forward to when the next decisions act, if that is compensated."""
-        if self._compensator is None:
-            return
-        image, state = self._compensator.foresee(
-            np.flatnonzero(who),
-            self.cameras.image,
-            self._age_us,
-            self.fleet.time_us,
-            self.kinematics(),
-        )
-        self._foreseen_mm[who] = image[who]
-        for kept, found in zip(vars(self._foreseen).values(), vars(state).values(), strict=True):
-            kept[who] = found[who]
+    def _look_ahead(self, who: NDArray[np.bool_]) -> None:
+        """Let the companions in `who` see what their next decisions will act on."""
+        if self._companions.foresee:
+            now_us, state = self.fleet.time_us, self.kinematics()
+            self._companions.look_ahead(who, self.cameras.image, now_us, state)
 
     def _held(self) -> Mapping[str, Any]:
         held: dict[str, Any] = {
@@ -346,11 +318,7 @@ class Navigation(Stateful):
             held["winds"] = self._winds
         if isinstance(self._timing, PipelinedTiming):
             held["timing"] = self._timing
-        if self._compensator is not None:
-            foreseen = {"depth_mm": self._foreseen_mm, **vars(self._foreseen)}
-            held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
-        if self._memory is not None:
-            held["decisions"] = {**self._memory.held(), "age_us": self._age_us}
+        held |= self._companions.held()
         return held
 
     def set_state(self, state: State) -> None:

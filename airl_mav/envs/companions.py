@@ -1,0 +1,128 @@
+"""What the companions of n flights know: their own decisions, and what is seen when they act.
+
+As `companion.pilot` keeps it for one: the account of the decisions, which a policy may be told, and
+where latency is compensated the newest images and states, carried forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.policy.observation import InFlight, Kinematics
+from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction.memory import DecisionMemory
+
+Times = NDArray[np.int64]
+"""(n,) [µs]."""
+
+
+class Companions:
+    """The companions of n vehicles."""
+
+    def __init__(
+        self, n: int, image: Intrinsics, *, compensator: Compensator | None, told: bool
+    ) -> None:
+        """Prepare n companions.
+
+        Args:
+            n: Number of companions.
+            image: Of their cameras.
+            compensator: Carries forward what is seen; None: nothing does.
+            told: Whether the policy is told of its decisions.
+        """
+        self._n = n
+        self._compensator = compensator
+        self._memory: DecisionMemory | None = None
+        if compensator is not None:
+            self._memory = compensator.memory
+            self._image_mm = np.zeros((n, image.height, image.width), np.uint16)
+            self._state = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
+        elif told:
+            self._memory = DecisionMemory(n)
+        self._age_us = np.zeros(n, np.int64)
+        """Of the frames, when their decisions begin."""
+
+    def begin(self, i: int) -> None:
+        """Begin the flight of companion i, in a hover; its first frame is new."""
+        if self._compensator is not None:
+            self._compensator.begin(i)
+        elif self._memory is not None:
+            self._memory.begin(i)
+        self._age_us[i] = 0
+
+    def aged(self, age_us: Times) -> None:
+        """Take how old the frames (n,) are of which the next decisions are made."""
+        self._age_us[:] = age_us
+
+    def decided(
+        self, setpoints: NDArray[np.float64], t2_us: Times, sent_us: Times, stop_us: Times | None
+    ) -> None:
+        """Take the setpoints that all have sent.
+
+        Args:
+            setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s].
+            t2_us: What the decisions took.
+            sent_us: When they were sent.
+            stop_us: When each is replaced by a stop if no other has come; None: never.
+        """
+        everyone = np.arange(self._n)
+        if self._compensator is not None:
+            self._compensator.decided(everyone, setpoints, t2_us, sent_us, stop_us)
+        elif self._memory is not None:
+            self._memory.decided(everyone, setpoints, t2_us)
+
+    @property
+    def foresee(self) -> bool:
+        """Whether they look ahead: latency is compensated."""
+        return self._compensator is not None
+
+    def look_ahead(
+        self,
+        who: NDArray[np.bool_],
+        image_mm: NDArray[np.uint16],
+        now_us: Times,
+        state: Kinematics,
+    ) -> None:
+        """Carry what is seen forward to when the next decisions act, of those that `foresee`.
+
+        Args:
+            who: (n,) the companions that decide next.
+            image_mm: (n, h, w) newest images, 0 = no return.
+            now_us: When their decisions begin.
+            state: Telemetry of all n.
+        """
+        if self._compensator is None:
+            return
+        image, then = self._compensator.foresee(
+            np.flatnonzero(who), image_mm, self._age_us, now_us, state
+        )
+        self._image_mm[who] = image[who]
+        for kept, found in zip(vars(self._state).values(), vars(then).values(), strict=True):
+            kept[who] = found[who]
+
+    def seen(
+        self, image_mm: NDArray[np.uint16], state: Kinematics
+    ) -> tuple[NDArray[np.uint16], Kinematics]:
+        """Return what the decisions see: the present, or what it will be when they act."""
+        if self._compensator is None:
+            return image_mm, state
+        return self._image_mm, self._state
+
+    def told(self) -> InFlight | None:
+        """Return what policies may be told of the decisions; None: nobody keeps account."""
+        return None if self._memory is None else self._memory.in_flight(self._age_us)
+
+    def held(self) -> Mapping[str, Any]:
+        """Return by name all arrays that change, for checkpoints."""
+        held: dict[str, Any] = {}
+        if self._compensator is not None:
+            foreseen = {"depth_mm": self._image_mm, **vars(self._state)}
+            held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
+        if self._memory is not None:
+            held["decisions"] = {**self._memory.held(), "age_us": self._age_us}
+        return held
