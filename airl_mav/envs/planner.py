@@ -4,9 +4,9 @@ Only the batch twin knows so much: nothing of this flies. It is there to be imit
 (`training.imitation`).
 
 An episode begins with a map of the way to the goal (`envs.goal_map`). A decision tries actions of
-the set: each is flown ahead with a simple model of the vehicle, to the end of its hold and then to
-a stand, past the obstacles where they will be. Of those that touch nothing the one with the least
-time to go wins (a dynamic window approach: Fox, Burgard, Thrun, IEEE Robotics & Automation
+the set: each is flown ahead on the response of the vehicle's profile, to the end of its hold and
+then to a stand, past the obstacles where they will be. Of those that touch nothing the one with the
+least time to go wins (a dynamic window approach: Fox, Burgard, Thrun, IEEE Robotics & Automation
 Magazine 4(1), 1997).
 """
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch
@@ -30,10 +31,6 @@ from airl_mav.latency.injection import Injection
 
 STEP_S = 0.1
 """Step of the flight ahead [s]."""
-
-DEAD_S, RESPONSE_S = 0.1, 0.6
-"""The velocity follows a setpoint after so long, with this time constant [s]; measured on the twin
-as 0.15 s and 0.55 s."""
 
 LOOK_S = 0.6
 """The time to go counts from where the vehicle is so long after the hold, going on straight [s]."""
@@ -55,26 +52,44 @@ LATENCIES = 64
 
 
 class Timing(NamedTuple):
-    """When a decision acts [s], counted from its observation."""
+    """When a decision acts [s], counted from its observation, and how fast the vehicle answers."""
 
     lead: float
-    """Until the new setpoint arrives; the last one flies on."""
+    """Until the vehicle begins to answer the new setpoint; the last one flies on."""
     hold: float
+    response: float
+    """Time constant of the velocity."""
 
 
 class Planner:
     """Decides for the flights of a batch twin. Implements `experts.Expert`."""
 
     def __init__(self, navigation: Navigation, commands: NDArray[np.float64]) -> None:
-        """Take the flights, and the commands (c, 3) to choose from."""
+        """Take the flights, and the commands (c, 3) to choose from.
+
+        Raises:
+            FieldError: The vehicle's profile does not say how it answers setpoints.
+        """
         self._navigation = navigation
         self._commands = commands
+        response = navigation.vehicle.response
+        if response is None:
+            raise FieldError(
+                "expert",
+                "planner",
+                problem="the vehicle's profile has no table `response`; scripts/fit-response"
+                " identifies it",
+            )
         vehicle, spec = navigation.whole_truth().vehicle, navigation.spec
         top = float(np.hypot(commands[:, 0], commands[:, 1]).max())
         self._body = Body(vehicle.radius, vehicle.half_height, spec.episode.altitude_m, top)
         lead_us = np.mean([_mean_t2_us(each, spec.delay) for each in navigation.injections])
         lead_us += spec.delay.link_ms * US_PER_MS
-        self._timing = Timing(float(lead_us) / US_PER_S + DEAD_S, spec.episode.hold_s)
+        self._timing = Timing(
+            float(lead_us) / US_PER_S + response.dead_time_s,
+            spec.episode.hold_s,
+            response.velocity_time_s,
+        )
         self._maps: dict[int, Map] = {}
 
     def begin(self, slots: Sequence[int]) -> None:
@@ -185,7 +200,7 @@ def best_command(
         time_s: Since the start of the flight [s].
     """
     best, least = 0, math.inf
-    share = STEP_S / RESPONSE_S
+    share = 1.0 - math.exp(-STEP_S / timing.response)
     end = timing.lead + timing.hold
     steps = int((end + BRAKE_S) / STEP_S) + 2
     places = np.empty((steps, batch.n_obstacles[i] - batch.n_static[i], 2))
@@ -207,9 +222,9 @@ def best_command(
                     looked = True
                     wx = cn * commands[c, 0] - sn * commands[c, 1]
                     wy = sn * commands[c, 0] + cn * commands[c, 1]
-                    after = 1.0 - math.exp(-LOOK_S / RESPONSE_S)
-                    ahead_x = x + wx * LOOK_S + (vx - wx) * RESPONSE_S * after
-                    ahead_y = y + wy * LOOK_S + (vy - wy) * RESPONSE_S * after
+                    after = timing.response * (1.0 - math.exp(-LOOK_S / timing.response))
+                    ahead_x = x + wx * LOOK_S + (vx - wx) * after
+                    ahead_y = y + wy * LOOK_S + (vy - wy) * after
                     to_go = read_at(known, known.to_go, ahead_x, ahead_y) / body.top_speed
                     north = read_at(known, known.to_go, ahead_x + known.cell, ahead_y)
                     north -= read_at(known, known.to_go, ahead_x - known.cell, ahead_y)
