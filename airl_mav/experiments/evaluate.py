@@ -118,22 +118,15 @@ def write_on_card(cell: Cell, episodes: Sequence[EpisodeRecord]) -> None:
     asked, folder = cell.scenario.scenario, cell.scenario.policy.folder
     if folder is None:
         return
-    quality = aggregate(episodes)
     workload = None if asked.workload is None else f"{asked.computer}/{asked.workload}"
     add_result(
         folder,
-        MeasuredResult(
+        MeasuredResult.of(
+            aggregate(episodes),
             arena=cell.scenario.arena_name,
             level=asked.level,
             latency=asked.latency or workload,
-            episodes=len(episodes),
             seed=asked.seed,
-            success_rate=quality.success_rate.value or 0.0,
-            success_low=quality.success_rate.low,
-            success_high=quality.success_rate.high,
-            flight_time_s=quality.flight_time_s.value,
-            distance_m=quality.distance_m.value,
-            energy_j=quality.energy_j.value,
             flown_utc=utc_now().date().isoformat(),
         ),
     )

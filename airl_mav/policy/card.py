@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from pydantic import Field, Strict, model_validator
 
@@ -51,6 +51,54 @@ class Training(ProfileModel):
     date_utc: str | None = Field(default=None, description="when it was exported, ISO 8601")
 
 
+class Measured(Protocol):
+    """A figure with its 95 % interval: `flight.statistics.Estimate`, or a published one."""
+
+    @property
+    def value(self) -> float | None:
+        """None: nothing to work it out from."""
+        ...
+
+    @property
+    def low(self) -> float | None:
+        """Lower end of the interval."""
+        ...
+
+    @property
+    def high(self) -> float | None:
+        """Upper end of the interval."""
+        ...
+
+    @property
+    def n(self) -> int:
+        """Flights behind it."""
+        ...
+
+
+class MeasuredQuality(Protocol):
+    """Figures of flown episodes: `flight.statistics.Aggregate`, or a published run."""
+
+    @property
+    def success_rate(self) -> Measured:
+        """Fraction, 0 to 1."""
+        ...
+
+    @property
+    def flight_time_s(self) -> Measured:
+        """This and the following: means over the successful flights."""
+        ...
+
+    @property
+    def distance_m(self) -> Measured:
+        """Flown [m]."""
+        ...
+
+    @property
+    def energy_j(self) -> Measured:
+        """Of the vehicle, without its computer [J]."""
+        ...
+
+
 class MeasuredResult(ProfileModel):
     """How a policy flew a set of episodes; means over the successful ones."""
 
@@ -76,6 +124,21 @@ class MeasuredResult(ProfileModel):
     behaviour: str | None = Field(
         default=None, description="fingerprint of the flight behaviour that it was flown with"
     )
+
+    @classmethod
+    def of(cls, quality: MeasuredQuality, **conditions: Any) -> MeasuredResult:
+        """Return a result with the figures of a quality; `conditions` are the other fields."""
+        rate = quality.success_rate
+        return cls(
+            episodes=rate.n,
+            success_rate=rate.value or 0.0,
+            success_low=rate.low,
+            success_high=rate.high,
+            flight_time_s=quality.flight_time_s.value,
+            distance_m=quality.distance_m.value,
+            energy_j=quality.energy_j.value,
+            **conditions,
+        )
 
 
 class PolicyFacts(ProfileModel):

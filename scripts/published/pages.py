@@ -95,18 +95,12 @@ def card_results(records: dict[str, Record]) -> dict[str, tuple[MeasuredResult, 
 
 
 def _result(run: FlownRun, record: Record) -> MeasuredResult:
-    return MeasuredResult(
+    return MeasuredResult.of(
+        run,
         arena=run.arena,
         level=run.level,
         latency=run.latency,
-        episodes=run.success_rate.n,
         seed=run.seed,
-        success_rate=run.success_rate.value or 0.0,
-        success_low=run.success_rate.low,
-        success_high=run.success_rate.high,
-        flight_time_s=run.flight_time_s.value,
-        distance_m=run.distance_m.value,
-        energy_j=run.energy_j.value,
         flown_utc=record.made.date,
         behaviour=record.made.behaviour,
     )
