@@ -27,6 +27,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.prediction.compensator import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.piloting import action_generator
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
@@ -79,6 +80,40 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
     )
 
 
+def navigation_of(
+    scenario: ResolvedScenario,
+    slots: int,
+    *,
+    trace: Trace | None = None,
+    compensator: Compensator | None = None,
+) -> Navigation:
+    """Return the batch twin that flies a scenario.
+
+    Args:
+        scenario: What is flown.
+        slots: Flights at a time.
+        trace: Records them.
+        compensator: Of so many companions, to fly with another than the vehicle's own.
+
+    Raises:
+        UsageError: The twin cannot fly by its rules.
+    """
+    asked = scenario.scenario
+    return Navigation(
+        environment_of(scenario),
+        slots,
+        vehicle=scenario.vehicle,
+        arena=scenario.arena,
+        injection=scenario.injection,
+        latency_draw=asked.latency_seed,
+        arena_seed=asked.arena_seed,
+        trace=trace,
+        computer_w=scenario.computer.onboard_watts,
+        battery_charge=asked.battery_charge,
+        compensator=compensator,
+    )
+
+
 @dataclass(frozen=True)
 class GymFlier:
     """Flies the episodes of a scenario in the batch twin. Implements `fliers.Flier`.
@@ -101,24 +136,13 @@ class GymFlier:
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (no logs here)
         """Load the policy; see `fliers.Flier`."""
         scenario = self.scenario
-        environment, pilots = environment_of(scenario), pilots_of(scenario)
+        pilots = pilots_of(scenario)
 
         def fly(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
             index_of = {episode.seed: episode.index for episode in episodes}
             slots = min(scenario.scenario.slots, len(index_of))
             trace = Trace(slots)
-            navigation = Navigation(
-                environment,
-                slots,
-                vehicle=scenario.vehicle,
-                arena=scenario.arena,
-                injection=scenario.injection,
-                latency_draw=scenario.scenario.latency_seed,
-                arena_seed=scenario.scenario.arena_seed,
-                trace=trace,
-                computer_w=scenario.computer.onboard_watts,
-                battery_charge=scenario.scenario.battery_charge,
-            )
+            navigation = navigation_of(scenario, slots, trace=trace)
             zone = scenario.scenario.zone
             for slot, flown in fly_seeds(navigation, pilots, list(index_of), zone=zone, stop=stop):
                 yield self._episode(navigation, trace, slot, flown, index_of[flown.seed])

@@ -21,13 +21,13 @@ from pydantic import Field, create_model
 from rich.console import Console
 from rich.progress import track
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Navigation
-from airl_mav.experiments.gym_flier import environment_of, pilots_of
+from airl_mav.experiments.gym_flier import navigation_of, pilots_of
 from airl_mav.flight.paired import relative_difference
 from airl_mav.flight.statistics import wilson
 from airl_mav.prediction.compensator import Compensator
@@ -134,23 +134,17 @@ def fly(scenario: Scenario, case: Case) -> dict[int, EpisodeResult]:
     resolved = resolve(scenario.model_copy(update=asked))
     seeds = range(scenario.seed, scenario.seed + scenario.episodes)
     slots = min(SLOTS, len(seeds))
-    spec, compensator = environment_of(resolved), None
+    compensator = None
     if case.compensate:
-        plain = Navigation(spec, 1, vehicle=resolved.vehicle)
         compensator = Compensator(
-            slots, case.vehicle(resolved.vehicle), plain.intrinsics, remembered=case.images
+            slots,
+            case.vehicle(resolved.vehicle),
+            Intrinsics.of(resolved.vehicle.camera),
+            remembered=case.images,
         )
         compensator.memory.latency = case.expected(slots)
-    navigation = Navigation(
-        spec,
-        slots,
-        vehicle=resolved.vehicle,
-        arena=resolved.arena,
-        injection=resolved.injection,
-        computer_w=resolved.computer.onboard_watts,
-        compensator=compensator,
-    )
-    flights = fly_seeds(navigation, pilots_of(resolved), seeds)
+    navigation = navigation_of(resolved, slots, compensator=compensator)
+    flights = fly_seeds(navigation, pilots_of(resolved), seeds, zone=scenario.zone)
     return {flight.seed: flight for _, flight in flights}
 
 
