@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -18,61 +20,80 @@ F = TypeVar("F", bound=Callable[..., Any])
 _PACKAGES = ("airl_mav", "firmware_sim")
 """Those of the distribution that hold kernels."""
 
+_ROOT = Path(__file__).resolve().parents[2]
+"""Where they lie."""
 
 _CACHE_NAME = "numba-"
-"""How the name of a folder of compiled code begins; the digest of the sources follows."""
+"""How the name of a folder of compiled code begins; the digest of its sources follows."""
 
-_IMPORT = re.compile(rf"^from ((?:{'|'.join(_PACKAGES)})[\w.]*) import", re.MULTILINE)
+_PACKAGE = rf"(?:{'|'.join(_PACKAGES)})[\w.]*"
+_IMPORT = re.compile(
+    rf"^[ \t]*(?:from ({_PACKAGE}) import (\([^)]*\)|.*)|import ({_PACKAGE}))", re.MULTILINE
+)
 
 
-def _sources_digest(root: Path) -> str:
-    """Return a digest of every source that can end up in compiled code.
+@cache
+def _file_of(module: str) -> Path | None:
+    """Return the file of a module of this distribution; None: there is none, or it is a name."""
+    path = _ROOT.joinpath(*module.split("."))
+    for file in (path.with_suffix(".py"), path / "__init__.py"):
+        if file.is_file():
+            return file
+    return None
 
-    Those are the files in which a kernel is defined, and all that these import, directly or not:
-    constants are compiled into the kernels that use them.
-    """
-    texts = {
-        ".".join(path.relative_to(root).with_suffix("").parts): path.read_text(encoding="utf-8")
-        for package in _PACKAGES
-        for path in (root / package).rglob("*.py")
-    }
-    pending = [name for name, text in texts.items() if "@kernel" in text]
-    found: set[str] = set()
+
+@cache
+def _read(file: Path) -> tuple[str, tuple[Path, ...]]:
+    """Return the digest of a source file, and the files that it imports."""
+    text = file.read_text(encoding="utf-8")
+    names: list[str] = []
+    for package, imported, module in _IMPORT.findall(text):
+        names += [module] if module else [package]
+        names += [f"{package}.{name}" for name in re.findall(r"\w+", imported)]
+    files = {found for name in names if (found := _file_of(name)) is not None}
+    return hashlib.sha256(text.encode()).hexdigest(), tuple(sorted(files))
+
+
+@cache
+def _closure_digest(file: Path) -> str:
+    """Return a digest of a source file and all that it imports, directly or not."""
+    pending, found = [file], dict[Path, str]()
     while pending:
-        name = pending.pop()
-        if name in texts and name not in found:
-            found.add(name)
-            pending += _IMPORT.findall(texts[name])
-    digest = hashlib.sha256()
-    for name in sorted(found):
-        digest.update(texts[name].encode())
-    return digest.hexdigest()[:16]
+        each = pending.pop()
+        if each not in found:
+            found[each], imported = _read(each)
+            pending += imported
+    listed = "".join(sorted(f"{each.name} {digest}\n" for each, digest in found.items()))
+    return hashlib.sha256(listed.encode()).hexdigest()[:16]
 
 
-def _choose_cache() -> None:
-    """Give compiled code a folder of its own for each state of the sources.
+@cache
+def _folder(digest: str) -> Path | None:
+    """Return the folder of what was made of sources; None: nothing can be written."""
+    return writable_folder(f"{_CACHE_NAME}{digest}")
 
-    numba stamps a cached function with its own file only: a kernel that inlines another one from a
-    changed file would go on running the old code, also after an upgrade of the package.
+
+def cache_folder(source: str) -> Path | None:
+    """Return the folder for what is made of a source file and of all that it imports.
+
+    Another state of any of them has another folder. None where none can be written, or where the
+    user has chosen one for all compiled code (`NUMBA_CACHE_DIR`), or the source is in no file.
     """
-    if numba.config.CACHE_DIR:
-        return  # NUMBA_CACHE_DIR: the user has chosen
-    package = Path(__file__).resolve().parents[1]
-    folder = writable_folder(f"{_CACHE_NAME}{_sources_digest(package.parent)}")
-    if folder is not None:
-        numba.config.CACHE_DIR = str(folder)
+    file = Path(source).resolve()
+    if numba.config.CACHE_DIR or not file.is_file():
+        return None
+    return _folder(_closure_digest(file))
 
 
-_choose_cache()
-
-
-def cache_folder() -> Path | None:
-    """Return the folder of this state of the sources, for what their kernels were measured to do.
-
-    None where there is none of our own: the user has chosen another, or none can be written.
-    """
-    chosen = Path(numba.config.CACHE_DIR or "")
-    return chosen if chosen.name.startswith(_CACHE_NAME) else None
+@contextmanager
+def _caching_in(folder: Path | None) -> Iterator[None]:
+    """Let numba keep what is decorated meanwhile in a folder; None: where it would."""
+    chosen = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = chosen if folder is None else str(folder)
+    try:
+        yield
+    finally:
+        numba.config.CACHE_DIR = chosen
 
 
 def kernel(function: F) -> F:
@@ -82,5 +103,10 @@ def kernel(function: F) -> F:
     releases the GIL. Always inlined: numba would pass the forty gains by value at each call, which
     costs a third of the batch twin's speed. Never `parallel`: one thread a process, processes for
     parallelism.
+
+    numba stamps a cached function with its own file only: a kernel that inlines another one, or a
+    constant, from a changed file would go on running the old code, also after an upgrade of the
+    package. So each is kept in a folder of its file and of all that this imports.
     """
-    return cast(F, njit(cache=True, nogil=True, forceinline=True)(function))
+    with _caching_in(cache_folder(function.__code__.co_filename)):
+        return cast(F, njit(cache=True, nogil=True, forceinline=True)(function))

@@ -8,11 +8,9 @@ at many moments of that get a setpoint of zero velocity.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -119,8 +117,8 @@ class Braking(ProfileModel):
 def braking_of(vehicle: VehicleProfile) -> Braking:
     """Return the braking of a vehicle, with all that it carries: measured once, and stored.
 
-    The measurement lies beside the compiled kernels, in a folder of these sources, under the
-    digest of the vehicle: another payload, computer or parameter is another vehicle.
+    The measurement lies beside the compiled kernels, in a folder of this source and all that it
+    imports, under the digest of the vehicle: another payload, computer or parameter is another one.
     """
     return _braking(vehicle.model_dump_json())
 
@@ -128,12 +126,10 @@ def braking_of(vehicle: VehicleProfile) -> Braking:
 @cache
 def _braking(vehicle_json: str) -> Braking:
     vehicle = VehicleProfile.model_validate_json(vehicle_json)
-    folder = cache_folder()
+    folder = cache_folder(__file__)
     if folder is None:
         return measure_braking(vehicle)
-    # With this file's own digest: the folder's name stands for the kernels alone.
-    how = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
-    path = folder / f"braking-{profile_digest(vehicle)[:16]}-{how[:16]}.json"
+    path = folder / f"braking-{profile_digest(vehicle)[:16]}.json"
     with suppress(UsageError):
         stored = read_json(path, SCHEMA, "braking")
         del stored["schema"]

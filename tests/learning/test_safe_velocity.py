@@ -100,7 +100,7 @@ def test_it_is_measured_once_for_each_load(
 def test_a_damaged_measurement_is_measured_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(braking, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(braking, "cache_folder", lambda _: tmp_path)
     braking._braking.cache_clear()
     first = braking_of(QUAD)
     (stored,) = tmp_path.glob("braking-*.json")
