@@ -13,6 +13,9 @@ MAX_LAG_US = 200_000
 """A greater lag is given up instead of caught up: a burst of ticks would outrun the companion
 [µs]."""
 
+MAX_WAKES = 16
+"""So often in one tick is the wait for it broken by what arrives; more waits for the tick."""
+
 PR_SET_TIMERSLACK = 29
 """Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
 
@@ -80,8 +83,12 @@ class WallPacing:
         while it waited must not stamp what has arrived with a time that is about to be given up.
         """
         clock = self.clock
+        woken = 0
         while (wait_s := clock.wall_seconds_until(tick_us)) > 0.0:
-            ready, _, _ = select.select(sockets, [], [], wait_s)
+            # A flood must not keep the processor busy until the tick: what it lacks then is missed
+            # by the companion.
+            ready, _, _ = select.select(sockets if woken < MAX_WAKES else (), [], [], wait_s)
+            woken += 1
             now_us = clock.time_us()
             if now_us - tick_us > MAX_LAG_US:
                 break

@@ -90,7 +90,7 @@ def build_firmware(
 
     flight_stack: FlightStack
     if aircraft.firmware == "builtin":
-        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us()))
+        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us(), pacing.clock))
     else:
         flight_stack = real_firmware(Wanted(aircraft, vehicle, log, ends))
     try:

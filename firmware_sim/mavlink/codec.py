@@ -176,7 +176,13 @@ class Encoder:
     def __init__(self, system_id: int = SYSTEM_ID, component_id: int = COMPONENT_ID) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self._seq = 0
-        self._ids = bytes([system_id, component_id])
+        self._component_id = component_id
+        self.identify(system_id)
+
+    def identify(self, system_id: int) -> None:
+        """Send as another system from now on; the sequence goes on."""
+        self._mav.srcSystem = system_id
+        self._ids = bytes([system_id, self._component_id])
 
     def pack(self, message: WireMessage) -> bytes:
         """Return the frame of a message.

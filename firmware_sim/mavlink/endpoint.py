@@ -6,13 +6,16 @@ import errno
 import ipaddress
 import socket
 from collections import deque
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Iterator, Sequence
+from typing import Protocol, TypeAlias
 
 from airl_mav.core.errors import UsageError
 
 Address = tuple[str, int]
 """IPv4 host (name or number) and UDP port."""
+
+Peer: TypeAlias = "Address | None"
+"""Who is at the other end: the preset remote, or the only one in memory (None), or an address."""
 
 MAX_DATAGRAM = 4096
 """Longest datagram read; MAVLink frames are at most 280 bytes, some senders join several."""
@@ -52,6 +55,21 @@ class Endpoint(Protocol):
         ...
 
 
+class SharedEndpoint(Endpoint, Protocol):
+    """An endpoint that tells its peers apart."""
+
+    def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
+        """Yield what has arrived and from whom, oldest first; a bounded number of chunks.
+
+        What is not taken out of the iterator waits for the next call.
+        """
+        ...
+
+    def towards(self, peer: Peer) -> Endpoint | None:
+        """Return an endpoint that sends to one peer; None for a preset remote that is not set."""
+        ...
+
+
 class MemoryEndpoint:
     """Two queues in one process: for lockstep and tests."""
 
@@ -71,6 +89,16 @@ class MemoryEndpoint:
         while inbox:  # one by one: another thread may be appending
             chunks.append(inbox.popleft())
         return chunks
+
+    def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
+        """Yield the chunks put into `inbox`, oldest first."""
+        inbox = self.inbox
+        while inbox:
+            yield None, inbox.popleft()
+
+    def towards(self, peer: Peer) -> Endpoint | None:
+        """Return this endpoint: there is one other end."""
+        return self if peer is None else None
 
     def send(self, data: bytes) -> None:
         """Append one frame to `outbox`."""
@@ -96,12 +124,45 @@ class MemoryEndpoint:
         """Do nothing."""
 
 
+class UdpPeer:
+    """One address that a bound UDP socket sends to. Receives nothing by itself."""
+
+    datagrams = True
+
+    def __init__(self, bound: socket.socket, address: Address) -> None:
+        self.send_errors = 0
+        self._socket = bound
+        self._address = address
+
+    def receive(self) -> list[bytes]:
+        """Return nothing: the socket's owner sorts what arrives."""
+        return []
+
+    def send(self, data: bytes) -> None:
+        """Send one frame."""
+        try:
+            self._socket.sendto(data, self._address)
+        except OSError:
+            self.send_errors += 1
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send each frame as a datagram of its own."""
+        for frame in frames:
+            self.send(frame)
+
+    def fileno(self) -> int | None:
+        """Return None: the socket's owner waits for it."""
+
+    def close(self) -> None:
+        """Do nothing: the socket is its owner's."""
+
+
 class UdpEndpoint:
     """A bound UDP socket with a preset remote, like a PX4 SITL link.
 
-    Frames are sent to the preset remote from the first tick, before anything was received. A peer
-    that sends from another address gets all frames, too: the newest such peer. So an onboard
-    program on the usual port and one more client can share the link.
+    Frames are sent to the preset remote from the first tick, before anything was received.
+    Whoever tells its peers apart uses `arrivals` and `towards`. With `receive` and `send`, a peer
+    that sends from another address gets all frames, too: the newest such peer.
     """
 
     datagrams = True
@@ -151,17 +212,27 @@ class UdpEndpoint:
     def receive(self) -> list[bytes]:
         """Return the datagrams that have arrived, oldest first, and note their sender."""
         chunks: list[bytes] = []
+        for peer, data in self.arrivals():
+            if peer not in (None, self.peer) and data and data[0] in _MARKERS:
+                self.peer = peer
+            chunks.append(data)
+        return chunks
+
+    def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
+        """Yield the datagrams that have arrived and who sent each, oldest first."""
         for _ in range(MAX_DATAGRAMS_PER_CALL):
             try:
                 data, address = self._socket.recvfrom(MAX_DATAGRAM)
             except BlockingIOError:
-                break
+                return
             except OSError:
                 continue  # an earlier send was refused (ICMP): nothing arrived
-            if address not in (self._remote, self.peer) and data and data[0] in _MARKERS:
-                self.peer = address
-            chunks.append(data)
-        return chunks
+            yield (None if address == self._remote else address), data
+
+    def towards(self, peer: Peer) -> Endpoint | None:
+        """Return an endpoint that sends to one address; None: to the preset remote."""
+        address = self._remote if peer is None else peer
+        return None if address is None else UdpPeer(self._socket, address)
 
     def send(self, data: bytes) -> None:
         """Send one frame to the preset remote and to the learned peer."""

@@ -1,14 +1,22 @@
-"""One MAVLink link: an endpoint, its codec, its streams and its counters."""
+"""One client of a MAVLink link: an endpoint, its codec, its streams and its counters."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMessage, layout
-from firmware_sim.mavlink.endpoint import Endpoint
+from firmware_sim.mavlink.codec import (
+    SYSTEM_ID,
+    Decoder,
+    Encoder,
+    Layout,
+    Values,
+    WireMessage,
+    layout,
+)
+from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
 from firmware_sim.mavlink.rates import GCS_HZ, ONBOARD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
@@ -23,7 +31,7 @@ class LinkConfig:
     """What a link is made of."""
 
     name: str
-    endpoint: Endpoint
+    endpoint: SharedEndpoint
     rates_hz: Mapping[str, float]
     """Default rate per stream [Hz]; streams not named are off."""
     separate_replies: bool = False
@@ -32,12 +40,12 @@ class LinkConfig:
     not take a jump in the sequence for lost messages."""
 
 
-def onboard_link(endpoint: Endpoint, *, separate_replies: bool = False) -> LinkConfig:
+def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the link for the companion (PX4: 14580 -> 14540)."""
     return LinkConfig("onboard", endpoint, ONBOARD_HZ, separate_replies)
 
 
-def gcs_link(endpoint: Endpoint, *, separate_replies: bool = False) -> LinkConfig:
+def gcs_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the link for a ground station (PX4: 18570 -> 14550)."""
     return LinkConfig("gcs", endpoint, GCS_HZ, separate_replies)
 
@@ -57,10 +65,24 @@ class LinkCounters:
     handler."""
     send_errors: int
     """Messages that could not be packed or sent."""
+    dropped: int = 0
+    """Received datagrams that exceeded what their sender may send, or came from one client too
+    many."""
+
+    def __add__(self, other: LinkCounters) -> LinkCounters:
+        """Return the traffic of both together."""
+        return LinkCounters(
+            self.rx + other.rx,
+            self.tx + other.tx,
+            self.malformed + other.malformed,
+            self.ignored + other.ignored,
+            self.send_errors + other.send_errors,
+            self.dropped + other.dropped,
+        )
 
 
 class Link:
-    """Receives and sends the messages of one endpoint.
+    """Receives and sends the messages of one client.
 
     Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) and answers to requests
     (`send`, `send_stream`) share one sequence, in the order of sending, unless
@@ -72,8 +94,14 @@ class Link:
         config: LinkConfig,
         builders: Mapping[str, Builder],
         replies: Mapping[str, Builder] | None = None,
+        *,
+        endpoint: Endpoint | None = None,
+        system_id: int = SYSTEM_ID,
     ) -> None:
-        """Open a link that can stream `builders`, and reply with `replies`; None = the same."""
+        """Open a link that can stream `builders`, and reply with `replies`; None = the same.
+
+        `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's.
+        """
         self.name = config.name
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
@@ -83,11 +111,13 @@ class Link:
         self.tap: Callable[[bytes], None] | None = None
         """Called with every frame of both directions, if set."""
         self.ignored = 0
-        self.endpoint = config.endpoint
+        self.endpoint = config.endpoint if endpoint is None else endpoint
         self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
         self._replies = builders if replies is None else replies
-        self._stream_encoder = Encoder()
-        self._reply_encoder = Encoder() if config.separate_replies else self._stream_encoder
+        self._stream_encoder = Encoder(system_id)
+        self._reply_encoder = (
+            Encoder(system_id) if config.separate_replies else self._stream_encoder
+        )
         self._decoder = Decoder(datagrams=config.endpoint.datagrams)
         self._pending: list[bytes] = []
         """This tick's telemetry."""
@@ -106,16 +136,30 @@ class Link:
             send_errors=self._unsendable + self.endpoint.send_errors,
         )
 
+    def identify(self, system_id: int) -> None:
+        """Send as another system from now on."""
+        self._stream_encoder.identify(system_id)
+        self._reply_encoder.identify(system_id)
+
     def receive(self) -> list[WireMessage]:
         """Return the messages that have arrived, oldest first."""
         messages: list[WireMessage] = []
         for chunk in self.endpoint.receive():
-            messages += self._decoder.feed(chunk)
+            messages += self.decode(chunk)
+        return messages
+
+    def decode(self, chunk: bytes) -> list[WireMessage]:
+        """Return the messages in a chunk of bytes from this client."""
+        messages = self._decoder.feed(chunk)
+        self.note(messages)
+        return messages
+
+    def note(self, messages: Sequence[WireMessage]) -> None:
+        """Count and log messages from this client."""
         self._rx += len(messages)
         if self.tap is not None:
             for message in messages:
                 self.tap(bytes(message.get_msgbuf()))
-        return messages
 
     # --- answers
 

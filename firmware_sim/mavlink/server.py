@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
+from firmware_sim.mavlink.endpoint import Endpoint, Peer
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.senders import Senders
-from firmware_sim.mavlink.services import handle, missions, params, peers
+from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
 from firmware_sim.mavlink.streams.status import system_time
@@ -21,17 +25,8 @@ from firmware_sim.mavlink.tlog import TlogWriter
 _DISCARD_CALLS = 4
 """Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
 
-
-class _Session:
-    """One link and its state."""
-
-    def __init__(self, link: Link, *, separate_replies: bool) -> None:
-        self.link = link
-        self.context: Context | None = None
-        """None while there is no autopilot."""
-        self.texts = TextEncoder()
-        self.reply_texts = TextEncoder(REPLY_IDS) if separate_replies else self.texts
-        self.announced_origin: Geodetic | None = None
+FORGET_EVERY_US = US_PER_S
+"""Silent clients are looked for so often [µs]."""
 
 
 class MavlinkServer:
@@ -43,15 +38,27 @@ class MavlinkServer:
     """
 
     def __init__(
-        self, links: Sequence[LinkConfig], port: AutopilotPort | None = None, *, boot_unix_us: int
+        self,
+        links: Sequence[LinkConfig],
+        port: AutopilotPort | None = None,
+        *,
+        boot_unix_us: int,
+        clock: Clock | None = None,
     ) -> None:
         """Open the links: each streams its default rates from the first `send` on.
 
-        The autopilot may come later (`attach`). `boot_unix_us` is the calendar time of simulated
-        time 0 [µs since 1970, UTC].
+        Args:
+            links: What they are made of.
+            port: The autopilot; None: it comes later (`attach`).
+            boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+            clock: Measures what part of a tick goes into received messages, and bounds it; None,
+                or a clock that stands still meanwhile: it is bounded by their number only.
         """
         self._port: AutopilotPort | None = None
+        self._clock = clock
         self._now_us = 0
+        self._forget_us = 0
+        self._system_id = SYSTEM_ID
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
         self._senders = Senders()
@@ -64,29 +71,28 @@ class MavlinkServer:
             "BATTERY_STATUS": self._battery_status,
             "TIMESYNC": peers.timesync_request,
         }
-        self._sessions = [self._open(config) for config in links]
+        self._links = [self._open(config) for config in links]
         if port is not None:
             self.attach(port)
 
     def attach(self, port: AutopilotPort) -> None:
         """Replace the autopilot, between two episodes.
 
-        Rates that clients have set are kept; running parameter lists and messages for the old
-        autopilot (stale setpoints) are dropped. Simulated time may start anew.
+        Clients and the rates that they have set are kept; running parameter lists and messages for
+        the old autopilot (stale setpoints) are dropped. Simulated time may start anew.
         """
         if self._port is not None:
-            for session in self._sessions:
-                for _ in range(_DISCARD_CALLS):
-                    session.link.ignored += len(session.link.receive())
+            self._discard()
         self._port = port
+        self._forget_us = 0
+        self._system_id = _system_id(port)
         self._senders.forget()
         self._vibration = VibrationMeter()
-        for session in self._sessions:
-            session.context = Context(
-                session.link, port, self._now_us, self._texts.append, self._broadcast
-            )
-            session.announced_origin = None
-            session.link.scheduler.restart()
+        for clients in self._links:
+            clients.restart(self._now_us)
+            for client in clients:
+                self._connect(client, port)
+                client.link.scheduler.restart()
 
     def receive(self, now_us: int) -> int:
         """Read and carry out everything that has arrived by simulated `now_us` [µs].
@@ -95,12 +101,12 @@ class MavlinkServer:
         """
         self._now_us = now_us
         effective = 0
-        for session in self._sessions:
-            for message in session.link.receive():
-                if self._dispatch(session, message):
+        for clients in self._links:
+            for client, message in clients.receive(now_us):
+                if self._dispatch(client, message):
                     effective += 1
                 else:
-                    session.link.ignored += 1
+                    client.link.ignored += 1
         if self._texts:
             self._send_texts()
         return effective
@@ -120,82 +126,130 @@ class MavlinkServer:
         texts = port.take_messages()
         state: AutopilotState | None = None
         payloads: Payloads = {}
-        for session in self._sessions:
-            link = session.link
-            for text in texts:
-                for chunk in session.texts.encode(text):
-                    link.stream(chunk)
-            due = link.scheduler.due(now_us)
-            if due or session.announced_origin is None:
-                # Not in every tick: the snapshot costs more than asking the schedulers.
-                if state is None:
-                    state = port.state()
-                if state.origin is not None and state.origin != session.announced_origin:
-                    session.announced_origin = state.origin
-                    link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
-            if session.context is not None:
-                session.context.now_us = now_us
-                params.send_pending(session.context)
-                missions.send_pending(session.context)
-            if state is not None:
-                link.stream_due(due, state, payloads)
-            link.flush()
+        for clients in self._links:
+            clients.renew()
+            for client in clients:
+                link = client.link
+                for text in texts:
+                    for chunk in client.texts.encode(text):
+                        link.stream(chunk)
+                due = link.scheduler.due(now_us)
+                if due or client.announced_origin is None:
+                    # Not in every tick: the snapshot costs more than asking the schedulers.
+                    if state is None:
+                        state = port.state()
+                    if state.origin is not None and state.origin != client.announced_origin:
+                        client.announced_origin = state.origin
+                        link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
+                if client.context is not None:
+                    client.context.now_us = now_us
+                    send_pending(client.context)
+                if state is not None:
+                    link.stream_due(due, state, payloads)
+                link.flush()
+        if now_us >= self._forget_us:
+            self._forget_us = now_us + FORGET_EVERY_US
+            for clients in self._links:
+                clients.forget_silent(now_us)
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
         """Write both directions of a link to a tlog from now on; None ends it.
 
         The caller closes the writer. Raises ValueError if there is no such link.
         """
-        (session,) = (session for session in self._sessions if session.link.name == link)
-        session.link.tap = None if tlog is None else lambda frame: tlog.write(self._now_us, frame)
+        (clients,) = (clients for clients in self._links if clients.name == link)
+        preset = clients.preset()
+        if preset is not None:
+            preset.link.tap = (
+                None if tlog is None else lambda frame: tlog.write(self._now_us, frame)
+            )
 
     def counters(self) -> dict[str, LinkCounters]:
-        """Return the traffic per link name."""
-        return {session.link.name: session.link.counters for session in self._sessions}
+        """Return the traffic per link name, all its clients together."""
+        return {clients.name: clients.counters for clients in self._links}
 
     def filenos(self) -> list[int]:
         """Return the descriptors that become readable when something arrives."""
-        numbers = (session.link.endpoint.fileno() for session in self._sessions)
+        numbers = (clients.endpoint.fileno() for clients in self._links)
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
         """Close the endpoints."""
-        for session in self._sessions:
-            session.link.endpoint.close()
+        for clients in self._links:
+            clients.endpoint.close()
 
-    def _open(self, config: LinkConfig) -> _Session:
-        builders = self._link_builders()
-        # A requested PING must not advance the sequence of those that are streamed.
-        replies = self._link_builders() if config.separate_replies else builders
-        return _Session(Link(config, builders, replies), separate_replies=config.separate_replies)
+    def _open(self, config: LinkConfig) -> Clients:
+        def welcome(peer: Peer, endpoint: Endpoint) -> Client:
+            builders = self._link_builders()
+            # A requested PING must not advance the sequence of those that are streamed.
+            replies = self._link_builders() if config.separate_replies else builders
+            link = Link(config, builders, replies, endpoint=endpoint, system_id=self._system_id)
+            texts = TextEncoder()
+            reply_texts = TextEncoder(REPLY_IDS) if config.separate_replies else texts
+            client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
+            if self._port is not None:
+                self._connect(client, self._port)
+                link.scheduler.restart()
+            return client
+
+        return Clients(config.name, config.endpoint, welcome, self._clock)
+
+    def _connect(self, client: Client, port: AutopilotPort) -> None:
+        client.link.identify(self._system_id)
+        client.context = Context(
+            client.link,
+            port,
+            self._now_us,
+            self._texts.append,
+            self._broadcast,
+            self._system_id,
+        )
+        client.announced_origin = None
+
+    def _discard(self) -> None:
+        """Drop what has arrived for the autopilot that goes."""
+        for clients in self._links:
+            for _ in range(_DISCARD_CALLS):
+                clients.renew()
+                for client, _message in clients.receive(self._now_us):
+                    client.link.ignored += 1
 
     def _link_builders(self) -> dict[str, Builder]:
         return {**self._builders, "PING": peers.ping_requests()}
 
-    def _dispatch(self, session: _Session, message: WireMessage) -> bool:
-        if (message.get_srcSystem(), message.get_srcComponent()) == (SYSTEM_ID, COMPONENT_ID):
+    def _dispatch(self, client: Client, message: WireMessage) -> bool:
+        if (message.get_srcSystem(), message.get_srcComponent()) == (self._system_id, COMPONENT_ID):
             return False  # an echo of our own message
-        if session.context is None:
+        if client.context is None:
             return False
-        session.context.now_us = self._now_us
-        effective = handle(message, session.context)
+        client.context.now_us = self._now_us
+        effective = handle(message, client.context)
         if effective:
             self._senders.note(message)
         return effective
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""
-        for session in self._sessions:
+        for client in self._all():
             for text in self._texts:
-                for chunk in session.reply_texts.encode(text):
-                    session.link.send(chunk)
+                for chunk in client.reply_texts.encode(text):
+                    client.link.send(chunk)
         self._texts.clear()
 
     def _broadcast(self, message: WireMessage) -> None:
-        for session in self._sessions:
-            session.link.send(message)
+        for client in self._all():
+            client.link.send(message)
+
+    def _all(self) -> Iterator[Client]:
+        return chain.from_iterable(self._links)
 
     def _battery_status(self, state: AutopilotState) -> Values | None:
         if self._port is None:
             return None
         return sensors.battery_status(state, self._port.parameters)
+
+
+def _system_id(port: AutopilotPort) -> int:
+    """Return MAV_SYS_ID, which PX4 reads when it boots."""
+    stored = port.parameters.by_name("MAV_SYS_ID")
+    return SYSTEM_ID if stored is None else int(stored.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from airl_mav.core.clock import Clock
 from firmware_sim.mavlink.endpoint import Address, Endpoint, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -56,6 +57,7 @@ def bind_udp_links(
     return UdpLinks(api, gcs)
 
 
-def udp_server(ends: UdpLinks, boot_unix_us: int) -> MavlinkServer:
+def udp_server(ends: UdpLinks, boot_unix_us: int, clock: Clock) -> MavlinkServer:
     """Return the server of both links, still without an autopilot; see `MavlinkServer`."""
-    return MavlinkServer([onboard_link(ends.api), gcs_link(ends.gcs)], boot_unix_us=boot_unix_us)
+    links = [onboard_link(ends.api), gcs_link(ends.gcs)]
+    return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock)

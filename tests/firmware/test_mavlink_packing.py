@@ -156,8 +156,9 @@ def test_messages_are_known_by_name() -> None:
 
 def streams(bench: Bench) -> dict[str, Callable[[AutopilotState], Values | None]]:
     """Return every builder of the onboard link."""
-    (session, _) = bench.server._sessions
-    return dict(session.link.builders)
+    (clients, _) = bench.server._links
+    (client,) = clients
+    return dict(client.link.builders)
 
 
 def check_streams(autopilot: KinematicAutopilot, bench: Bench) -> set[str]:

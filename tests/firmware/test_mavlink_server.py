@@ -144,7 +144,7 @@ class TwoLanes(MemoryEndpoint):
 
 def ask_anything(client: RawClient, server: MavlinkServer, rng: np.random.Generator) -> None:
     """Send a request that is answered and changes nothing."""
-    streams = list(server._sessions[0].link.builders)
+    streams = list(next(iter(server._links[0])).link.builders)
     name = streams[rng.integers(len(streams))]
     choices = (
         lambda: client.command(512, getattr(dialect, f"MAVLINK_MSG_ID_{name}")),

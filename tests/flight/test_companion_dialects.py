@@ -138,7 +138,8 @@ def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting(
     )
     bench = Bench(endpoint)
     asked: list[int] = []
-    scheduler = next(s for s in bench.server._sessions if s.link.name == "onboard").link.scheduler
+    onboard = next(link for link in bench.server._links if link.name == "onboard")
+    scheduler = next(iter(onboard)).link.scheduler
     set_interval = scheduler.set_interval
 
     def note(name: str, interval_us: int, now_us: int) -> None:

@@ -135,7 +135,7 @@ class Manners:
             link, self.copter.inner, self.copter.time_us, lambda _: None, lambda _: None
         )
         kind = message.get_type()
-        if kind == "COMMAND_LONG" and for_vehicle(message):
+        if kind == "COMMAND_LONG" and for_vehicle(message, context):
             params = [getattr(message, f"param{n}") for n in range(1, 8)]
             result = self._command(message.command, params, context)
             link.send(
@@ -144,7 +144,7 @@ class Manners:
         elif kind == "SET_POSITION_TARGET_LOCAL_NED":
             self._setpoint(message)
         elif kind in ("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_SET"):
-            self._parameter(kind, message, link)
+            self._parameter(kind, message, context)
         elif kind in ("TIMESYNC", "PING", "REQUEST_DATA_STREAM"):
             handle(message, context)
 
@@ -186,10 +186,11 @@ class Manners:
         heading = nan if message.type_mask & _YAW_BIT else message.yaw
         self.copter.velocity(Setpoint(np.full(3, nan), velocity, heading, yaw_rate))
 
-    def _parameter(self, kind: str, message: WireMessage, link: Link) -> None:
+    def _parameter(self, kind: str, message: WireMessage, context: Context) -> None:
         """Values travel as what they are, not as bits of a float; unknown names get no answer."""
-        if not for_vehicle(message):
+        if not for_vehicle(message, context):
             return
+        link = context.link
         values = self.copter.parameters
         names = sorted(values)
         if kind == "PARAM_REQUEST_LIST":

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, Result
-from firmware_sim.mavlink.endpoint import Endpoint, MemoryEndpoint
+from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
@@ -30,7 +30,7 @@ class Bench:
     """A server over two in-memory links, a kinematic autopilot, and a clock moved by hand."""
 
     def __init__(
-        self, onboard: Endpoint | None = None, autopilot: KinematicAutopilot | None = None
+        self, onboard: SharedEndpoint | None = None, autopilot: KinematicAutopilot | None = None
     ) -> None:
         self.onboard = onboard if onboard is not None else MemoryEndpoint()
         self.gcs = MemoryEndpoint()
@@ -246,7 +246,7 @@ def mavsdk_over_memory(
 
 
 @contextmanager
-def mavsdk_over_udp(endpoint: Endpoint, url: str) -> Iterator[tuple[Companion, Pacer]]:
+def mavsdk_over_udp(endpoint: SharedEndpoint, url: str) -> Iterator[tuple[Companion, Pacer]]:
     """Yield MAVSDK connected to a ticking bench through a UDP endpoint."""
     pacer = Pacer(Bench(endpoint))
     mavsdk = _new_mavsdk(ComponentType.COMPANION_COMPUTER)

@@ -21,11 +21,14 @@ Handler = Callable[[WireMessage, Context], bool]
 """Handles one message for this vehicle; returns False if it has no effect."""
 
 
-def _for_anyone(_message: WireMessage) -> bool:
+def _for_anyone(_message: WireMessage, _context: Context) -> bool:
     return True
 
 
-HANDLERS: Mapping[str, tuple[Callable[[WireMessage], bool], Handler]] = MappingProxyType(
+Addressee = Callable[[WireMessage, Context], bool]
+"""Returns whether a message is for this vehicle."""
+
+HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
     {
         "COMMAND_LONG": (commands.is_addressed, commands.handle_command_long),
         "COMMAND_INT": (commands.is_addressed, commands.handle_command_int),
@@ -55,4 +58,16 @@ HANDLERS: Mapping[str, tuple[Callable[[WireMessage], bool], Handler]] = MappingP
 def handle(message: WireMessage, context: Context) -> bool:
     """Return whether a message was for this vehicle and did something; now it has."""
     is_addressed, handler = HANDLERS.get(message.get_type(), (None, None))
-    return bool(is_addressed and handler and is_addressed(message) and handler(message, context))
+    return bool(
+        is_addressed and handler and is_addressed(message, context) and handler(message, context)
+    )
+
+
+PENDING: tuple[Callable[[Context], None], ...] = (params.send_pending, missions.send_pending)
+"""Send the next part of what a client is getting piece by piece; once a tick and client."""
+
+
+def send_pending(context: Context) -> None:
+    """Send a client what is next of all that it is getting piece by piece."""
+    for send in PENDING:
+        send(context)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
-from firmware_sim.mavlink.codec import SYSTEM_ID, WireMessage, dialect, message_id
+from firmware_sim.mavlink.codec import WireMessage, dialect, message_id
 from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services.context import (
@@ -179,7 +179,7 @@ def handle_command_int(message: WireMessage, context: Context) -> bool:
 
 def handle_set_mode(message: WireMessage, context: Context) -> bool:
     """Carry out a SET_MODE, the old message without acknowledgement."""
-    if message.target_system != SYSTEM_ID:
+    if message.target_system != context.system_id:
         return False
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
     _change_mode(message.base_mode, main, sub, context)
@@ -195,11 +195,11 @@ def _handle(message: WireMessage, command: Command, context: Context) -> bool:
     return True
 
 
-def is_addressed(message: WireMessage) -> bool:
+def is_addressed(message: WireMessage, context: Context) -> bool:
     """Return whether a command is for this vehicle: who it is may be asked of all systems."""
     if message.command in (_REQUEST_CAPABILITIES, _REQUEST_PROTOCOL):
-        return message.target_system in (SYSTEM_ID, ANY)
-    return for_vehicle(message)
+        return message.target_system in (context.system_id, ANY)
+    return for_vehicle(message, context)
 
 
 def _stream_name(number: int | None, context: Context) -> str | None:

@@ -17,34 +17,37 @@ ANY = 0
 
 @dataclass(slots=True)
 class Context:
-    """What a handler may use on one link; the server updates `now_us` for every message."""
+    """What a handler may use for one client; the server updates `now_us` for every message."""
 
     link: Link
+    """Answers and streams of the client that asks, and of nobody else."""
     port: AutopilotPort
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators on all links."""
+    """Sends a text to the operators: to all clients of all links."""
     broadcast: Callable[[WireMessage], None]
-    """Sends a message on all links."""
+    """Sends a message to all clients of all links."""
+    system_id: int = SYSTEM_ID
+    """Of this vehicle."""
     next_parameter: int | None = None
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
     """The link's part in the mission protocol."""
 
 
-def for_vehicle(message: WireMessage) -> bool:
+def for_vehicle(message: WireMessage, context: Context) -> bool:
     """Return whether a message is addressed to this vehicle, its autopilot or all components."""
     system: int = message.target_system
     component: int = message.target_component
-    return system == SYSTEM_ID and component in (COMPONENT_ID, ANY)
+    return system == context.system_id and component in (COMPONENT_ID, ANY)
 
 
-def for_vehicle_or_all(message: WireMessage) -> bool:
+def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
     """As `for_vehicle`, and broadcasts to all systems too."""
     system: int = message.target_system
     component: int = message.target_component
-    return system in (SYSTEM_ID, ANY) and component in (COMPONENT_ID, ANY)
+    return system in (context.system_id, ANY) and component in (COMPONENT_ID, ANY)
 
 
 def sender(message: WireMessage) -> tuple[int, int]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
-from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage, dialect
+from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 from firmware_sim.mavlink.services.mission_transfer import RETRY_US, TIMEOUT_US, Activity
@@ -27,9 +27,11 @@ REPEATS = 10
 REPEAT_US = 1_000_000
 
 
-def is_addressed(message: WireMessage) -> bool:
+def is_addressed(message: WireMessage, context: Context) -> bool:
     """Return whether a message is for this vehicle's missions."""
-    return bool(message.target_system == SYSTEM_ID and message.target_component in _PLANNERS)
+    return bool(
+        message.target_system == context.system_id and message.target_component in _PLANNERS
+    )
 
 
 # --- downloads

@@ -1,0 +1,184 @@
+"""Who is at the other end of a link: several clients, each with its streams and its answers.
+
+PX4 SITL has a preset remote on each link (14540, 14550), which hears it before it has said
+anything. Whoever else sends a valid frame becomes a client: it begins with the link's default
+streams, and gets its own answers and parameter lists. What one client asks for changes nothing for
+another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.frames import Geodetic
+from firmware_sim.mavlink.allowance import Allowance
+from firmware_sim.mavlink.codec import Decoder, WireMessage
+from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
+from firmware_sim.mavlink.link import Link, LinkCounters
+from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.texts import TextEncoder
+
+MAX_CLIENTS = 32
+"""Clients of a link at a time, the preset remote not counted."""
+
+SILENT_US = 600 * US_PER_S
+"""A client that has said nothing for so long in simulated time is forgotten [µs]."""
+
+GONE_US = 5 * US_PER_S
+"""Where a link has all its clients, one that was silent for so long makes room for another [µs].
+Heartbeats come every second."""
+
+LISTEN_US = TICK_US // 8
+"""Longest time of a tick that goes into what arrives on one link [µs of the pacing clock]. What is
+left waits for the next tick."""
+
+
+@dataclass(slots=True, eq=False)
+class Client:
+    """One other end of a link."""
+
+    peer: Peer
+    link: Link
+    texts: TextEncoder
+    reply_texts: TextEncoder
+    context: Context | None = None
+    """None while there is no autopilot."""
+    announced_origin: Geodetic | None = None
+    heard_us: int = 0
+    """When it last sent a valid frame, in simulated time [µs]."""
+    allowance: Allowance = field(default_factory=Allowance)
+
+
+class Clients:
+    """The clients of one link."""
+
+    def __init__(
+        self,
+        name: str,
+        endpoint: SharedEndpoint,
+        welcome: Callable[[Peer, Endpoint], Client],
+        clock: Clock | None = None,
+    ) -> None:
+        """Begin with the preset remote, where there is one.
+
+        Args:
+            name: Of the link.
+            endpoint: Where its clients are.
+            welcome: Makes a client of who is heard for the first time.
+            clock: Measures the time that what arrives takes out of a tick; None: it may take any.
+        """
+        self.name = name
+        self.endpoint = endpoint
+        self._welcome = welcome
+        self._clock = clock
+        self._spent_us = 0
+        self._clients: dict[Peer, Client] = {}
+        self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
+        """Reads what nobody known has sent."""
+        self._strangers = Allowance()
+        self._dropped = 0
+        self._gone = LinkCounters(0, 0, 0, 0, 0)
+        preset = endpoint.towards(None)
+        if preset is not None:
+            self._clients[None] = welcome(None, preset)
+
+    def __iter__(self) -> Iterator[Client]:
+        """Iterate over the clients: the preset remote, then by when they came."""
+        return iter(tuple(self._clients.values()))
+
+    def preset(self) -> Client | None:
+        """Return the preset remote."""
+        return self._clients.get(None)
+
+    @property
+    def counters(self) -> LinkCounters:
+        """Traffic so far, of clients that are gone too."""
+        total = self._gone + LinkCounters(
+            0, 0, self._doorkeeper.malformed, self._doorkeeper.unknown, 0, self._dropped
+        )
+        for client in self._clients.values():
+            total += client.link.counters
+        return total
+
+    def renew(self) -> None:
+        """Begin another tick: what arrives may take its time again."""
+        self._spent_us = 0
+
+    def restart(self, now_us: int) -> None:
+        """Take simulated `now_us` [µs] as the present, whatever it was before."""
+        self._strangers.renew()
+        for client in self._clients.values():
+            client.allowance.renew()
+            client.heard_us = now_us
+
+    def receive(self, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
+        """Yield what has arrived by simulated `now_us` [µs], and from whom, oldest first.
+
+        What exceeds the allowance of its sender is dropped and counted; when the link's share of
+        the tick is spent, the rest waits.
+        """
+        clock = self._clock
+        if clock is not None and self._spent_us >= LISTEN_US:
+            return
+        began_us = 0 if clock is None else clock.time_us()
+        spent_us = self._spent_us
+        for peer, chunk in self.endpoint.arrivals():
+            client = self._clients.get(peer)
+            if client is None:
+                client, messages = self._meet(peer, chunk, now_us)
+            elif client.allowance.left(now_us):
+                messages = client.link.decode(chunk)
+                client.allowance.take(max(1, len(messages)), now_us)
+            else:
+                self._dropped += 1
+                messages = []
+            if client is not None and messages:
+                client.heard_us = now_us
+                for message in messages:
+                    yield client, message
+            if clock is not None:
+                self._spent_us = spent_us + clock.time_us() - began_us
+                if self._spent_us >= LISTEN_US:
+                    return
+
+    def forget_silent(self, now_us: int, silent_us: int = SILENT_US) -> None:
+        """Forget who has said nothing for long before simulated `now_us` [µs]."""
+        for peer, client in tuple(self._clients.items()):
+            if peer is not None and now_us - client.heard_us >= silent_us:
+                self._gone += client.link.counters
+                del self._clients[peer]
+
+    def _meet(
+        self, peer: Peer, chunk: bytes, now_us: int
+    ) -> tuple[Client | None, list[WireMessage]]:
+        """Return the client that a stranger becomes by a valid frame, and what it said."""
+        if not self._strangers.left(now_us):
+            self._dropped += 1
+            return None, []
+        messages = self._doorkeeper.feed(chunk)
+        self._strangers.take(max(1, len(messages)), now_us)
+        if not messages:
+            return None, []
+        end = self.endpoint.towards(peer)
+        if end is None or not self._room(now_us):
+            self._dropped += 1
+            return None, []
+        client = self._welcome(peer, end)
+        client.link.note(messages)
+        client.allowance.take(len(messages), now_us)
+        self._clients[peer] = client
+        return client, messages
+
+    def _room(self, now_us: int) -> bool:
+        """Return whether another client can be taken; who has gone silent makes room."""
+        learned = [client for peer, client in self._clients.items() if peer is not None]
+        if len(learned) < MAX_CLIENTS:
+            return True
+        silent_us = now_us - min(client.heard_us for client in learned)
+        if silent_us < GONE_US:
+            return False
+        self.forget_silent(now_us, silent_us)
+        return True
