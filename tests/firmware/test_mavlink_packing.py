@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.frames import local_to_geodetic, quat_from_euler, quat_to_euler, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Mode, Setpoint
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Layout, Values, layout
+from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Layout, Values, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import Link, Payloads, onboard_link
 from firmware_sim.mavlink.streams import BUILDERS, units
