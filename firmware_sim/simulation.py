@@ -45,7 +45,10 @@ class EpisodeSetup:
 
 def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
     """Boot the built-in autopilot. Raises UsageError for a wrong parameter of the vehicle's."""
-    parameters = Parameters(setup.vehicle.autopilot_parameters())
+    overrides = dict(setup.vehicle.autopilot_parameters())
+    if instance := setup.aircraft.real.instance:
+        overrides["MAV_SYS_ID"] = instance + 1  # as PX4 SITL's rcS sets it
+    parameters = Parameters(overrides)
     if setup.aircraft.estimator == "kernel":
         return BuiltinAutopilot(parameters)
     # The library's filter, equal to rounding. Imported late: it brings scipy's statistics along.

@@ -58,6 +58,12 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
         say(f"MAVSDK            udpin://{options.companion_host}:{options.companion_port}")
         if not options.lockstep:
             say(f"QGroundControl    UDP port {options.ports.gcs_port} (connects by itself)")
+            if options.firmware == "builtin":
+                ports = options.open_ports
+                say(
+                    f"system            {options.real.instance + 1}, listens on UDP ports"
+                    f" {ports.api_local_port} (onboard) and {ports.gcs_local_port} (ground)"
+                )
         say(f"depth camera      {camera}")
         if options.firmware != "builtin":
             say(f"firmware          {FIRMWARE_TITLES[options.firmware]}")

@@ -85,7 +85,8 @@ class Inbound:
         self._numbered: Encoders = {}
         self._aside: Encoders = {}
         """Numbers apart, for what comes in any order."""
-        self._own = Encoder()
+        self._own: Encoders = {}
+        """Of the flight controller, for what is answered in its place."""
 
     def take(self, frame: bytes, now_us: int) -> Passed:
         """Sort one frame.
@@ -165,7 +166,10 @@ class Inbound:
 
     def _answer(self, command: WireMessage, result: int) -> bytes:
         sender = command.get_srcSystem(), command.get_srcComponent()
-        return self._own.pack(
+        vehicle = command.target_system, dialect.MAV_COMP_ID_AUTOPILOT1
+        if vehicle not in self._own:
+            self._own[vehicle] = Encoder(*vehicle)
+        return self._own[vehicle].pack(
             dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *sender)
         )
 

@@ -151,7 +151,7 @@ def fly_vehicle_in_lockstep(
     listener = listener or Listener()
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
-    ports = asked.ports
+    ports = asked.open_ports
     with (
         closing(
             UdpEndpoint(

@@ -76,12 +76,13 @@ class Missions:
             LinkError: No flight controller is heard.
         """
         aircraft, clock = self._scenario.scenario, self._clock
+        camera_port = aircraft.open_ports.camera_port
         use = UseMeter(WallClock())
         self._scenario.fresh_policy(aircraft.seed)  # loaded before the first flight
         compensator = self._scenario.compensator()
         with (
             held_to(aircraft.cpu_quota),
-            closing(open_camera(f"tcp://{LOOPBACK}:{aircraft.ports.camera_port}", clock)) as frames,
+            closing(open_camera(f"tcp://{LOOPBACK}:{camera_port}", clock)) as frames,
             closing(
                 MavsdkLink(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon)
             ) as link,

@@ -76,7 +76,7 @@ def build_firmware(
     Raises:
         UsageError: A port is taken, an address unusable, or real firmware is not there.
     """
-    ports = aircraft.ports
+    ports = aircraft.open_ports
 
     def ends() -> UdpLinks:
         return bind_udp_links(

@@ -73,7 +73,8 @@ class RealFirmware(ProfileModel):
         " flight",
     )
     instance: int = quantity(
-        "with PX4 or ArduPilot SITL: instance number; moves all of its ports, as -i and -I do",
+        "instance number: moves all ports of the flight controller and that of the camera, as PX4's"
+        " -i and ArduPilot's -I do; the built-in one is system N + 1 then, as PX4 is",
         "1",
         ge=0,
         le=9,
@@ -128,7 +129,22 @@ class Aircraft(ProfileModel):
     ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
 
     @property
+    def open_ports(self) -> Ports:
+        """The ports of this instance.
+
+        As PX4's number `-i` does, it moves all of them but the ground station's. Real firmware
+        moves its own.
+        """
+        moved = ["camera_port"]
+        if self.firmware == "builtin":
+            moved += ["api_port", "api_local_port", "gcs_local_port"]
+        asked = self.ports.model_dump()
+        # 0 stays 0: any free one.
+        by_name = {name: asked[name] and asked[name] + self.real.instance for name in moved}
+        return self.ports.model_copy(update=by_name)
+
+    @property
     def companion_port(self) -> int:
         """The UDP port on which a companion listens for the flight controller."""
         moved = self.real.instance if self.firmware == "px4" else 0
-        return self.ports.api_port + moved
+        return self.open_ports.api_port + moved

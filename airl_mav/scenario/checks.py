@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from airl_mav.core.errors import FieldError
-from airl_mav.scenario.aircraft import NO_TWIN, Aircraft, Ports
+from airl_mav.scenario.aircraft import GREATEST_PORT, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
 
 SITL_SPEEDS = 0.5, 10.0
@@ -50,6 +50,9 @@ def check_ports(ports: Ports, *, any_camera: bool) -> None:
     for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
         if getattr(ports, field) == 0:
             raise FieldError(f"ports.{field}", 0, "1 <= value <= 65535")
+    for field, port in ports:
+        if port > GREATEST_PORT:
+            raise FieldError(f"ports.{field}", port, f"value + instance <= {GREATEST_PORT}")
     if ports.api_port == ports.gcs_port:
         raise FieldError("ports.gcs_port", ports.gcs_port, "another than that of the onboard API")
 

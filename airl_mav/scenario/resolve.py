@@ -30,7 +30,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     check_firmware(scenario, scenario.level, scenario.speed)
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: it cannot be "any free one" here.
-        check_ports(scenario.ports, any_camera=False)
+        check_ports(scenario.open_ports, any_camera=False)
     policy = find_policy(scenario.policy)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)

@@ -187,7 +187,7 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
 
 def check_vehicle(asked: StandAloneVehicle) -> None:
     """Raise FieldError for what can be seen to be wrong before a port is bound."""
-    check_ports(asked.ports, any_camera=True)
+    check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
     check_firmware(asked, "lockstep" if asked.lockstep else "sitl", speed)
     low, high = LOCKSTEP_SPEEDS if asked.lockstep else SPEEDS
