@@ -75,6 +75,7 @@ class BuiltinAutopilot:
         self._pressure_hpa = math.nan
         self._gps: GpsFix | None = None
         self._home: Geodetic | None = None
+        self._armed_us = self._takeoff_us = 0
         self._snapshot: AutopilotState | None = None
         self.on_setpoint: Callable[[Setpoint, int], None] | None = None
         """Called with every accepted setpoint and its time of receipt, if set."""
@@ -141,11 +142,23 @@ class BuiltinAutopilot:
             return step.result
         if step.flight.mode is not before.mode:
             self._guidance.enter(step.flight.mode, self._state)
+        if step.flight.phase is not before.phase:
+            self._note_times(step.flight.phase)
         if before.phase < _GROUND <= step.flight.phase:
             self._failsafe.armed()
             self._set_home()
             self._guidance.enter(step.flight.mode, self._state)
         return step.result
+
+    def _note_times(self, phase: Phase) -> None:
+        """Note when it was armed and took off, and forget both once it is disarmed."""
+        now_us = self._now_us
+        if phase < _GROUND:
+            self._armed_us = self._takeoff_us = 0
+        elif self._armed_us == 0:
+            self._armed_us = now_us
+        if phase is _AIR and self._takeoff_us == 0:
+            self._takeoff_us = now_us
 
     def _say(self, message: Message) -> None:
         self._messages.append(message)
@@ -272,6 +285,8 @@ class BuiltinAutopilot:
             gps=self._gps,
             home=self._home,
             origin=self.estimator.origin,
+            armed_us=self._armed_us,
+            takeoff_us=self._takeoff_us,
             mission=progress(self.plans),
         )
         return self._snapshot

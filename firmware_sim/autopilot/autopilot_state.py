@@ -181,4 +181,8 @@ class AutopilotState(NamedTuple):
     """The point of the globe where local NED is zero; None before the first fix."""
     load: float = 0.0
     """Share of the tick spent computing, 0..1."""
+    armed_us: int = 0
+    """When it was armed [µs], 0 while it is not."""
+    takeoff_us: int = 0
+    """When it left the ground [µs], 0 before."""
     mission: MissionProgress = NO_MISSION

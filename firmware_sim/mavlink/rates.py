@@ -1,9 +1,8 @@
 """Default stream rates of the two links, as measured on a real PX4 1.16 SITL.
 
-Messages that PX4 sends and we do not are left out: CURRENT_MODE, TIME_ESTIMATE_TO_TARGET,
-CURRENT_EVENT_SEQUENCE, LINK_NODE_STATUS (not in pymavlink's common dialect), OPEN_DRONE_ID_*,
-DISTANCE_SENSOR (the vehicle has no such device). The tables' order is the order on the wire
-when several messages are due in the same tick.
+Messages that PX4 sends and we do not are left out: TIME_ESTIMATE_TO_TARGET, CURRENT_EVENT_SEQUENCE,
+LINK_NODE_STATUS, OPEN_DRONE_ID_*, DISTANCE_SENSOR (the vehicle has no such device). The tables'
+order is the order on the wire when several messages are due in the same tick.
 """
 
 from __future__ import annotations
@@ -39,6 +38,9 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "BATTERY_STATUS": 0.5,
         "HOME_POSITION": 0.5,
         "VIBRATION": 0.5,
+        "CURRENT_MODE": 0.5,
+        "ESC_INFO": 10.0,
+        "ESC_STATUS": 10.0,
     }
 )
 """Onboard (API) link, 14580 -> 14540 [Hz]."""
@@ -65,6 +67,9 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "HOME_POSITION": 0.5,
         "PING": 0.1,
         "VIBRATION": 0.1,
+        "CURRENT_MODE": 0.5,
+        "ESC_INFO": 1.0,
+        "ESC_STATUS": 1.0,
     }
 )
 """Ground station link, 18570 -> 14550 [Hz]."""

@@ -55,8 +55,8 @@ def test_refusals_and_their_words(rig: Rig) -> None:
 
 @pytest.mark.parametrize("action", [2.0, -1.0, NAN, math.inf])
 def test_arm_parameter_must_be_0_or_1(rig: Rig, action: float) -> None:
-    result, messages = rig.command(400, action)
-    assert result == UNSUPPORTED
+    messages = rig.exchange(dialect.MAVLink_command_long_message(1, 1, 400, 0, action, *[NAN] * 6))
+    assert [m for m in messages if m.get_type() == "COMMAND_ACK"] == []  # as PX4
     assert text_of(messages) == [(2, f"Unsupported ARM_DISARM param: {action:.3f}")]
     assert rig.autopilot.commands == []
 
@@ -158,7 +158,7 @@ def test_reboot_is_refused(rig: Rig) -> None:
     assert rig.command(246, 1)[0] == DENIED
 
 
-@pytest.mark.parametrize("number", [192, 16, 300, 519, 31_000])
+@pytest.mark.parametrize("number", [192, 16, 300, 31_000])
 def test_unknown_commands_are_unsupported(rig: Rig, number: int) -> None:
     assert rig.command(number, 1, 2, 3)[0] == UNSUPPORTED
 

@@ -285,7 +285,8 @@ def test_refusals_come_at_once_and_by_name() -> None:
         telemetry, action = ready(companion), companion.plugin(Action)
         assert failure(lambda: action.goto_location(47.0, 8.0, 500.0, 0.0)) == "UNSUPPORTED"
         assert failure(action.reboot) == "COMMAND_DENIED"
-        assert failure(lambda: telemetry.set_rate_distance_sensor(10.0)) == "UNSUPPORTED"
+        telemetry.set_rate_distance_sensor(10.0)  # PX4 takes a rate for a device that it lacks
+        assert failure(lambda: telemetry.set_rate_raw_imu(5.0)) == "UNKNOWN"  # and not this one
         assert failure(lambda: companion.plugin(Ftp).list_directory("/")) != "TIMEOUT"
         companion.plugin(MissionRaw).clear_mission()
         action.arm()

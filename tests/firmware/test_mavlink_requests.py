@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 
 import pytest
-from pymavlink.dialects.v20 import common as dialect
 
+from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import CAPABILITIES
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import Rig
 
 NAN = math.nan
-ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
+ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
 
 
 @pytest.fixture
@@ -40,9 +40,13 @@ def test_message_interval(rig: Rig) -> None:
     assert rig.command(511, attitude, 0)[0] == ACCEPTED
     assert rig.command(511, local, 0)[0] == ACCEPTED
     assert rate() == (200, 60)
-    assert rig.command(511, attitude, NAN)[0] == DENIED
-    assert rig.command(511, 132, 10_000)[0] == UNSUPPORTED  # DISTANCE_SENSOR
-    assert rig.command(511, NAN, 10_000)[0] == UNSUPPORTED
+    rig.command(511, attitude, 4_000)
+    assert rig.command(511, attitude, NAN)[0] == ACCEPTED  # not given: the default
+    assert rig.command(511, attitude, math.inf)[0] == ACCEPTED
+    assert rig.command(511, attitude, 0)[0] == ACCEPTED
+    for no_stream in (9_999, dialect.MAVLINK_MSG_ID_HEARTBEAT, NAN):
+        assert rig.command(511, no_stream, 10_000)[0] == FAILED
+    assert rig.command(511, dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR, 10_000)[0] == ACCEPTED
     assert rate() == (200, 60)
 
 
@@ -63,7 +67,8 @@ def test_get_message_interval(rig: Rig) -> None:
     assert interval(30) == (30, 10_000)
     rig.command(511, 30, -1)
     assert interval(30) == (30, -1)
-    assert interval(132) == (132, 0)
+    assert interval(9_999) == (9_999, 0)
+    assert interval(132) == (132, -1)
     assert rig.command(510, NAN)[0] == DENIED
     assert rig.command(510, -5)[0] == DENIED
     result, messages = rig.command(512, 244, 32)
@@ -72,7 +77,13 @@ def test_get_message_interval(rig: Rig) -> None:
     assert (message.message_id, message.interval_us) == (32, 33_333)
 
 
-@pytest.mark.parametrize("number", [148, 242, 245, 0, 1, 2, 4, 24, 30, 32, 49, 105, 111, 147, 331])
+@pytest.mark.parametrize(
+    "number",
+    [
+        *(148, 242, 245, 0, 1, 2, 4, 24, 26, 30, 32, 49, 93, 105, 111, 147, 264),
+        *(290, 291, 300, 331, 375, 436),
+    ],
+)
 def test_requested_messages_come_before_their_acknowledgement(rig: Rig, number: int) -> None:
     rig.client.command(512, number)
     rig.bench.server.receive(rig.autopilot.time_us)
@@ -81,9 +92,11 @@ def test_requested_messages_come_before_their_acknowledgement(rig: Rig, number: 
     assert (ack.get_type(), ack.result) == ("COMMAND_ACK", ACCEPTED)
 
 
-@pytest.mark.parametrize("number", [435, 397, 395, 300, 264, 132, NAN])
-def test_requests_for_what_we_do_not_have(rig: Rig, number: float) -> None:
-    assert rig.command(512, number)[0] == UNSUPPORTED
+@pytest.mark.parametrize("number", [132, 225, 410, 412, 437, 9_999, NAN])
+def test_requests_for_what_has_nothing_to_say(rig: Rig, number: float) -> None:
+    result, messages = rig.command(512, number)
+    assert result == DENIED
+    assert [m for m in messages if m.get_msgId() == number] == []
 
 
 def test_requests_for_what_is_not_known_yet() -> None:

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pymavlink import mavutil
-from pymavlink.dialects.v20 import common as dialect
 
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Message, Severity
+from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -96,9 +96,9 @@ def test_the_snapshot_is_only_taken_when_there_is_something_to_send(
     endpoint = MemoryEndpoint()
     server = MavlinkServer([onboard_link(endpoint)], autopilot, boot_unix_us=0)
     client = RawClient(endpoint)
-    client.command(511, dialect.MAVLINK_MSG_ID_HEARTBEAT, 100_000)
+    client.command(511, dialect.MAVLINK_MSG_ID_ATTITUDE, 100_000)
     for number in dialect.mavlink_map:
-        if number != dialect.MAVLINK_MSG_ID_HEARTBEAT:
+        if number != dialect.MAVLINK_MSG_ID_ATTITUDE:
             client.command(511, number, -1)
     for _ in range(100):  # the origin is announced on the way
         autopilot.step()
@@ -118,8 +118,10 @@ def test_the_snapshot_is_only_taken_when_there_is_something_to_send(
         autopilot.step()
         server.receive(autopilot.time_us)
         server.send(autopilot.time_us)
-    assert client.count() == {"HEARTBEAT": 10}
-    assert taken == 10
+    # Those two have rates that no client can change.
+    counts = client.count()
+    assert counts == {"ATTITUDE": 10, "HEARTBEAT": 1, "MISSION_CURRENT": 1}
+    assert taken == counts.total()
 
 
 # --- the two lanes of a link
@@ -242,5 +244,7 @@ def test_a_log_has_both_lanes_in_the_order_of_sending(tmp_path: Path) -> None:
     logged = list(iter(log.recv_msg, None))
     log.close()
     ours = [bytes(m.get_msgbuf()) for m in logged if m.get_srcSystem() == 1]
-    assert ours == endpoint.take()
-    assert len(logged) - len(ours) == 500
+    # mavutil reads a log with its own dialect: it skips what is newer.
+    known = mavutil.mavlink.mavlink_map
+    assert ours == [f for f in endpoint.take() if int.from_bytes(f[7:10], "little") in known]
+    assert sum(m.get_srcSystem() == 245 for m in logged) == 500

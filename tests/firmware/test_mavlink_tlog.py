@@ -51,7 +51,9 @@ def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) ->
     logged = read(path)
     assert not tlog.partial_path.exists()
     own = [m for m in logged if m.get_srcSystem() == 1]
-    assert [bytes(m.get_msgbuf()) for m in own] == sent
+    # mavutil reads a log with its own dialect: it skips what is newer.
+    known = [f for f in sent if int.from_bytes(f[7:10], "little") in mavutil.mavlink.mavlink_map]
+    assert [bytes(m.get_msgbuf()) for m in own] == known
     (other,) = [m for m in logged if m.get_srcSystem() == 245]
     assert (other.get_type(), other.seq) == ("PING", 77)
     assert not [m for m in logged if m.get_type() == "PING" and m.seq == 99]

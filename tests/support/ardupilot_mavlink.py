@@ -20,6 +20,7 @@ from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle, peers
+from firmware_sim.mavlink.services.command import Command
 from firmware_sim.mavlink.services.context import Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.texts import TextEncoder
@@ -167,8 +168,9 @@ class Manners:
             dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
         ):
             a, b, c, d, e, f, g = params
-            command = commands.Command(number, (a, b, c, d, e, f, g))
-            return commands.ACTIONS[number](command, context)
+            result = commands.ACTIONS[number](Command(number, (a, b, c, d, e, f, g)), context)
+            assert result is not None
+            return result
         return Result.UNSUPPORTED
 
     def _setpoint(self, message: WireMessage) -> None:

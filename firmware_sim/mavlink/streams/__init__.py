@@ -11,7 +11,15 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import pose, sensors, status
+from firmware_sim.mavlink.streams import (
+    actuators,
+    flight_modes,
+    information,
+    pose,
+    sensors,
+    status,
+)
+from firmware_sim.mavlink.streams.silent import SILENT
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in the order of its definition, from a snapshot; None = there is
@@ -19,6 +27,7 @@ nothing to say yet. Plain values, because message objects would cost more than a
 
 BUILDERS: Mapping[str, Builder] = MappingProxyType(
     {
+        **SILENT,
         "HEARTBEAT": status.heartbeat,
         "ATTITUDE": pose.attitude,
         "ATTITUDE_QUATERNION": pose.attitude_quaternion,
@@ -29,7 +38,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "ALTITUDE": pose.altitude,
         "ATTITUDE_TARGET": pose.attitude_target,
         "POSITION_TARGET_LOCAL_NED": pose.position_target_local_ned,
-        "SERVO_OUTPUT_RAW": sensors.servo_output_raw,
+        "SERVO_OUTPUT_RAW": actuators.servo_output_raw,
         "VFR_HUD": pose.vfr_hud,
         "GPS_RAW_INT": sensors.gps_raw_int,
         "EXTENDED_SYS_STATE": status.extended_sys_state,
@@ -40,6 +49,14 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "HOME_POSITION": pose.home_position,
         "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
+        "CURRENT_MODE": flight_modes.current_mode,
+        "ESC_INFO": actuators.esc_info,
+        "ESC_STATUS": actuators.esc_status,
+        "ACTUATOR_OUTPUT_STATUS": actuators.actuator_output_status,
+        "HIL_ACTUATOR_CONTROLS": actuators.hil_actuator_controls,
+        "SCALED_IMU": sensors.scaled_imu,
+        "FLIGHT_INFORMATION": information.flight_information,
+        "PROTOCOL_VERSION": information.protocol_version,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.vehicle import atmosphere
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
@@ -15,9 +16,6 @@ _IMU_FIELDS = 0b1_1011_1111_1111
 
 _NO_AIRSPEED = 0.0
 """Differential pressure: there is no such sensor."""
-
-_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
-"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
 
 _NO_CELL_VOLTAGES = (units.UINT16_MAX,) * 9
 """BATTERY_STATUS.voltages[1:]."""
@@ -43,6 +41,21 @@ def highres_imu(state: AutopilotState) -> Values:
         atmosphere.altitude_m(state.pressure_hpa),
         state.temperature_c,
         _IMU_FIELDS,
+    )
+
+
+def scaled_imu(state: AutopilotState) -> Values:
+    """Newest IMU sample, biases removed [mG, mrad/s], and magnetic field [mGauss]."""
+    estimate = state.estimate
+    return (
+        units.boot_ms(state.time_us),
+        *(
+            units.int16(a * 1e3 / GRAVITY_M_S2)
+            for a in (state.accel - estimate.accel_bias).tolist()
+        ),
+        *(units.int16(w * 1e3) for w in (state.gyro - estimate.gyro_bias).tolist()),
+        *(units.int16(m * 1e3) for m in state.mag.tolist()),
+        units.int16(state.temperature_c * 100.0),
     )
 
 
@@ -105,16 +118,6 @@ def _charge_state(remaining: float, parameters: ParameterStore) -> int:
         if remaining < threshold.value:
             state = warning
     return state
-
-
-def servo_output_raw(state: AutopilotState) -> Values:
-    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
-    if state.status.arming is Arming.ARMED:
-        pulses = [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
-    else:
-        pulses = [_PWM_DISARMED] * len(state.motors)
-    port = 0
-    return state.time_us & units.UINT32_MAX, port, *pulses, 0, 0, 0, 0
 
 
 def percent(share: float) -> int:

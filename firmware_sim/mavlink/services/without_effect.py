@@ -1,0 +1,60 @@
+"""Commands that do nothing here and are answered as a running PX4 1.16 SITL answers them.
+
+Some that PX4 accepts need no more than that (there is nothing to switch); some it hands to a part
+of the vehicle that is not there, and so nobody acknowledges them.
+"""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.services.command import Action, Command
+from firmware_sim.mavlink.services.context import Context
+
+ACCEPTED = (
+    dialect.MAV_CMD_DO_SET_ACTUATOR,
+    dialect.MAV_CMD_DO_GO_AROUND,
+    dialect.MAV_CMD_RUN_PREARM_CHECKS,
+)
+
+NOT_ACKNOWLEDGED = (
+    dialect.MAV_CMD_ACTUATOR_TEST,
+    dialect.MAV_CMD_SET_CAMERA_MODE,
+    dialect.MAV_CMD_DO_DIGICAM_CONTROL,
+    dialect.MAV_CMD_DO_TRIGGER_CONTROL,
+    dialect.MAV_CMD_DO_GRIPPER,
+    dialect.MAV_CMD_DO_WINCH,
+    dialect.MAV_CMD_DO_MOUNT_CONTROL,
+    dialect.MAV_CMD_DO_MOUNT_CONFIGURE,
+    dialect.MAV_CMD_DO_MOUNT_CONTROL_QUAT,
+    dialect.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW,
+    dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE,
+    dialect.MAV_CMD_REQUEST_CAMERA_INFORMATION,
+    dialect.MAV_CMD_NAV_DELAY,
+    dialect.MAV_CMD_DO_VTOL_TRANSITION,
+    dialect.MAV_CMD_PREFLIGHT_SET_SENSOR_OFFSETS,
+    dialect.MAV_CMD_PREFLIGHT_UAVCAN,
+    dialect.MAV_CMD_PAYLOAD_PREPARE_DEPLOY,
+    dialect.MAV_CMD_PAYLOAD_CONTROL_DEPLOY,
+)
+
+
+def _accept(_command: Command, _context: Context) -> Result:
+    return Result.ACCEPTED
+
+
+def _ignore(_command: Command, _context: Context) -> None:
+    return None
+
+
+def _high_latency(_command: Command, context: Context) -> Result:
+    text = "Control high latency failed! Telemetry unavailable"
+    context.announce(Message(Severity.CRITICAL, text))
+    return Result.FAILED
+
+
+ACTIONS: dict[int, Action] = {
+    **dict.fromkeys(ACCEPTED, _accept),
+    **dict.fromkeys(NOT_ACKNOWLEDGED, _ignore),
+    dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
+}

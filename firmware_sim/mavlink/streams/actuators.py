@@ -1,0 +1,85 @@
+"""What the motors are told, and what their speed controllers report."""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.mavlink.codec import Values, dialect
+from firmware_sim.mavlink.px4_custom_mode import base_mode
+from firmware_sim.mavlink.streams import units
+
+_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
+"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
+
+_OUTPUTS = 16
+"""Of PX4's simulation. Those that drive no motor stay at the disarmed pulse."""
+
+_OUTPUT_FIELDS = 32
+"""Slots of ACTUATOR_OUTPUT_STATUS."""
+
+_ESC_RPM, _ESC_IDLE_A, _ESC_SPAN_A = 6_000, 1.0, 15.0
+_ESC_IDLE_C, _ESC_SPAN_C = 20.0, 40.0
+"""Speed [rpm], current [A] and temperature [°C] of a speed controller, by the command 0..1.
+Source: PX4 1.16, SimulatorMavlink::send_esc_telemetry: it has no model of them."""
+
+_NO_FAILURES = (0, 0, 0, 0)
+_FIRST_ESC = 0
+_ESCS = 4
+
+
+def servo_output_raw(state: AutopilotState) -> Values:
+    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
+    port = 0
+    return state.time_us & units.UINT32_MAX, port, *_pulses(state), 0, 0, 0, 0
+
+
+def actuator_output_status(state: AutopilotState) -> Values:
+    """The same pulse widths as an array of 16 outputs in use."""
+    pulses = _pulses(state)
+    unused = (_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
+    return state.time_us, _OUTPUTS, *pulses, *unused, *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
+
+
+def hil_actuator_controls(state: AutopilotState) -> Values:
+    """Motor commands 0..1, zero while disarmed; 16 controls."""
+    commands, flags = _commands(state), 0
+    unused = (0.0,) * (_OUTPUTS - len(commands))
+    return state.time_us, *commands, *unused, base_mode(state.status), flags
+
+
+def esc_info(state: AutopilotState) -> Values:
+    """Four speed controllers, all of them on line; temperature [0.01 °C]."""
+    counter, online = 0, (1 << _ESCS) - 1
+    temperature = (units.int16((_ESC_IDLE_C + _ESC_SPAN_C * u) * 100.0) for u in _commands(state))
+    return (
+        *(_FIRST_ESC, state.time_us, counter, _ESCS),
+        *(dialect.ESC_CONNECTION_TYPE_PPM, online),
+        *_NO_FAILURES,
+        *_NO_FAILURES,
+        *temperature,
+    )
+
+
+def esc_status(state: AutopilotState) -> Values:
+    """Speed [rpm], voltage [V] and current [A] of four speed controllers."""
+    commands = _commands(state)
+    armed = _armed(state)
+    return (
+        *(_FIRST_ESC, state.time_us),
+        *(round(_ESC_RPM * u) for u in commands),
+        *(state.battery.voltage_v,) * _ESCS,
+        *(_ESC_IDLE_A + _ESC_SPAN_A * u if armed else 0.0 for u in commands),
+    )
+
+
+def _armed(state: AutopilotState) -> bool:
+    return state.status.arming is Arming.ARMED
+
+
+def _commands(state: AutopilotState) -> tuple[float, ...]:
+    return state.motors if _armed(state) else (0.0,) * len(state.motors)
+
+
+def _pulses(state: AutopilotState) -> list[int]:
+    if not _armed(state):
+        return [_PWM_DISARMED] * len(state.motors)
+    return [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]

@@ -1,0 +1,69 @@
+"""Standard modes: AVAILABLE_MODES, CURRENT_MODE, DO_SET_STANDARD_MODE."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.px4_custom_mode import custom_mode
+from firmware_sim.mavlink.streams.flight_modes import KNOWN, existing
+from tests.support.mavlink_clients import Rig
+
+REQUEST_MESSAGE, SET_STANDARD_MODE = 512, 262
+ACCEPTED, REJECTED, DENIED, FAILED = 0, 1, 2, 4
+
+
+def modes(rig: Rig, number: int) -> tuple[int, list[Any]]:
+    result, messages = rig.command(
+        REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_AVAILABLE_MODES, number, 0, 0, 0, 0, 0
+    )
+    return result, [m for m in messages if m.get_type() == "AVAILABLE_MODES"]
+
+
+def test_every_mode_that_exists_is_available() -> None:
+    result, found = modes(Rig(), 0)
+    assert result == ACCEPTED
+    assert {m.custom_mode for m in found} == {custom_mode(mode) for mode in Mode}
+    assert [m.mode_index for m in found] == list(range(1, len(Mode) + 1))
+    assert {m.number_modes for m in found} == {len(Mode)}
+    by_custom = {m.custom_mode: m for m in found}
+    hold, land = by_custom[custom_mode(Mode.HOLD)], by_custom[custom_mode(Mode.LAND)]
+    assert (hold.standard_mode, hold.mode_name) == (0, "Hold")
+    assert (land.standard_mode, land.mode_name) == (dialect.MAV_STANDARD_MODE_LAND, "")
+
+
+def test_one_mode_is_asked_for_by_its_number() -> None:
+    rig = Rig()
+    result, (one,) = modes(rig, 2)
+    assert (result, one.mode_index) == (ACCEPTED, 2)
+    assert modes(rig, len(Mode) + 1) == (DENIED, [])
+
+
+def test_the_current_mode_is_streamed_and_is_one_of_the_available() -> None:
+    rig = Rig()
+    rig.bench.run(4.0)
+    current = [m for m in rig.client.received() if m.get_type() == "CURRENT_MODE"]
+    assert len(current) == 2
+    assert {m.custom_mode for m in current} <= {known.custom_mode for known in existing()}
+    assert current[0].intended_custom_mode == custom_mode(Mode.HOLD)
+
+
+@pytest.mark.parametrize("known", [k for k in existing() if k.standard], ids=lambda k: k.standard)
+def test_a_standard_mode_that_exists_is_changed_to(known: Any) -> None:
+    rig = Rig()
+    rig.command(SET_STANDARD_MODE, known.standard)
+    asked = Mode[rig.autopilot.commands[-1].removeprefix("mode ")]
+    assert custom_mode(asked) == known.custom_mode
+
+
+def test_standard_modes_that_are_lacking_are_refused() -> None:
+    rig = Rig()
+    lacking = {k.standard for k in KNOWN} - {k.standard for k in existing()}
+    for standard in lacking:
+        assert rig.command(SET_STANDARD_MODE, standard)[0] in (REJECTED, FAILED)
+    # Those that no multicopter has: none, cruise, and numbers that mean nothing.
+    for number in (0, 3, 9, 99, float("nan")):
+        assert rig.command(SET_STANDARD_MODE, number)[0] == FAILED
