@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
+from airl_mav.core.kernels import kernel
 
 Floats = NDArray[np.float64]
 
@@ -57,9 +58,21 @@ def bounding_boxes(obstacles: Obstacles) -> Boxes:
 
 def outside_all(points: Floats, boxes: Boxes) -> NDArray[np.bool_]:
     """Return (q,) whether each point (q, 2) [m] is outside, or on the edge, of every box."""
-    gap: Floats = np.abs(points[:, None, :] - boxes.center) - boxes.half
-    free: NDArray[np.bool_] = np.all(np.any(gap >= 0.0, axis=2), axis=1)
+    free = np.empty(len(points), np.bool_)
+    _outside_all(points, boxes.center, boxes.half, free)
     return free
+
+
+@kernel
+def _outside_all(points: Floats, center: Floats, half: Floats, free: NDArray[np.bool_]) -> None:
+    for i in range(len(points)):
+        free[i] = True
+        for j in range(len(center)):
+            north = abs(points[i, 0] - center[j, 0]) - half[j, 0]
+            east = abs(points[i, 1] - center[j, 1]) - half[j, 1]
+            if north < 0.0 and east < 0.0:
+                free[i] = False
+                break
 
 
 def segments_clear(start: Floats, ends: Floats, boxes: Boxes) -> NDArray[np.bool_]:
@@ -67,16 +80,30 @@ def segments_clear(start: Floats, ends: Floats, boxes: Boxes) -> NDArray[np.bool
 
     Slab method: a segment meets a box when its stays between the box's two pairs of lines overlap.
     """
-    # A step of zero along an axis becomes a tiny one: it never leaves, or never reaches, the slab.
-    step = ends - start
-    step = np.where(np.abs(step) < 1e-12, 1e-12, step)[:, None, :]
-    low = (boxes.center - boxes.half - start) / step
-    high = (boxes.center + boxes.half - start) / step
-    enter = np.minimum(low, high).max(axis=2)
-    leave = np.maximum(low, high).min(axis=2)
-    hit = (enter <= leave) & (leave >= 0.0) & (enter <= 1.0)
-    clear: NDArray[np.bool_] = ~np.any(hit, axis=1)
+    clear = np.empty(len(ends), np.bool_)
+    _segments_clear(start, ends, boxes.center, boxes.half, clear)
     return clear
+
+
+@kernel
+def _segments_clear(
+    start: Floats, ends: Floats, center: Floats, half: Floats, clear: NDArray[np.bool_]
+) -> None:
+    for i in range(len(ends)):
+        clear[i] = True
+        for j in range(len(center)):
+            enter, leave = -math.inf, math.inf
+            for axis in range(2):
+                step = ends[i, axis] - start[axis]
+                if abs(step) < 1e-12:
+                    # It never leaves, or never reaches, the slab.
+                    step = 1e-12
+                low = (center[j, axis] - half[j, axis] - start[axis]) / step
+                high = (center[j, axis] + half[j, axis] - start[axis]) / step
+                enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
+            if enter <= leave and leave >= 0.0 and enter <= 1.0:
+                clear[i] = False
+                break
 
 
 def inner(bounds: Bounds, margin: float | Floats) -> tuple[Floats, Floats]:
