@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,11 +62,27 @@ def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
     return batch
 
 
+def with_room(batch: ArenaBatch, arena: Arena) -> ArenaBatch:
+    """Return a batch with the same arenas in which there is room for another one."""
+    room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
+    need = _room_of(arena)
+    larger = empty_batch(len(batch.bounds), *map(max, room, need))
+    arrays: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(batch, larger, strict=True)
+    for old, new in arrays:
+        new[tuple(map(slice, old.shape))] = old
+    return larger
+
+
+def _room_of(arena: Arena) -> tuple[int, int, int]:
+    """Return how many obstacles, movers and way-points an arena has."""
+    points = max((len(tour.times_s) for tour in arena.tours), default=0)
+    return len(arena.obstacles), len(arena.tours), points
+
+
 def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     """Write an arena into row i. Raises ValueError when it needs more room than there is."""
     o = arena.obstacles
-    count, movers = len(o), len(arena.tours)
-    points = max((len(tour.times_s) for tour in arena.tours), default=0)
+    count, movers, points = _room_of(arena)
     room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
     if count > room[0] or movers > room[1] or points > room[2]:
         raise ValueError(f"arena needs {(count, movers, points)}, the batch has room for {room}")

@@ -138,6 +138,10 @@ class Telemetry(Stateful):
             *perturbed(truth.position, truth.velocity, truth.quaternion, self._errors)
         )
 
+    def position(self, truth: Array) -> Array:
+        """Return the positions (n, 3) of all n as telemetry reports them; see `report`."""
+        return truth if self._model is None else truth + self._errors[:, POSITION]
+
     def _held(self) -> Mapping[str, Any]:
         return {
             "now": {"errors": self._errors},

@@ -22,12 +22,13 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import ArenaBatch, batch_of, put_arena
+from airl_mav.envs.arenas import ArenaBatch, batch_of, put_arena, with_room
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
 from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
+from airl_mav.envs.encoding import shrink
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
@@ -202,11 +203,15 @@ class Navigation(Stateful):
         arena = self._arena(seed, zone)
         self.arenas[i], self._begun[i] = arena, True
         self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
+        if len(self._batch.bounds) == 0:
+            # The others stay in the first one's until their own begin.
+            self._batch = batch_of([arena] * self.n)
         try:
             put_arena(self._batch, i, arena)
-        except (ValueError, IndexError):
-            # The arena is larger than all before: make room.
-            self._batch = batch_of([a if a is not None else arena for a in self.arenas])
+        except ValueError:
+            # It is larger than all before.
+            self._batch = with_room(self._batch, arena)
+            put_arena(self._batch, i, arena)
         randomisation = self.spec.randomisation
         airframe = draw_airframe(
             self._vehicle.airframe, randomisation, stream(seed, Stream.AIRFRAME)
@@ -235,9 +240,15 @@ class Navigation(Stateful):
         image, state = self._companions.seen(self.cameras.image, self.kinematics())
         return observe(image, self.intrinsics, state, self._batch.goal, self._companions.told())
 
-    def observe(self) -> Encoded:
-        """Return the present observations of all vehicles in the environment's layout."""
-        return encode_layout(self.observation, self.see())
+    def observe(self, slots: Sequence[int] | None = None) -> Encoded:
+        """Return the present observations in the environment's layout.
+
+        Of all vehicles, or of those in `slots`.
+        """
+        seen = self.see()
+        if slots is not None:
+            seen = seen.rows(slots)
+        return encode_layout(self.observation, seen, shrink)
 
     def kinematics(self) -> Kinematics:
         """Return the state of all n as telemetry reports it: with the estimator's error."""
@@ -348,7 +359,8 @@ class Navigation(Stateful):
 
     def holding_altitude(self) -> NDArray[np.float64]:
         """Return the downward speeds (n,) [m/s] that hold the altitude."""
-        return vertical_speeds(self.spec.episode.altitude_m, self.kinematics().position[:, 2])
+        down = self._telemetry.position(self.fleet.position)[:, 2]
+        return vertical_speeds(self.spec.episode.altitude_m, down)
 
     def advance(self, ticks: NDArray[np.int64]) -> None:
         """Advance all flights by ticks (n,); the only place where time passes."""

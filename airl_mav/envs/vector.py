@@ -124,7 +124,8 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             final = self._final(seen, now, ended)
             slots = np.flatnonzero(ended).tolist()
             now = self._begin(slots, draw_seeds(self.np_random, len(slots)))
-            seen = self.navigation.observe()
+            for key, first in self.navigation.observe(slots).items():
+                seen[key][slots] = first
         return seen, reward, terminated, truncated, _masked(self._quality(now)) | final
 
     def _final(self, seen: Encoded, flights: Flights, ended: NDArray[np.bool_]) -> dict[str, Any]:
@@ -138,7 +139,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         observation = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             info["outcome"][i] = outcome(flights, i)["outcome"]
-            observation[i] = {key: value[i] for key, value in seen.items()}
+            observation[i] = {key: value[i].copy() for key, value in seen.items()}
         return {
             "final_obs": observation,
             "_final_obs": ended.copy(),

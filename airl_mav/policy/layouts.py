@@ -11,7 +11,7 @@ and the companion is n = 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -127,12 +127,25 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     return None
 
 
-def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
+Shrink = Callable[[NDArray[np.uint16], int, int, NDArray[np.uint8]], NDArray[np.uint8]]
+"""From Z16 images (n, h, w), rows, columns and a byte for each value of `nearest_returns` to the
+images (n, rows, columns) of those bytes."""
+
+
+def shrink(
+    depth_mm: NDArray[np.uint16], rows: int, columns: int, table: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Return what numpy makes of images; a `Shrink`."""
+    return table[nearest_returns(depth_mm, rows, columns)]
+
+
+def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shrink) -> Encoded:
     """Return the arrays of a layout for n vehicles.
 
     Args:
         spec: The layout; its camera must fit (`camera_mismatch`).
         seen: Of n vehicles: every array has a leading axis (n,).
+        shrink: What makes the network's images of the camera's; numpy by default.
 
     Returns:
         `depth` (n, 1, height, width) uint8, `velocity` (n, 3) and `goal` (n, 3) float32.
@@ -146,7 +159,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation) -> Encoded:
     """
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
     table = _body_table if spec.layout == "body" else _paper_table
-    image = table(spec.range_m)[_pooled(seen.depth_mm, spec.camera_rows, spec.width_px)]
+    image = shrink(seen.depth_mm, spec.camera_rows, spec.width_px, table(spec.range_m))
     if spec.layout == "body":
         safe = np.maximum(distance, 1e-6)
         goal = np.stack(
@@ -186,9 +199,11 @@ def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
     return {k: np.zeros_like(v) if k == key else v for k, v in encoded.items()}
 
 
-def _pooled(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
-    """Shrink Z16 images (n, h, w) to (n, rows, columns): the nearest return of each block wins."""
-    # One less, so that "no return" (0) wraps round to the farthest of all.
+def nearest_returns(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
+    """Shrink Z16 images (n, h, w) to (n, rows, columns): the nearest return of each block wins.
+
+    Values are one less than in the images, so that "no return" (0) wraps round to the farthest.
+    """
     image = depth_mm - np.uint16(1)
     vertical, horizontal = depth_mm.shape[1] // rows, depth_mm.shape[2] // columns
     nearest = image[:, ::vertical]
@@ -201,7 +216,7 @@ def _pooled(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np
 
 
 def _depths_m(range_m: float) -> NDArray[np.float64]:
-    """Return the depth [m] of every value of `_pooled`; infinite beyond the range."""
+    """Return the depth [m] of every value of `nearest_returns`; infinite beyond the range."""
     depth = (np.arange(MAX_MM + 1) + 1) / MM_PER_M
     depth[(depth > range_m) | (np.arange(MAX_MM + 1) == MAX_MM)] = np.inf
     return depth

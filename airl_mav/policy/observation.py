@@ -7,6 +7,7 @@ one vehicle in the companion and of n at a time in training.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -63,8 +64,11 @@ class Observation:
     in_flight: InFlight | None = None
     """None: nobody keeps account of the decisions."""
 
-    def rows(self, index: int | None) -> Observation:
-        """Return what vehicle `index` of n sees, or, with None, one vehicle's as that of n = 1."""
+    def rows(self, index: int | Sequence[int] | None) -> Observation:
+        """Return what vehicle `index` of n sees, or several of them.
+
+        With None: what one vehicle sees, as that of n = 1.
+        """
         names = ("depth_mm", "goal", "velocity", "roll", "pitch", "yaw")
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
         if (told := self.in_flight) is not None:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.envs import encoding
 from airl_mav.policy.layouts import (
     STRIP_ROWS,
     Encoded,
@@ -23,6 +24,7 @@ from airl_mav.policy.layouts import (
     boxes,
     camera_mismatch,
     encode_layout,
+    shrink,
 )
 from airl_mav.policy.observation import Kinematics, Observation, observe
 
@@ -348,3 +350,14 @@ def test_the_strip_leaves_room_for_the_camera(height: int) -> None:
         spec("paper", height)
     assert spec("paper", 11).camera_rows == 1
     assert spec("body", height).camera_rows == height
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(48, 64), (24, 32), (12, 16), (16, 64)])
+def test_the_compiled_images_are_those_of_numpy(rows: int, columns: int) -> None:
+    rng = np.random.default_rng(3)
+    depth = rng.integers(0, 1 << 16, (5, 48, 64)).astype(np.uint16)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    depth[0, :4] = (1 << 16) - 1
+    table = rng.integers(0, 256, 1 << 16).astype(np.uint8)
+    wanted = shrink(depth, rows, columns, table)
+    np.testing.assert_array_equal(encoding.shrink(depth, rows, columns, table), wanted)
