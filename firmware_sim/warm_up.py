@@ -6,8 +6,16 @@ disk. Either way it must not happen in flight: a tick has 4 ms.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
 from airl_mav.arena.generate import generate
+from airl_mav.control.controller import Controller
+from airl_mav.control.demand import AttitudeDemand, RateDemand, TrajectoryDemand
+from airl_mav.control.gains import Gains
 from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import TICK_S
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -38,3 +46,15 @@ def warm_up(vehicle: VehicleProfile) -> None:
                 autopilot.takeoff(2.0)
     finally:
         simulation.close()
+    _fly_every_kind(autopilot.parameters.value)
+
+
+def _fly_every_kind(value: Callable[[str], float]) -> None:
+    """Run the cascade once for every kind of demand: some modes fly by attitude or rates."""
+    controller = Controller(Gains.from_parameters(value), TICK_S)
+    state = np.zeros(13)
+    state[6] = 1.0
+    nothing = (0.0, 0.0, 0.0)
+    controller.fly(state, TrajectoryDemand(nothing, nothing, nothing, 0.0, 0.0))
+    controller.fly(state, AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.0, 0.5))
+    controller.fly(state, RateDemand(nothing, 0.5))

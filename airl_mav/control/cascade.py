@@ -5,8 +5,7 @@ estimator publishes a position, at every second sample of the IMU; each loop fli
 that the loop above it published at an earlier sample, as the inner ones are scheduled first. From
 a new position to the motors that takes two ticks.
 
-One vehicle's memory is a row of `MEMORY_SIZE` floats, so that N vehicles are an (N, MEMORY_SIZE)
-array and the flight controller holds a single row.
+`demand` says what can be asked for, `memory` what is kept between two ticks.
 """
 
 from __future__ import annotations
@@ -14,49 +13,45 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_setpoint
+from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
-from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
-from airl_mav.control.mixer import PITCH, ROLL, Motors, mix
+from airl_mav.control.low_pass import Biquad, butterworth, filtered, weight
+from airl_mav.control.memory import (
+    ATTITUDE_SP,
+    DGYRO,
+    GYRO,
+    GYRO_NEWER,
+    GYRO_OLDER,
+    PRIMED,
+    RATE_INT,
+    RATES_SP,
+    SAT,
+    THRUST_ON,
+    THRUST_SP,
+    VEL_DOT,
+    VEL_INT,
+    VEL_LP,
+    VELOCITY_SP,
+    WAIT,
+    YAW_RATE_SP,
+    YAW_TORQUE,
+    Memory,
+    settle_gyro_filter,
+    three,
+)
+from airl_mav.control.mixer import Motors, mix
 from airl_mav.control.rate import rate_control
-from airl_mav.control.velocity import velocity_control, velocity_setpoint
-from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.control.velocity import (
+    acceleration_control,
+    velocity_control,
+    velocity_setpoint,
+)
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
-Memory = NDArray[np.float64]
-
-HANDOVER_TICKS = 2
-"""From the tick of the position loop to that whose motor commands reflect it: attitude, rates."""
-
 POSITION_TICKS = 2
 """PX4's EKF (EKF2_PREDICT_US = 10 ms) publishes positions at every second 4 ms sample, measured."""
-
-# Layout of a memory row.
-_VEL_INT, _VEL_LP, _VEL_DOT, _RATE_INT, _SAT = 0, 3, 6, 9, 12
-_GYRO, _GYRO_NEWER, _GYRO_OLDER, _DGYRO = 15, 18, 21, 24
-_YAW_TORQUE, _PRIMED, _WAIT = 27, 28, 29
-# What the position loop published: velocity and attitude setpoint, yaw rate, collective.
-_VELOCITY_SP, _ATTITUDE_SP, _YAW_RATE_SP, _THRUST_SP = 30, 33, 37, 38
-# What the attitude loop published: rates and, passed on, collective.
-_RATES_SP, _THRUST_ON = 39, 42
-MEMORY_SIZE = 43
-
-
-class Demand(NamedTuple):
-    """The setpoint of the cascade; NaN = not commanded."""
-
-    position: Vec
-    """NED [m]."""
-    velocity: Vec
-    """NED [m/s]."""
-    yaw: float
-    """Heading [rad]; NaN with a yaw rate = the heading of the moment."""
-    yaw_rate: float
-    """[rad/s] about the world's down axis."""
 
 
 class Output(NamedTuple):
@@ -71,63 +66,6 @@ class Output(NamedTuple):
     """Newest rate setpoint FRD [rad/s]."""
     velocity: Vec
     """Newest velocity setpoint after limits NED [m/s]."""
-
-
-def ticks_to_motors(memory: Memory) -> int:
-    """Return after how many more ticks the motors reflect what is demanded in the next one."""
-    return int(memory[_WAIT]) + HANDOVER_TICKS if memory[_PRIMED] else 0
-
-
-def new_memory(n: int | None = None) -> Memory:
-    """Return the memory of one vehicle (MEMORY_SIZE,), or of n (n, MEMORY_SIZE), at rest."""
-    return np.zeros(MEMORY_SIZE if n is None else (n, MEMORY_SIZE))
-
-
-def trim_for_hover(
-    memory: Memory, command: float, gains: Gains, north: float = 0.0, east: float = 0.0
-) -> None:
-    """Set the integrals of the velocity to what they settle at in a hover.
-
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        command: Collective 0..1.
-        gains: Hold the hover thrust.
-        north: Acceleration that the vehicle leans for, against the wind [m/s²].
-        east: The same towards east.
-    """
-    # thrust_from_acceleration, solved for the acceleration that gives the command.
-    upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)
-    memory[_VEL_INT], memory[_VEL_INT + 1] = north, east
-    memory[_VEL_INT + 2] = (
-        (gains.hover_thrust - upright * command) * GRAVITY_M_S2 / gains.hover_thrust
-    )
-
-
-def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
-    """Set the integrals of roll and pitch to what they settle at with these commands in a hover.
-
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        motors: Commands 0..1; equal ones need no torque.
-        gains: Hold the limits of the integrals, and how torque becomes commands.
-    """
-    axes = (
-        (ROLL, gains.mix_roll, gains.rate_int_max_roll),
-        (PITCH, gains.mix_pitch, gains.rate_int_max_pitch),
-    )
-    for i, (direction, mixed, most) in enumerate(axes):
-        torque = math.fsum(d * m for d, m in zip(direction, motors, strict=True)) / (4.0 * mixed)
-        memory[_RATE_INT + i] = min(max(torque, -most), most)
-
-
-@kernel
-def reset_integrals(memory: Memory) -> None:
-    """Reset the integrators, which wind up on the ground, and the setpoints of all loops."""
-    for i in range(3):
-        memory[_VEL_INT + i] = 0.0
-        memory[_RATE_INT + i] = 0.0
-        memory[_SAT + i] = 0.0
-    memory[_PRIMED] = 0.0
 
 
 class Filters(NamedTuple):
@@ -176,60 +114,155 @@ def cascade_tick(
         weights: `filters(gains, dt)`: the same at every tick.
         dt: Tick [s].
     """
-    first = memory[_PRIMED] == 0.0
-    if first:
-        _prime(velocity, omega, memory, weights)
+    first = _start(velocity, omega, memory, weights)
     # Setpoints published by an outer loop take effect at the next tick, except at the very first.
-    q_sp, yaw_rate, thrust_sp = _attitude_sp(memory)
-    if memory[_WAIT] == 0.0:
+    published = _attitude_sp(memory)
+    if memory[WAIT] == 0.0:
         _position_loop(position, velocity, q, demand, memory, gains, weights, dt)
-        memory[_WAIT] = POSITION_TICKS
+        memory[WAIT] = POSITION_TICKS
         if first:
-            q_sp, yaw_rate, thrust_sp = _attitude_sp(memory)
-    memory[_WAIT] -= 1.0
-    wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
-    rates_sp, collective = wanted, thrust_sp
-    if not first:
-        rates_sp = _three(memory, _RATES_SP)
-        collective = memory[_THRUST_ON]
-    memory[_THRUST_ON] = thrust_sp
-    for i in range(3):
-        memory[_RATES_SP + i] = wanted[i]
-    motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
-    newest_sp = _attitude_sp(memory)[0]
-    return Output(motors, collective, newest_sp, wanted, _three(memory, _VELOCITY_SP))
+            published = _attitude_sp(memory)
+    memory[WAIT] -= 1.0
+    return _inner_loops(q, omega, published, first, memory, gains, weights, dt)
 
 
 @kernel
-def settle_gyro_filter(memory: Memory, gyro: Biquad) -> None:
-    """Bring the delay elements of the gyro's filter to the steady state of its newest output."""
+def trajectory_tick(
+    position: Vec,
+    velocity: Vec,
+    q: Quat,
+    omega: Vec,
+    demand: TrajectoryDemand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Output:
+    """Run one tick as `cascade_tick` does, for a demand with an acceleration."""
+    first = _start(velocity, omega, memory, weights)
+    published = _attitude_sp(memory)
+    if memory[WAIT] == 0.0:
+        _trajectory_loop(position, velocity, q, demand, memory, gains, weights, dt)
+        memory[WAIT] = POSITION_TICKS
+        if first:
+            published = _attitude_sp(memory)
+    memory[WAIT] -= 1.0
+    return _inner_loops(q, omega, published, first, memory, gains, weights, dt)
+
+
+@kernel
+def attitude_tick(
+    velocity: Vec,
+    q: Quat,
+    omega: Vec,
+    demand: AttitudeDemand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Output:
+    """Run the attitude and the rate loop alone; the position loop is due when it is wanted again.
+
+    The velocity setpoint of the output is NaN.
+    """
+    first = _start(velocity, omega, memory, weights)
+    _skip_position_loop(velocity, memory, weights, dt)
+    for i in range(4):
+        memory[ATTITUDE_SP + i] = demand.attitude[i]
+    memory[YAW_RATE_SP], memory[THRUST_SP] = demand.yaw_rate, demand.thrust
+    return _inner_loops(q, omega, _attitude_sp(memory), first, memory, gains, weights, dt)
+
+
+@kernel
+def rate_tick(
+    velocity: Vec,
+    q: Quat,
+    omega: Vec,
+    demand: RateDemand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Output:
+    """Run the rate loop alone; the others are due when they are wanted again.
+
+    The attitude setpoint of the output is the present attitude, its velocity setpoint NaN.
+    """
+    _start(velocity, omega, memory, weights)
+    _skip_position_loop(velocity, memory, weights, dt)
+    for i in range(4):
+        memory[ATTITUDE_SP + i] = q[i]
     for i in range(3):
-        held = settled(gyro, memory[_GYRO + i])
-        memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = held, held
+        memory[RATES_SP + i] = demand.rates[i]
+    memory[YAW_RATE_SP], memory[THRUST_SP] = 0.0, demand.thrust
+    memory[THRUST_ON] = demand.thrust
+    motors = _rate_loop(omega, demand.rates, demand.thrust, memory, gains, weights, dt)
+    return Output(motors, demand.thrust, q, demand.rates, three(memory, VELOCITY_SP))
+
+
+@kernel
+def _start(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> bool:
+    """Settle the filters if this is the first tick; return whether it is."""
+    first: bool = memory[PRIMED] == 0.0
+    if first:
+        _prime(velocity, omega, memory, weights)
+    return first
+
+
+@kernel
+def _inner_loops(
+    q: Quat,
+    omega: Vec,
+    published: tuple[Quat, float, float],
+    first: bool,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> Output:
+    """Fly what the position loop has published: attitude setpoint, yaw rate, collective."""
+    q_sp, yaw_rate, thrust_sp = published
+    wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
+    rates_sp, collective = wanted, thrust_sp
+    if not first:
+        rates_sp = three(memory, RATES_SP)
+        collective = memory[THRUST_ON]
+    memory[THRUST_ON] = thrust_sp
+    for i in range(3):
+        memory[RATES_SP + i] = wanted[i]
+    motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
+    newest_sp = _attitude_sp(memory)[0]
+    return Output(motors, collective, newest_sp, wanted, three(memory, VELOCITY_SP))
+
+
+@kernel
+def _skip_position_loop(velocity: Vec, memory: Memory, weights: Filters, dt: float) -> None:
+    """Keep the velocity's filter going while no position is flown."""
+    if memory[WAIT] == 0.0:
+        _differentiate(velocity, memory, weights, POSITION_TICKS * dt)
+        memory[WAIT] = POSITION_TICKS
+    memory[WAIT] -= 1.0
+    for i in range(3):
+        memory[VELOCITY_SP + i] = math.nan
 
 
 @kernel
 def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
     """Start: the filters are settled at the first sample, the position loop is due."""
-    memory[_PRIMED] = 1.0
-    memory[_WAIT] = 0.0
+    memory[PRIMED] = 1.0
+    memory[WAIT] = 0.0
     for i in range(3):
-        memory[_VEL_LP + i] = velocity[i]
-        memory[_GYRO + i] = omega[i]
+        memory[VEL_LP + i] = velocity[i]
+        memory[GYRO + i] = omega[i]
     settle_gyro_filter(memory, weights.gyro)
-
-
-@kernel
-def _three(memory: Memory, start: int) -> Vec:
-    return memory[start], memory[start + 1], memory[start + 2]
 
 
 @kernel
 def _attitude_sp(memory: Memory) -> tuple[Quat, float, float]:
     """Return attitude setpoint, yaw rate and collective as the position loop published them."""
-    a = _ATTITUDE_SP
+    a = ATTITUDE_SP
     q_sp = (memory[a], memory[a + 1], memory[a + 2], memory[a + 3])
-    return q_sp, memory[_YAW_RATE_SP], memory[_THRUST_SP]
+    return q_sp, memory[YAW_RATE_SP], memory[THRUST_SP]
 
 
 @kernel
@@ -245,32 +278,82 @@ def _position_loop(
 ) -> None:
     """Publish the attitude and thrust that fly the demand."""
     period = POSITION_TICKS * dt
-    velocities = (velocity[0], velocity[1], velocity[2])
-    for i in range(3):
-        before = memory[_VEL_LP + i]
-        memory[_VEL_LP + i] = before + weights.velocity * (velocities[i] - before)
-        memory[_VEL_DOT + i] = (memory[_VEL_LP + i] - before) / period
+    _differentiate(velocity, memory, weights, period)
     velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
     thrust, integral = velocity_control(
         velocity,
-        _three(memory, _VEL_DOT),
+        three(memory, VEL_DOT),
         velocity_sp,
-        _three(memory, _VEL_INT),
+        three(memory, VEL_INT),
         gains,
         period,
     )
-    if math.isnan(demand.yaw):
+    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory)
+
+
+@kernel
+def _trajectory_loop(
+    position: Vec,
+    velocity: Vec,
+    q: Quat,
+    demand: TrajectoryDemand,
+    memory: Memory,
+    gains: Gains,
+    weights: Filters,
+    dt: float,
+) -> None:
+    """As `_position_loop`, with an acceleration."""
+    period = POSITION_TICKS * dt
+    _differentiate(velocity, memory, weights, period)
+    north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
+    if math.isnan(demand.position[2]) and math.isnan(demand.velocity[2]):
+        down = math.nan
+    velocity_sp = (north, east, down)
+    thrust, integral = acceleration_control(
+        velocity,
+        three(memory, VEL_DOT),
+        velocity_sp,
+        demand.acceleration,
+        three(memory, VEL_INT),
+        gains,
+        period,
+    )
+    _publish(velocity_sp, thrust, integral, demand.yaw, demand.yaw_rate, q, memory)
+
+
+@kernel
+def _differentiate(velocity: Vec, memory: Memory, weights: Filters, period: float) -> None:
+    """Advance the filtered derivative of the velocity."""
+    velocities = (velocity[0], velocity[1], velocity[2])
+    for i in range(3):
+        before = memory[VEL_LP + i]
+        memory[VEL_LP + i] = before + weights.velocity * (velocities[i] - before)
+        memory[VEL_DOT + i] = (memory[VEL_LP + i] - before) / period
+
+
+@kernel
+def _publish(
+    velocity_sp: Vec,
+    thrust: Vec,
+    integral: Vec,
+    yaw: float,
+    yaw_rate: float,
+    q: Quat,
+    memory: Memory,
+) -> None:
+    """Store what the position loop hands on: attitude, yaw rate and collective."""
+    if math.isnan(yaw):
         cos_yaw, sin_yaw = heading_of(q)
     else:
-        cos_yaw, sin_yaw = math.cos(demand.yaw), math.sin(demand.yaw)
+        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     q_sp = attitude_setpoint(thrust, cos_yaw, sin_yaw)
     for i in range(3):
-        memory[_VEL_INT + i] = integral[i]
-        memory[_VELOCITY_SP + i] = velocity_sp[i]
+        memory[VEL_INT + i] = integral[i]
+        memory[VELOCITY_SP + i] = velocity_sp[i]
     for i in range(4):
-        memory[_ATTITUDE_SP + i] = q_sp[i]
-    memory[_YAW_RATE_SP] = 0.0 if math.isnan(demand.yaw_rate) else demand.yaw_rate
-    memory[_THRUST_SP] = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
+        memory[ATTITUDE_SP + i] = q_sp[i]
+    memory[YAW_RATE_SP] = 0.0 if math.isnan(yaw_rate) else yaw_rate
+    memory[THRUST_SP] = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
 
 
 @kernel
@@ -286,23 +369,23 @@ def _rate_loop(
     """Return the motor commands that turn as wanted, with a collective 0..1."""
     rates_now = (omega[0], omega[1], omega[2])
     for i in range(3):
-        before, newer = memory[_GYRO + i], memory[_GYRO_NEWER + i]
-        rate, held = filtered(weights.gyro, rates_now[i], newer, memory[_GYRO_OLDER + i])
-        memory[_GYRO + i], memory[_GYRO_NEWER + i], memory[_GYRO_OLDER + i] = rate, held, newer
+        before, newer = memory[GYRO + i], memory[GYRO_NEWER + i]
+        rate, held = filtered(weights.gyro, rates_now[i], newer, memory[GYRO_OLDER + i])
+        memory[GYRO + i], memory[GYRO_NEWER + i], memory[GYRO_OLDER + i] = rate, held, newer
         slope = (rate - before) / dt
-        memory[_DGYRO + i] += weights.angular_acceleration * (slope - memory[_DGYRO + i])
+        memory[DGYRO + i] += weights.angular_acceleration * (slope - memory[DGYRO + i])
     torque, integral = rate_control(
-        _three(memory, _GYRO),
-        _three(memory, _DGYRO),
+        three(memory, GYRO),
+        three(memory, DGYRO),
         rates_sp,
-        _three(memory, _RATE_INT),
-        _three(memory, _SAT),
+        three(memory, RATE_INT),
+        three(memory, SAT),
         gains,
         dt,
     )
-    memory[_YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[_YAW_TORQUE])
-    motors, missing = mix(collective, (torque[0], torque[1], memory[_YAW_TORQUE]), gains)
+    memory[YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[YAW_TORQUE])
+    motors, missing = mix(collective, (torque[0], torque[1], memory[YAW_TORQUE]), gains)
     for i in range(3):
-        memory[_RATE_INT + i] = integral[i]
-        memory[_SAT + i] = missing[i]
+        memory[RATE_INT + i] = integral[i]
+        memory[SAT + i] = missing[i]
     return motors

@@ -12,17 +12,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.control.cascade import (
-    Demand,
-    Memory,
+    Output,
+    attitude_tick,
     cascade_tick,
     filters,
+    rate_tick,
+    trajectory_tick,
+)
+from airl_mav.control.demand import (
+    AnyDemand,
+    AttitudeDemand,
+    Demand,
+    RateDemand,
+    TrajectoryDemand,
+)
+from airl_mav.control.gains import Gains, pack, unpack
+from airl_mav.control.low_pass import butterworth
+from airl_mav.control.memory import (
+    Memory,
     new_memory,
     reset_integrals,
     settle_gyro_filter,
     ticks_to_motors,
 )
-from airl_mav.control.gains import Gains, pack, unpack
-from airl_mav.control.low_pass import butterworth
 from airl_mav.control.mixer import Motors
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
@@ -32,6 +44,10 @@ Row = NDArray[np.float64]
 # Layout of the output row.
 _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
 _SIZE = 11
+
+_TRAJECTORY, _ATTITUDE_ONLY, _RATES_ONLY = 0, 1, 2
+_WANTED_SIZE = 11
+"""Numbers in the largest demand."""
 
 
 class ControlSetpoints(NamedTuple):
@@ -72,6 +88,42 @@ def _fly(
         filters(known, dt),
         dt,
     )
+    return _stored(out, output)
+
+
+@kernel
+def _fly_other(
+    state: Row, kind: int, wanted: Row, memory: Memory, gains: Row, dt: float, output: Row
+) -> Motors:
+    """As `_fly`, for the other demands: `wanted` is the fields of the one that `kind` names."""
+    known = unpack(gains)
+    weights = filters(known, dt)
+    position, velocity = (state[0], state[1], state[2]), (state[3], state[4], state[5])
+    q = (state[6], state[7], state[8], state[9])
+    omega = (state[10], state[11], state[12])
+    if kind == _TRAJECTORY:
+        trajectory = TrajectoryDemand(
+            (wanted[0], wanted[1], wanted[2]),
+            (wanted[3], wanted[4], wanted[5]),
+            (wanted[6], wanted[7], wanted[8]),
+            wanted[9],
+            wanted[10],
+        )
+        out = trajectory_tick(position, velocity, q, omega, trajectory, memory, known, weights, dt)
+    elif kind == _ATTITUDE_ONLY:
+        attitude = AttitudeDemand(
+            (wanted[0], wanted[1], wanted[2], wanted[3]), wanted[4], wanted[5]
+        )
+        out = attitude_tick(velocity, q, omega, attitude, memory, known, weights, dt)
+    else:
+        rates = RateDemand((wanted[0], wanted[1], wanted[2]), wanted[3])
+        out = rate_tick(velocity, q, omega, rates, memory, known, weights, dt)
+    return _stored(out, output)
+
+
+@kernel
+def _stored(out: Output, output: Row) -> Motors:
+    """Write the setpoints to the output row; return the motor commands."""
     for i in range(4):
         output[_ATTITUDE + i] = out.attitude[i]
     for i in range(3):
@@ -91,6 +143,7 @@ class Controller:
         self._dt = dt
         self._memory = new_memory()
         self._output = np.zeros(_SIZE)
+        self._wanted = np.zeros(_WANTED_SIZE)
         self.rest()
 
     def set_gains(self, gains: Gains) -> None:
@@ -103,12 +156,14 @@ class Controller:
             self._gyro_cutoff_hz = cutoff_hz
         self._gains = pack(gains)
 
-    def fly(self, state: Row, demand: Demand) -> Motors:
+    def fly(self, state: Row, demand: AnyDemand) -> Motors:
         """Run one tick; return the motor commands 0..1.
 
         `state` begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
         rates FRD [rad/s]: 13 floats.
         """
+        if not isinstance(demand, Demand):
+            return self._fly_other(state, demand)
         position, velocity, yaw, yaw_rate = demand
         motors: Motors = _fly(
             state,
@@ -120,6 +175,25 @@ class Controller:
             self._gains,
             self._dt,
             self._output,
+        )
+        return motors
+
+    def _fly_other(
+        self, state: Row, demand: TrajectoryDemand | AttitudeDemand | RateDemand
+    ) -> Motors:
+        wanted = self._wanted
+        if isinstance(demand, TrajectoryDemand):
+            kind = _TRAJECTORY
+            position, velocity, acceleration, yaw, yaw_rate = demand
+            wanted[:] = (*position, *velocity, *acceleration, yaw, yaw_rate)
+        elif isinstance(demand, AttitudeDemand):
+            kind = _ATTITUDE_ONLY
+            wanted[:6] = (*demand.attitude, demand.yaw_rate, demand.thrust)
+        else:
+            kind = _RATES_ONLY
+            wanted[:4] = (*demand.rates, demand.thrust)
+        motors: Motors = _fly_other(
+            state, kind, wanted, self._memory, self._gains, self._dt, self._output
         )
         return motors
 
@@ -141,8 +215,8 @@ class Controller:
 
     @property
     def descending(self) -> bool:
-        """Whether the velocity setpoint points down."""
-        return self._output.item(_VELOCITY + 2) > 0.0
+        """Whether the velocity setpoint points down, or nothing controls the velocity."""
+        return not self._output.item(_VELOCITY + 2) <= 0.0
 
     def setpoints(self) -> ControlSetpoints:
         """Return a copy of the setpoints of the newest tick."""

@@ -101,7 +101,53 @@ def velocity_control(
         ax, ay, ex, ey = 0.0, 0.0, 0.0, 0.0
         integral = (0.0, 0.0, integral[2])
     az = gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]
-    tx, ty, tz = thrust_from_acceleration((ax, ay, az), gains)
+    return _produced((ax, ay, az), (ex, ey, ez), integral, gains, dt)
+
+
+@kernel
+def acceleration_control(
+    velocity: Vec,
+    velocity_dot: Vec,
+    velocity_sp: Vec,
+    acceleration_ff: Vec,
+    integral: Vec,
+    gains: Gains,
+    dt: float,
+) -> tuple[Vec, Vec]:
+    """As `velocity_control`, with an acceleration NED [m/s²] that is added on each axis.
+
+    An axis without a velocity (NaN) is flown by the acceleration alone, without feedback, and its
+    integral stays. Source: PX4 1.16, PositionControl::_velocityControl.
+    """
+    ax = 0.0 if math.isnan(acceleration_ff[0]) else acceleration_ff[0]
+    ay = 0.0 if math.isnan(acceleration_ff[1]) else acceleration_ff[1]
+    az = 0.0 if math.isnan(acceleration_ff[2]) else acceleration_ff[2]
+    ex, ey, ez = 0.0, 0.0, 0.0
+    if not math.isnan(velocity_sp[0]):
+        ex = velocity_sp[0] - velocity[0]
+        ax += gains.vel_p_xy * ex + integral[0] - gains.vel_d_xy * velocity_dot[0]
+    if not math.isnan(velocity_sp[1]):
+        ey = velocity_sp[1] - velocity[1]
+        ay += gains.vel_p_xy * ey + integral[1] - gains.vel_d_xy * velocity_dot[1]
+    if not math.isnan(velocity_sp[2]):
+        ez = velocity_sp[2] - velocity[2]
+        az += gains.vel_p_z * ez + integral[2] - gains.vel_d_z * velocity_dot[2]
+    thrust, new = _produced((ax, ay, az), (ex, ey, ez), integral, gains, dt)
+    return thrust, (
+        integral[0] if math.isnan(velocity_sp[0]) else new[0],
+        integral[1] if math.isnan(velocity_sp[1]) else new[1],
+        integral[2] if math.isnan(velocity_sp[2]) else new[2],
+    )
+
+
+@kernel
+def _produced(
+    acceleration: Vec, error: Vec, integral: Vec, gains: Gains, dt: float
+) -> tuple[Vec, Vec]:
+    """Return the thrust vector for an acceleration, and the integral of the velocity error."""
+    ax, ay, _ = acceleration
+    ex, ey, ez = error
+    tx, ty, tz = thrust_from_acceleration(acceleration, gains)
     if (tz >= -gains.thrust_min and ez >= 0.0) or (tz <= -gains.thrust_max and ez <= 0.0):
         ez = 0.0
     # Vertical thrust first, but a horizontal margin always stays.

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.control.attitude import attitude_setpoint
-from airl_mav.control.cascade import new_memory, trim_against_torque, trim_for_hover
 from airl_mav.control.gains import Gains
+from airl_mav.control.memory import new_memory, trim_against_torque, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.envs.contact import NOTHING
 from airl_mav.profiles.vehicle import VehicleProfile

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.control.attitude import heading_of
-from airl_mav.control.cascade import Demand, Filters, cascade_tick, filters
+from airl_mav.control.cascade import Filters, cascade_tick, filters
+from airl_mav.control.demand import Demand
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles

@@ -10,13 +10,9 @@ import pytest
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.control.cascade import (
-    Demand,
-    cascade_tick,
-    filters,
-    new_memory,
-    trim_for_hover,
-)
+from airl_mav.control.cascade import cascade_tick, filters
+from airl_mav.control.demand import Demand
+from airl_mav.control.memory import new_memory, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import heading_to_ned, quat_yaw
 from airl_mav.envs.arenas import ArenaBatch, batch_of, empty_batch, move_obstacles, put_arena
