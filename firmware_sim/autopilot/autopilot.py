@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from airl_mav.control.cascade import Demand
 from airl_mav.control.controller import Controller
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ, TICK_S
@@ -34,6 +34,7 @@ from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -57,7 +58,7 @@ class BuiltinAutopilot:
         self.estimator = Estimator(value, new_filter)
         """For consistency checks."""
         self._state = self.estimator.state
-        self._guidance = Guidance(value)
+        self._guidance = Guidance(value, self._say)
         self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
@@ -66,7 +67,7 @@ class BuiltinAutopilot:
         """The commander's state."""
         self._status = _status(self.flight)
         self._messages: list[Message] = []
-        self._demand: Demand | None = None
+        self._demand: AnyDemand | None = None
         """What is being flown; None = the motors are stopped."""
         self._motors = _STILL
         self.sample: SensorSample | None = None
@@ -131,7 +132,7 @@ class BuiltinAutopilot:
 
     # --- commander
 
-    def _handle(self, event: Ask | Event) -> Result:
+    def _handle(self, event: Ask | Event, request: Request | None = None) -> Result:
         before = self.flight
         step = transition(before, event)
         self.flight, self._status = step.flight, _status(step.flight)
@@ -140,8 +141,9 @@ class BuiltinAutopilot:
             self._say(step.text)
         if self.sample is None:
             return step.result
-        if step.flight.mode is not before.mode:
-            self._guidance.enter(step.flight.mode, self._state)
+        asked_for_more = request is not None and step.result is Result.ACCEPTED
+        if step.flight.mode is not before.mode or asked_for_more:
+            self._guidance.enter(step.flight.mode, self._state, request)
         if step.flight.phase is not before.phase:
             self._note_times(step.flight.phase)
         if before.phase < _GROUND <= step.flight.phase:
@@ -170,6 +172,7 @@ class BuiltinAutopilot:
         if origin is not None:
             self._home = local_to_geodetic(self._state[P:V], origin)
             self._guidance.at_home(self._state)
+            self._guidance.context.home_amsl_m = self._home.altitude_m
             self._snapshot = None
 
     def _parameters_changed(self) -> None:
@@ -220,20 +223,29 @@ class BuiltinAutopilot:
 
     def takeoff(self, altitude_m: float | None) -> Result:
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
-        default = self.parameters["MIS_TAKEOFF_ALT"]
-        self._guidance.context.takeoff_altitude_m = default if altitude_m is None else altitude_m
+        context, height = self._guidance.context, self._guidance.context.height(self._state)
         if altitude_m is None:
-            text = f"Using default takeoff altitude: {default:.1f} m"
-            self._say(Message(Severity.INFO, text))
+            default = self.parameters["MIS_TAKEOFF_ALT"]
+            self._say(Message(Severity.INFO, f"Using default takeoff altitude: {default:.1f} m"))
+            # In flight, PX4 climbs from where the vehicle is.
+            altitude_m = default + (height if self.flight.phase is _AIR else 0.0)
+        if altitude_m < (height if self.flight.phase is _AIR else 0.0):
+            self._say(Message(Severity.CRITICAL, "Already higher than takeoff altitude"))
+            altitude_m = height if self.flight.phase is _AIR else 0.0
+        context.takeoff_altitude_m = altitude_m
         return self._handle(Ask(Mode.TAKEOFF))
 
-    def set_mode(self, mode: Mode) -> Result:
-        """Ask for a mode."""
+    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
+        """Ask for a mode, with what it takes beyond its name."""
         if mode is Mode.OFFBOARD:
             return self._handle(Ask(mode, self._failsafe.setpoint_fresh(self._now_us)))
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
-        return self._handle(Ask(mode))
+        return self._handle(Ask(mode), request)
+
+    def change_speed(self, speed_m_s: float) -> None:
+        """Set the horizontal speed of the present automatic mode [m/s]."""
+        self._guidance.context.travel.speed_m_s = speed_m_s
 
     def set_home_here(self) -> Result:
         """Make the present position home."""
@@ -262,7 +274,7 @@ class BuiltinAutopilot:
             raise RuntimeError("no tick yet: the autopilot has no state")
         estimate = self.estimator.estimate()
         attitude, rates, velocity, thrust = self._controller.setpoints()
-        if demand is None:
+        if demand is None or isinstance(demand, AttitudeDemand | RateDemand):
             setpoint = Setpoint(estimate.position, velocity, math.nan, 0.0)
         else:
             position = np.array(demand.position)

@@ -1,8 +1,7 @@
-"""Vertical trajectories of the automatic modes: how fast they climb and descend to a height.
+"""The vertical trajectory of a take-off.
 
-Source: PX4 1.16, `PositionSmoothing` on the vertical axis and `computeMaxSpeedFromDistance`
-(lib/motion_planning, TrajMath.hpp). The jerk limit of the speed itself is left out: it delays a
-change of speed by a tenth of a second.
+Source: PX4 1.16, `PositionSmoothing` on the vertical axis (`trajectory`). The jerk limit of the
+speed itself is left out: it delays a change of speed by a tenth of a second.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ import math
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.trajectory import braking_speed
 
 
 class ClimbLimits(NamedTuple):
@@ -23,9 +23,8 @@ class ClimbLimits(NamedTuple):
 
 def approach_speed(distance_m: float, limits: ClimbLimits) -> float:
     """Return the greatest speed [m/s] that can still be braked within a distance [m] >= 0."""
-    _, a, jerk = limits
-    b = 4.0 * a * a / jerk
-    return min(limits.speed_m_s, 0.5 * (math.sqrt(b * b + 8.0 * a * distance_m) - b))
+    speed, acceleration, jerk = limits
+    return min(speed, braking_speed(distance_m, acceleration, jerk))
 
 
 class Climb:

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
 from firmware_sim.autopilot.navigation.plan import Plans
+from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import SensorSample
 
 
@@ -78,8 +79,12 @@ class AutopilotPort(Protocol):
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
         ...
 
-    def set_mode(self, mode: Mode) -> Result:
-        """Ask for HOLD, OFFBOARD, LAND, RETURN, TAKEOFF or POSITION."""
+    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
+        """Ask for a mode, with what it takes beyond its name."""
+        ...
+
+    def change_speed(self, speed_m_s: float) -> None:
+        """Set the horizontal speed of the present automatic mode [m/s]."""
         ...
 
     def set_home_here(self) -> Result:

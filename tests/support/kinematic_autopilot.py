@@ -28,6 +28,7 @@ from firmware_sim.autopilot.autopilot_state import (
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -106,6 +107,7 @@ class KinematicAutopilot:
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
         self.commands: list[str] = []
+        self.requests: list[Request | None] = []
         self.messages: list[Message] = []
         self.offboard_loss_us = US_PER_S
         self.frozen = False
@@ -148,7 +150,11 @@ class KinematicAutopilot:
         self.mode = Mode.TAKEOFF
         return Result.ACCEPTED
 
-    def set_mode(self, mode: Mode) -> Result:
+    def change_speed(self, speed_m_s: float) -> None:
+        self.commands.append(f"speed {speed_m_s}")
+
+    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
+        self.requests.append(request)
         self.commands.append(f"mode {mode.name}")
         in_air = self.landed is not Landed.ON_GROUND
         if mode is Mode.POSITION or (mode is Mode.OFFBOARD and in_air and not self._fresh()):

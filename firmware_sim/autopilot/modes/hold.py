@@ -1,10 +1,10 @@
-"""Hold: brake, then stay there."""
+"""Hold: brake, then stay there; or go to a place first."""
 
 from __future__ import annotations
 
 import math
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import (
@@ -12,11 +12,13 @@ from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
     FlightMode,
-    Place,
     here,
     triple,
 )
 from firmware_sim.autopilot.modes.takeoff import climb_on
+from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
+from firmware_sim.autopilot.trajectory import Leg
+from firmware_sim.autopilot.travel import stopping_place
 
 SETTLED_M = 0.01
 """From this close to it, the take-off altitude is held like any other [m]."""
@@ -32,16 +34,28 @@ class Hold(FlightMode):
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
         self._braking = False
+        self._travelling = False
         self._settling = False
         """Whether hold still climbs to the altitude of a take-off that has ended."""
 
-    def enter(self, state: Vector, destination: Place | None, /) -> None:
-        """Begin; a take-off that ended near its altitude is climbed to its end."""
-        self._settling, self._braking = destination is not None, destination is None
-        self._place = here(state) if destination is None else destination
+    def enter(self, state: Vector, request: Request | None, /) -> None:
+        """Begin: climb the rest of a take-off, go to a place, or brake here."""
+        self._settling = isinstance(request, ClimbOn)
+        self._travelling = isinstance(request, Reposition)
+        self._braking = not (self._settling or self._travelling)
+        if isinstance(request, ClimbOn):
+            self._place = request.place
+        elif isinstance(request, Reposition):
+            self._go(request, state)
+        else:
+            self._place = here(state)
 
-    def demand(self, state: Vector, time_us: int, /) -> Demand:
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Brake first, then hold the place where the vehicle came to rest."""
+        if self._travelling:
+            place = self._place
+            leg = Leg(place.position)
+            return self._context.travel.fly(state, time_us, leg, yaw=place.yaw)
         if self._settling:
             return self._settle(time_us)
         if self._braking:
@@ -51,7 +65,25 @@ class Hold(FlightMode):
             self._braking = False
         return Demand(self._place.position, FREE, self._place.yaw, NAN)
 
-    def _settle(self, time_us: int, /) -> Demand:
+    def _go(self, request: Reposition, state: Vector) -> None:
+        """Begin the way to a place; what it leaves open stays as it is.
+
+        Source: PX4 1.16, Navigator: with a new height alone the vehicle stays above its place;
+        without anything it stops.
+        """
+        place, before = request.place, self._place
+        held = before.position if not self._braking else stopping_place(state, self._context.value)
+        now = triple(state, P)
+        north, east, down = place.position
+        if math.isnan(north) or math.isnan(east):
+            north, east = held[0], held[1]
+        if math.isnan(down):
+            down = now[2]
+        self._place = Place((north, east, down), place.yaw)
+        if not math.isnan(request.speed_m_s):
+            self._context.travel.speed_m_s = request.speed_m_s
+
+    def _settle(self, time_us: int) -> Demand:
         """Return the demand between the end of a take-off and its altitude."""
         context, climb = self._context, self._context.climb
         climb_on(context, time_us, near_ground=False)

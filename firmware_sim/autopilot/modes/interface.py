@@ -5,27 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Setpoint
+from firmware_sim.autopilot.autopilot_state import Message, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.requests import Place, Request
+from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
 FREE: Vec = (NAN, NAN, NAN)
 """Of a demand's position or velocity: no axis is commanded."""
-
-
-class Place(NamedTuple):
-    """A place and the heading that is kept there."""
-
-    position: Vec
-    """Local NED [m]."""
-    yaw: float
-    """Heading [rad]."""
 
 
 @dataclass
@@ -40,8 +33,19 @@ class FlightContext:
     """Height above home that a take-off climbs to [m]."""
     climb: Climb = field(default_factory=Climb)
     """The vertical trajectory of a take-off, which hold goes on with."""
+    say: Callable[[Message], None] = lambda _message: None
+    """Tells the operators something."""
+    home_yaw: float = 0.0
+    """Heading at home [rad]."""
+    home_amsl_m: float = 0.0
+    """Altitude of home above mean sea level [m]."""
+    travel: Travel = field(init=False)
+    """How the automatic modes move."""
     setpoint: Setpoint | None = None
     """The newest offboard setpoint."""
+
+    def __post_init__(self) -> None:
+        self.travel = Travel(self.value)
 
     def height(self, state: Vector) -> float:
         """Return the height above home [m]."""
@@ -62,19 +66,20 @@ class FlightMode(Protocol):
         """Whether an armed vehicle that stands on the ground takes off in this mode."""
         return False
 
-    def enter(self, state: Vector, destination: Place | None, /) -> None:
+    def enter(self, state: Vector, request: Request | None, /) -> None:
         """Begin at the present state.
 
-        `destination` is what the mode before was still on its way to (its `destination`).
+        `request`: the user's, or what the mode before leaves to this one (its `remainder`). A mode
+        ignores those that are not for it.
         """
         ...
 
-    def demand(self, state: Vector, time_us: int, /) -> Demand:
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what to fly at a time [µs] that rises from call to call."""
         ...
 
-    def destination(self, _state: Vector, /) -> Place | None:
-        """Return what the mode after this one goes on to, None = it begins where it is entered."""
+    def remainder(self, _state: Vector, /) -> Request | None:
+        """Return what is left to the mode after this one; None = it begins where it is entered."""
         return None
 
     def is_done(self, _state: Vector, /) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import (
@@ -13,11 +13,11 @@ from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
     FlightMode,
-    Place,
     here,
     over,
     triple,
 )
+from firmware_sim.autopilot.requests import Place, Request
 
 STANDING_M_S = 0.3
 """From this horizontal speed on the descent keeps to a place [m/s]."""
@@ -31,7 +31,7 @@ class Land(FlightMode):
         self._place = Place((0.0, 0.0, 0.0), 0.0)
         self._stopping = False
 
-    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin at the present place."""
         self._place, self._stopping = here(state), True
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.modes.hold import Hold
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, Place, triple
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
+from firmware_sim.autopilot.requests import Request
 
 CLIMBS_M_S = 0.1
 """A setpoint that asks to climb faster than this lifts a standing vehicle [m/s]."""
@@ -35,11 +36,11 @@ class Offboard(FlightMode):
         above = self._context.home[2] - ABOVE_HOME_M
         return demand.velocity[2] < -CLIMBS_M_S or demand.position[2] < above
 
-    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin."""
         self._waiting.enter(state, None)
 
-    def demand(self, state: Vector, time_us: int, /) -> Demand:
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what the companion commands."""
         return self._newest() or self._waiting.demand(state, time_us)
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, Q
-from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode, Place
+from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode
+from firmware_sim.autopilot.requests import Request
 
 FALLBACK_DESCENT_M_S = 0.75
 """Descent in Position mode without a pilot's input (measured on PX4 1.16). The vehicle stays
@@ -18,7 +19,7 @@ class Position(FlightMode):
     def __init__(self, _context: FlightContext, /) -> None:
         self._yaw = 0.0
 
-    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin with the present heading."""
         self._yaw = quat_yaw(state[Q:RATES])
 

@@ -1,28 +1,31 @@
-"""Return: climb to RTL_RETURN_ALT, fly home, land."""
+"""Return: climb, fly home, wait if asked to, land.
+
+Source: PX4 1.16, RtlDirect and RTL::calculate_return_alt_from_cone_half_angle.
+"""
 
 from __future__ import annotations
 
 import math
+from enum import Enum, auto
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import AnyDemand
+from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.error_state import P
-from firmware_sim.autopilot.modes.interface import (
-    NAN,
-    FlightContext,
-    FlightMode,
-    Place,
-    here,
-    over,
-    triple,
-)
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
 from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.requests import Place, Request
+from firmware_sim.autopilot.trajectory import Leg
 
-HEIGHT_REACHED_M = 0.2
-"""The climb of a return ends this close to its height [m]."""
 
-HOME_REACHED_M = 0.5
-"""From this close to home the vehicle descends [m]."""
+class _Stage(Enum):
+    CLIMB = auto()
+    GO_HOME = auto()
+    DESCEND = auto()
+    """To RTL_DESCEND_ALT, to wait there."""
+    WAIT = auto()
+    LAND = auto()
 
 
 class ReturnToLaunch(FlightMode):
@@ -30,37 +33,97 @@ class ReturnToLaunch(FlightMode):
 
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
-        self._place = Place((0.0, 0.0, 0.0), 0.0)
-        self._leg = 0
-        """0 = climb, 1 = fly home, 2 = land."""
+        self._start = Place((0.0, 0.0, 0.0), 0.0)
+        self._stage = _Stage.CLIMB
+        self._waiting_since_us: int | None = None
+        self._down = 0.0
+        """Of the way home, NED [m]."""
+        self._home = Place((0.0, 0.0, 0.0), 0.0)
 
-    def enter(self, state: Vector, _destination: Place | None, /) -> None:
-        """Begin with the climb."""
-        self._place, self._leg = here(state), 0
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
+        """Begin with the climb, if it takes one."""
+        context = self._context
+        self._home = Place(context.home, context.home_yaw)
+        self._start = here(state)
+        self._waiting_since_us = None
+        height = context.height(state)
+        at = self._return_height(height, self._away(state))
+        self._down = self._home.position[2] - at
+        self._stage = _Stage.CLIMB if height < at else _Stage.GO_HOME
+        above_sea = math.ceil(context.home_amsl_m + at)
+        text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
+        context.say(Message(Severity.INFO, text))
 
-    def demand(self, state: Vector, _time_us: int, /) -> Demand:
-        """Fly the present leg, and on to the next when it is over."""
-        value, home = self._context.value, self._context.home
-        position = triple(state, P)
-        north, east = position[0] - home[0], position[1] - home[1]
-        away = math.hypot(north, east)
-        if self._leg == 0:
-            height = self._context.height(state)
-            target = max(value("RTL_RETURN_ALT"), height)
-            if height > target - HEIGHT_REACHED_M or away < value("NAV_ACC_RAD"):
-                self._leg = 1
-                self._place = self._place._replace(position=position)
-            down = home[2] - target - 0.5
-            limit = value("MPC_Z_VEL_MAX_UP")
-            return over(
-                self._place, min(limit, max(-limit, value("MPC_Z_P") * (down - position[2])))
-            )
-        if self._leg == 1:
-            if away > HOME_REACHED_M:
-                cruise = min(value("MPC_XY_CRUISE"), value("MPC_XY_P") * away)
-                velocity = (-north / away * cruise, -east / away * cruise, NAN)
-                return Demand((NAN, NAN, self._place.position[2]), velocity, self._place.yaw, NAN)
-            self._leg = 2
-            # Almost at rest: descend to home itself.
-            self._place = self._place._replace(position=home)
-        return over(self._place, landing_speed(value, self._context.height(state)))
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Fly the present stage, and on to the next when it is over."""
+        self._go_on(state, time_us)
+        (north, east, _), travel = self._home.position, self._context.travel
+        if self._stage is _Stage.CLIMB:
+            start = self._start
+            leg = Leg((start.position[0], start.position[1], self._down))
+            return travel.fly(state, time_us, leg, yaw=start.yaw)
+        if self._stage is _Stage.GO_HOME:
+            near = self._away(state) < self._context.value("RTL_MIN_DIST")
+            yaw = self._home.yaw if near else math.nan
+            return travel.fly(state, time_us, Leg((north, east, self._down)), yaw=yaw)
+        if self._stage is _Stage.LAND:
+            speed = landing_speed(self._context.value, self._context.height(state))
+            leg = Leg((north, east, math.nan), vertical_m_s=speed)
+            return travel.fly(state, time_us, leg, yaw=self._home.yaw)
+        leg = Leg((north, east, self._waiting_down))
+        return travel.fly(state, time_us, leg, yaw=self._home.yaw)
+
+    @property
+    def _waiting_down(self) -> float:
+        """Height to wait at before landing NED [m]."""
+        return max(self._down, self._home.position[2] - self._context.value("RTL_DESCEND_ALT"))
+
+    def _go_on(self, state: Vector, time_us: int) -> None:
+        """Choose the next stage when the present one has reached its end."""
+        value, down = self._context.value, triple(state, P)[2]
+        radius = value("NAV_MC_ALT_RAD")
+        delay = value("RTL_LAND_DELAY")
+        home_reached = self._away(state) < value("NAV_ACC_RAD")
+        if self._stage is _Stage.CLIMB and abs(down - self._down) < radius:
+            self._stage = _Stage.GO_HOME
+        elif self._stage is _Stage.GO_HOME and home_reached and abs(down - self._down) < radius:
+            if delay:
+                self._stage = _Stage.DESCEND
+            else:
+                self._land()
+        elif self._stage is _Stage.DESCEND and abs(down - self._waiting_down) < radius:
+            self._stage, self._waiting_since_us = _Stage.WAIT, time_us
+            if delay < 0.0:
+                self._context.say(Message(Severity.INFO, "RTL: completed, loitering"))
+        elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
+            waited_s = (time_us - self._waiting_since_us) / US_PER_S
+            if 0.0 <= delay <= waited_s:
+                self._land()
+
+    def _land(self) -> None:
+        self._stage = _Stage.LAND
+        self._context.say(Message(Severity.INFO, "RTL: land at destination"))
+
+    def _away(self, state: Vector) -> float:
+        """Return the horizontal distance from home [m]."""
+        (north, east, _), home = triple(state, P), self._home.position
+        return math.hypot(north - home[0], east - home[1])
+
+    def _return_height(self, height: float, away: float) -> float:
+        """Return the height above home [m] for the way home."""
+        value = self._context.value
+        highest, angle, radius = (
+            value("RTL_RETURN_ALT"),
+            value("RTL_CONE_ANG"),
+            value("NAV_ACC_RAD"),
+        )
+        if angle <= 0.0:
+            return max(height, highest)
+        if away <= radius:
+            wanted = 2.0 * away
+        else:
+            wanted = highest
+            if away <= value("RTL_MIN_DIST"):
+                wanted = min(highest, away / math.tan(min(89.0, max(1.0, angle)) * DEG))
+            wanted = max(wanted, 2.0 * radius)
+        return max(height, min(wanted, highest))

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from airl_mav.control.cascade import Demand
+from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.climb import ClimbLimits
 from firmware_sim.autopilot.error_state import V
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, Place, here, over
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, over
+from firmware_sim.autopilot.requests import ClimbOn, Place, Request
+
+LEAST_CLIMB_M = 0.1
+"""A take-off that asks for less than this above where the vehicle stands leaves it there [m]."""
 
 
 class Takeoff(FlightMode):
     """Climbs to `FlightContext.takeoff_altitude_m`, gently near the ground."""
 
-    lifts = True
-
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
 
-    def enter(self, state: Vector, _destination: Place | None, /) -> None:
+    @property
+    def lifts(self) -> bool:
+        """Whether the altitude lies above the ground."""
+        return self._context.takeoff_altitude_m > LEAST_CLIMB_M
+
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin the climb at the present place."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
         self._place = here(state)
@@ -32,13 +39,13 @@ class Takeoff(FlightMode):
         climb_on(self._context, time_us, near_ground=True)
         return over(self._place, -climb.speed_m_s)
 
-    def destination(self, state: Vector, /) -> Place | None:
+    def remainder(self, state: Vector, /) -> Request | None:
         """Return the altitude above the place where it began, once it is near: hold goes on."""
         if not self.is_done(state):
             return None
         north, east, _ = self._place.position
         down = self._context.home[2] - self._context.takeoff_altitude_m
-        return Place((north, east, down), self._place.yaw)
+        return ClimbOn(Place((north, east, down), self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
         """Return whether the take-off has come near its altitude, by PX4's acceptance radius.

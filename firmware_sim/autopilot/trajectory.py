@@ -1,0 +1,348 @@
+"""Smooth trajectories: jerk-limited velocity on each axis, and ways through waypoints.
+
+Source: PX4 1.16, `VelocitySmoothing`, `PositionSmoothing`, `TrajectoryConstraints` and `TrajMath`
+(lib/motion_planning, lib/mathlib): the motion of Hold, Return, missions and repositioning.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from airl_mav.vehicle.rotation import Vec
+
+_TINY = 1e-9
+
+TURNING_M_S = 0.2
+TURNING_COSINE = 0.98
+"""The vehicle turns if it moves faster than this, and further than this from its target's
+direction (PositionSmoothing::_isTurning)."""
+
+LEAST_L1_M = 5.0
+"""Least distance at which a turning vehicle aims ahead on its leg [m]."""
+
+
+class Axis:
+    """The motion along one axis: acceleration changes with limited jerk.
+
+    `plan` chooses three phases (jerk, constant acceleration, opposite jerk) to a velocity;
+    `advance` moves along them.
+    """
+
+    def __init__(self) -> None:
+        self.position = 0.0
+        self.velocity = 0.0
+        self.acceleration = 0.0
+        self._wanted = 0.0
+        self._jerk = 0.0
+        """Of the first phase, signed."""
+        self._limit = 0.0
+        """Greatest acceleration."""
+        self._phases = (0.0, 0.0, 0.0)
+        """Durations [s]."""
+
+    def restart(self, position: float, velocity: float) -> None:
+        """Go on from a position and a velocity, without acceleration and without a plan."""
+        self.position, self.velocity, self.acceleration = position, velocity, 0.0
+        self._jerk, self._phases = 0.0, (0.0, 0.0, 0.0)
+
+    @property
+    def duration_s(self) -> float:
+        """Time to the planned velocity [s]."""
+        return sum(self._phases)
+
+    def plan(self, velocity: float, limit: float, jerk: float) -> None:
+        """Plan the fastest way to a velocity [m/s], within an acceleration and a jerk > 0."""
+        a0 = self.acceleration
+        coasting = self.velocity + 0.5 * a0 * abs(a0) / jerk
+        sign = _sign(velocity - coasting) or _sign(a0)
+        self._wanted, self._jerk, self._limit = velocity, sign * jerk, limit
+        if sign == 0.0:
+            self._phases = (0.0, 0.0, 0.0)
+            return
+        square = 0.5 * a0 * a0 + self._jerk * (velocity - self.velocity)
+        self._ramp_to(sign * math.sqrt(max(0.0, square)), None)
+
+    def stretch(self, duration_s: float) -> None:
+        """Take this long to the planned velocity, if there is such a way without more jerk [s]."""
+        if self._jerk == 0.0:
+            return
+        a0, jerk = self.acceleration, self._jerk
+        # The peak p solves p² - (jerk T + a0) p + a0²/2 + jerk dv = 0.
+        b = jerk * duration_s + a0
+        rest = b * b - 2.0 * a0 * a0 - 4.0 * jerk * (self._wanted - self.velocity)
+        root = math.copysign(math.sqrt(max(0.0, rest)), jerk)
+        self._ramp_to(0.5 * (b - root), duration_s)
+
+    def _ramp_to(self, peak: float, duration_s: float | None) -> None:
+        """Choose the phases by the acceleration of the second one."""
+        a0, jerk = self.acceleration, self._jerk
+        peak = min(self._limit, max(-self._limit, peak))
+        up = max(0.0, (peak - a0) / jerk)
+        peak = a0 + jerk * up
+        down = max(0.0, peak / jerk)
+        if duration_s is not None:
+            flat = max(0.0, duration_s - up - down)
+        elif abs(peak) > _TINY:
+            gained = 0.5 * (a0 + peak) * up + 0.5 * peak * down
+            flat = max(0.0, (self._wanted - self.velocity - gained) / peak)
+        else:
+            flat = 0.0
+        self._phases = (up, flat, down)
+
+    def advance(self, seconds: float) -> None:
+        """Move on along the plan, and beyond its end with constant velocity."""
+        left, rests = seconds, []
+        for duration, jerk in zip(self._phases, (self._jerk, 0.0, -self._jerk), strict=True):
+            step = min(left, duration)
+            self._move(step, jerk)
+            rests.append(duration - step)
+            left -= step
+        up, flat, down = rests
+        self._phases = (up, flat, down)
+        if left > 0.0:
+            self.acceleration = 0.0
+            self._move(left, 0.0)
+
+    def _move(self, t: float, jerk: float) -> None:
+        a, v = self.acceleration, self.velocity
+        self.position += v * t + a * t * t / 2.0 + jerk * t**3 / 6.0
+        self.velocity += a * t + jerk * t * t / 2.0
+        self.acceleration += jerk * t
+
+
+def synchronise(axes: Sequence[Axis]) -> None:
+    """Let all axes take as long as the slowest one, so that the way is straight."""
+    longest = max(axis.duration_s for axis in axes)
+    for axis in axes:
+        if axis.duration_s < longest:
+            axis.stretch(longest)
+
+
+class PathLimits(NamedTuple):
+    """Limits of a way, by PX4's parameters."""
+
+    cruise_m_s: float
+    """Horizontal speed (MPC_XY_CRUISE, MAV_CMD_DO_CHANGE_SPEED)."""
+    up_m_s: float
+    down_m_s: float
+    acceleration_m_s2: float
+    """Horizontal."""
+    up_m_s2: float
+    down_m_s2: float
+    jerk_m_s3: float
+    acceptance_m: float
+    """A waypoint is rounded within this horizontal distance."""
+    vertical_acceptance_m: float
+    error_m: float
+    """The trajectory waits for a vehicle that is this far behind it (MPC_XY_ERR_MAX)."""
+    turn_share: float
+    """Share of the acceleration that a turn at a waypoint takes (MPC_XY_TRAJ_P)."""
+
+
+class Leg(NamedTuple):
+    """A way to a target; what lies before and behind it shapes the turns."""
+
+    target: Vec
+    """NED [m]."""
+    previous: Vec | None = None
+    """Where the leg began; None = anywhere."""
+    following: Vec | None = None
+    """The waypoint after the target; None = the vehicle comes to rest at the target."""
+    vertical_m_s: float = math.nan
+    """NED: a vertical speed that is flown whatever the target's height; NaN = to that height."""
+
+
+class Trajectory:
+    """A setpoint that moves smoothly to a target."""
+
+    def __init__(self) -> None:
+        self.axes = (Axis(), Axis(), Axis())
+        """NED."""
+        self._turn_speed = 0.0
+        """The speed at which the present turn began."""
+        self._climbing = False
+
+    def restart(self, position: Vec, velocity: Vec) -> None:
+        """Go on from a position and a velocity NED, without acceleration."""
+        for axis, p, v in zip(self.axes, position, velocity, strict=True):
+            axis.restart(p, v)
+
+    @property
+    def position(self) -> Vec:
+        """NED [m]."""
+        x, y, z = self.axes
+        return x.position, y.position, z.position
+
+    @property
+    def velocity(self) -> Vec:
+        """NED [m/s]."""
+        x, y, z = self.axes
+        return x.velocity, y.velocity, z.velocity
+
+    @property
+    def acceleration(self) -> Vec:
+        """NED [m/s²]."""
+        x, y, z = self.axes
+        return x.acceleration, y.acceleration, z.acceleration
+
+    def advance(self, vehicle: Vec, leg: Leg, limits: PathLimits, seconds: float) -> None:
+        """Move on for some time [s] while the vehicle is at a place NED [m]."""
+        wanted = self._wanted(leg, limits)
+        share = self._waiting(vehicle, limits.error_m)
+        for axis in self.axes:
+            axis.advance(seconds * share)
+        self.follow(wanted, limits)
+
+    def follow(self, velocity: Vec, limits: PathLimits) -> None:
+        """Plan towards a velocity NED [m/s]."""
+        x, y, z = self.axes
+        self._climbing = velocity[2] < 0.0
+        vertical = limits.up_m_s2 if self._climbing else limits.down_m_s2
+        x.plan(velocity[0], limits.acceleration_m_s2, limits.jerk_m_s3)
+        y.plan(velocity[1], limits.acceleration_m_s2, limits.jerk_m_s3)
+        z.plan(velocity[2], vertical, limits.jerk_m_s3)
+        synchronise(self.axes)
+
+    def _wanted(self, leg: Leg, limits: PathLimits) -> Vec:
+        """Return the velocity NED that leads to the target."""
+        here, target = self.position, leg.target
+        turning = leg.previous is not None and self._is_turning(target, limits.acceptance_m)
+        aim = target
+        if turning and leg.previous is not None:
+            aim = _aim_ahead(here, leg.previous, target, limits.acceptance_m)
+        speed = _horizontal_speed(here, leg, limits)
+        if turning:
+            speed = min(self._turn_speed, speed)
+        else:
+            self._turn_speed = speed
+        if not math.isnan(leg.vertical_m_s):
+            return (*_scaled(aim[0] - here[0], aim[1] - here[1], speed), leg.vertical_m_s)
+        vertical = self._vertical_speed(leg, limits)
+        way = tuple(a - h for a, h in zip(aim, here, strict=True))
+        length = math.sqrt(sum(w * w for w in way))
+        if length < _TINY:
+            return 0.0, 0.0, 0.0
+        total = math.hypot(speed, vertical) / length
+        return _clamped((way[0] * total, way[1] * total, way[2] * total), speed, vertical)
+
+    def _is_turning(self, target: Vec, acceptance_m: float) -> bool:
+        (x, y, _), (vx, vy, _) = self.position, self.velocity
+        north, east = target[0] - x, target[1] - y
+        speed, distance = math.hypot(vx, vy), math.hypot(north, east)
+        if speed <= TURNING_M_S or distance <= acceptance_m:
+            return False
+        return (vx * north + vy * east) / (speed * distance) < TURNING_COSINE
+
+    def _vertical_speed(self, leg: Leg, limits: PathLimits) -> float:
+        """Return the greatest vertical speed now [m/s]."""
+        here, target, after = self.position, leg.target, leg.following
+        climbing = target[2] < here[2]
+        most = limits.up_m_s if climbing else limits.down_m_s
+        acceleration = limits.up_m_s2 if climbing else limits.down_m_s2
+        arrival = 0.0
+        if after is not None and abs(target[2] - after[2]) > 1e-3:
+            back = math.hypot(target[0] - here[0], target[1] - here[1])
+            on = math.hypot(target[0] - after[0], target[1] - after[1])
+            angle = _angle((-back, here[2]), (0.0, target[2]), (on, after[2]))
+            arrival = min(most, _turn_speed(angle, acceleration, limits.vertical_acceptance_m))
+        distance = abs(target[2] - here[2])
+        return min(most, braking_speed(distance, acceleration, limits.jerk_m_s3, arrival))
+
+    def _waiting(self, vehicle: Vec, error_m: float) -> float:
+        """Return how fast time passes for the trajectory: slowly while the vehicle is behind."""
+        (x, y, _), (vx, vy, _) = self.position, self.velocity
+        north, east = x - vehicle[0], y - vehicle[1]
+        if error_m <= 0.0 or north * vx + east * vy < 0.0:
+            return 1.0
+        return 1.0 - min(1.0, math.hypot(north, east) / error_m)
+
+
+def braking_speed(
+    distance_m: float, acceleration: float, jerk: float, final_m_s: float = 0.0
+) -> float:
+    """Return the greatest speed [m/s] that can be braked to another one within a distance [m].
+
+    Source: PX4 1.16, computeMaxSpeedFromDistance: constant deceleration after the time
+    2 acceleration / jerk.
+    """
+    b = 4.0 * acceleration * acceleration / jerk
+    c = 2.0 * acceleration * distance_m + final_m_s * final_m_s
+    return max(final_m_s, 0.5 * (math.sqrt(b * b + 4.0 * c) - b))
+
+
+def _horizontal_speed(here: Vec, leg: Leg, limits: PathLimits) -> float:
+    """Return the greatest horizontal speed now [m/s]."""
+    target, after = leg.target, leg.following
+    acceleration, jerk = limits.acceleration_m_s2, limits.jerk_m_s3
+    arrival = 0.0
+    if after is not None:
+        beyond = math.hypot(target[0] - after[0], target[1] - after[1])
+        if beyond >= max(limits.acceptance_m, 1e-3):
+            angle = _angle(here[:2], target[:2], after[:2])
+            turn = _turn_speed(angle, limits.turn_share * acceleration, limits.acceptance_m)
+            leaving = min(limits.cruise_m_s, braking_speed(beyond, acceleration, jerk))
+            arrival = min(turn, leaving, limits.cruise_m_s)
+    distance = math.hypot(target[0] - here[0], target[1] - here[1])
+    return min(limits.cruise_m_s, braking_speed(distance, acceleration, jerk, arrival))
+
+
+def _turn_speed(angle: float, acceleration: float, radius_m: float) -> float:
+    """Return the speed [m/s] on a circle that rounds a corner of an angle [rad]; pi = straight.
+
+    Source: PX4 1.16, computeMaxSpeedInWaypoint.
+    """
+    return math.sqrt(acceleration * radius_m * math.tan(min(angle, math.pi - 1e-6) / 2.0))
+
+
+def _angle(a: Sequence[float], b: Sequence[float], c: Sequence[float]) -> float:
+    """Return the angle [rad] at corner b between the ways to a and c; 0 and pi / 2 if one is none.
+
+    A straight way on has pi.
+    """
+    ax, ay, cx, cy = a[0] - b[0], a[1] - b[1], c[0] - b[0], c[1] - b[1]
+    lengths = math.hypot(ax, ay) * math.hypot(cx, cy)
+    if lengths < _TINY:
+        return math.pi / 2.0
+    return math.acos(min(1.0, max(-1.0, (ax * cx + ay * cy) / lengths)))
+
+
+def _aim_ahead(here: Vec, start: Vec, target: Vec, acceptance_m: float) -> Vec:
+    """Return the point of the leg that lies an L1 distance ahead of a vehicle beside it."""
+    along = [t - s for t, s in zip(target, start, strict=True)]
+    length = math.sqrt(sum(a * a for a in along))
+    if length < _TINY:
+        return target
+    x, y, z = (a / length for a in along)
+    done = (here[0] - start[0]) * x + (here[1] - start[1]) * y + (here[2] - start[2]) * z
+    closest = (start[0] + done * x, start[1] + done * y, start[2] + done * z)
+    l1, aside = max(acceptance_m, LEAST_L1_M), math.dist(closest, here)
+    ahead = math.sqrt(l1 * l1 - aside * aside) if l1 > aside else 0.0
+    return closest[0] + ahead * x, closest[1] + ahead * y, closest[2] + ahead * z
+
+
+def _scaled(north: float, east: float, length: float) -> tuple[float, float]:
+    """Return a horizontal vector with another length; none where it has no direction."""
+    norm = math.hypot(north, east)
+    return (0.0, 0.0) if norm < _TINY else (north * length / norm, east * length / norm)
+
+
+def _clamped(velocity: Vec, horizontal: float, vertical: float) -> Vec:
+    """Scale a velocity down to both limits; one that is next to nothing scales its axes alone."""
+    vx, vy, vz = velocity
+    norm = math.hypot(vx, vy)
+    if norm > horizontal:
+        share = horizontal / norm
+        vx, vy = vx * share, vy * share
+        vz = vz if max(horizontal, norm) < 0.5 else vz * share
+    if abs(vz) > vertical:
+        share = vertical / abs(vz)
+        if max(vertical, abs(vz)) >= 0.5:
+            vx, vy = vx * share, vy * share
+        vz *= share
+    return vx, vy, vz
+
+
+def _sign(value: float) -> float:
+    return (value > 0.0) - (value < 0.0)

@@ -1,0 +1,123 @@
+"""How the automatic modes move: smoothly from waypoint to waypoint, with PX4's limits and heading.
+
+Source: PX4 1.16, FlightTaskAuto.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from airl_mav.control.demand import TrajectoryDemand
+from airl_mav.core.constants import DEG, US_PER_S
+from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.autopilot.trajectory import Leg, PathLimits, Trajectory
+
+PAUSE_US = 100_000
+"""After so long without being flown, the trajectory starts anew where the vehicle is [µs]."""
+
+YAW_RATE_TAU_S = 0.2
+"""Time constant of the yaw rate that is fed forward [s]."""
+
+
+class Travel:
+    """A trajectory that the automatic modes share: one goes on where another ended."""
+
+    def __init__(self, value: Callable[[str], float]) -> None:
+        """Take a lookup of PX4 parameter names."""
+        self._value = value
+        self._trajectory = Trajectory()
+        self._time_us: int | None = None
+        self._yaw = 0.0
+        """Heading setpoint [rad]."""
+        self._yaw_rate = 0.0
+        self._wanted_yaw: float | None = None
+        """Where the vehicle looks while nobody says; None = as it does when the leg begins."""
+        self.speed_m_s = math.nan
+        """Horizontal speed by MAV_CMD_DO_CHANGE_SPEED or the like; NaN = MPC_XY_CRUISE."""
+
+    def stop(self) -> None:
+        """Begin anew at the vehicle when the next leg is flown."""
+        self._time_us = None
+
+    def fly(
+        self, state: Vector, time_us: int, leg: Leg, *, yaw: float = math.nan
+    ) -> TrajectoryDemand:
+        """Return the demand at a time [µs] on the way along a leg.
+
+        `yaw`: heading [rad]; NaN = towards the target, and at the target as before.
+        """
+        position, velocity = _three(state, P), _three(state, V)
+        now = quat_yaw(state[Q:RATES])
+        if self._time_us is None or time_us - self._time_us > PAUSE_US:
+            self._trajectory.restart(position, velocity)
+            self._yaw, self._yaw_rate, self._wanted_yaw = now, 0.0, None
+            elapsed_s = 0.0
+        else:
+            elapsed_s = (time_us - self._time_us) / US_PER_S
+        self._time_us = time_us
+        path = self._trajectory
+        path.advance(position, leg, self.limits(), elapsed_s)
+        self._turn(self._heading(position, now, leg.target) if math.isnan(yaw) else yaw, elapsed_s)
+        return TrajectoryDemand(
+            path.position, path.velocity, path.acceleration, self._yaw, self._yaw_rate
+        )
+
+    def limits(self) -> PathLimits:
+        """Return the limits that the parameters give."""
+        value = self._value
+        speed = self.speed_m_s
+        cruise = value("MPC_XY_CRUISE") if math.isnan(speed) else speed
+        return PathLimits(
+            cruise_m_s=min(cruise, value("MPC_XY_VEL_MAX")),
+            up_m_s=value("MPC_Z_V_AUTO_UP"),
+            down_m_s=value("MPC_Z_V_AUTO_DN"),
+            acceleration_m_s2=value("MPC_ACC_HOR"),
+            up_m_s2=value("MPC_ACC_UP_MAX"),
+            down_m_s2=value("MPC_ACC_DOWN_MAX"),
+            jerk_m_s3=value("MPC_JERK_AUTO"),
+            acceptance_m=value("NAV_ACC_RAD"),
+            vertical_acceptance_m=value("NAV_MC_ALT_RAD"),
+            error_m=value("MPC_XY_ERR_MAX"),
+            turn_share=value("MPC_XY_TRAJ_P"),
+        )
+
+    def _heading(self, position: Vec, now: float, target: Vec) -> float:
+        """Return PX4's heading towards the waypoint (MPC_YAW_MODE 0); near it, that is kept."""
+        north, east = target[0] - position[0], target[1] - position[1]
+        if math.hypot(north, east) > self._value("NAV_ACC_RAD"):
+            self._wanted_yaw = math.atan2(east, north)
+        elif self._wanted_yaw is None:
+            self._wanted_yaw = now
+        return self._wanted_yaw
+
+    def _turn(self, yaw: float, elapsed_s: float) -> None:
+        """Turn the heading setpoint, no faster than MPC_YAWRAUTO_MAX."""
+        limit = self._value("MPC_YAWRAUTO_MAX") * DEG
+        most = limit * elapsed_s
+        step = min(most, max(-most, wrap_pi(yaw - self._yaw)))
+        self._yaw = wrap_pi(self._yaw + step)
+        if elapsed_s > 0.0:
+            weight = elapsed_s / (elapsed_s + YAW_RATE_TAU_S)
+            self._yaw_rate += weight * (step / elapsed_s - self._yaw_rate)
+            self._yaw_rate = min(limit, max(-limit, self._yaw_rate))
+
+
+def stopping_place(state: Vector, value: Callable[[str], float]) -> Vec:
+    """Return where the vehicle can come to rest by braking NED [m], at its present height.
+
+    Source: PX4 1.16, Navigator::preproject_stop_point.
+    """
+    north, east, down = _three(state, P)
+    vn, ve, _ = _three(state, V)
+    speed = math.hypot(vn, ve)
+    # The delay of the deceleration: 0.6 s, as PX4 passes 0.6 of the jerk for an acceleration.
+    distance_per_speed = speed / (2.0 * value("MPC_ACC_HOR")) + 0.6
+    return north + vn * distance_per_speed, east + ve * distance_per_speed, down
+
+
+def _three(state: Vector, start: int) -> Vec:
+    north, east, down = state[start : start + 3].tolist()
+    return north, east, down
