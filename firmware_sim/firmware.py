@@ -16,11 +16,15 @@ from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.flight_controller import FlightController
+from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
+
+ULOG_SUFFIX = ".ulg"
+"""Of a vehicle's own log."""
 
 IDLE_S = 0.02
 """How often requests are checked while no episode is loaded [s]."""
@@ -166,6 +170,7 @@ class Firmware:
         self._recording = recording
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
+        self._flight_log: FlightLog | None = None
 
     @property
     def camera_endpoint(self) -> str:
@@ -187,7 +192,7 @@ class Firmware:
 
         Args:
             setup: The episode.
-            tlog: Where its MAVLink log goes; None = no log.
+            tlog: Where its MAVLink log goes; the vehicle's log (.ulg) is beside it. None = no log.
             start_unix_us: Calendar time of this moment [µs since 1970].
 
         Raises:
@@ -196,7 +201,7 @@ class Firmware:
         """
         self.discard()
         autopilot = self.flight_stack.boot(setup)
-        autopilot.on_message = self.on_message
+        autopilot.on_message = self._hear
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
         try:
             simulation = Simulation(
@@ -221,6 +226,7 @@ class Firmware:
         if tlog is not None:
             self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
             self.flight_stack.log_to(self._tlog)
+            self._open_flight_log(tlog.with_suffix(ULOG_SUFFIX), start_unix_us)
         if self.epoch_ns is not None:
             # Objects that live for the whole episode are exempt from garbage collection: a full
             # collection would stall the 250 Hz loop for tens of milliseconds.
@@ -229,6 +235,23 @@ class Firmware:
         # All this took wall time, which is no part of the episode: it starts now.
         self._pacing.restart(simulation.time_us)
         return Loaded(start_us, self.epoch_ns)
+
+    def _open_flight_log(self, path: Path, start_unix_us: int) -> None:
+        """Begin the vehicle's log. Real firmware, which shows nothing, writes its own."""
+        simulation = self.simulation
+        internals = None if simulation is None else simulation.autopilot.internals
+        if simulation is not None and internals is not None:
+            now_us = simulation.time_us
+            self._flight_log = log = FlightLog(
+                path, internals.parameters, now_us, start_unix_us - now_us
+            )
+            internals.parameters.on_change(log.parameters_changed)
+
+    def _hear(self, message: Message) -> None:
+        if self._flight_log is not None and self.simulation is not None:
+            self._flight_log.text(message, self.simulation.time_us)
+        if self.on_message is not None:
+            self.on_message(message)
 
     def _tick_on_the_ground(self) -> int:
         simulation = self.simulation
@@ -254,19 +277,30 @@ class Firmware:
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
             simulation.capture_due(self._camera.publish)
-        simulation.tick()
+        log = self._flight_log
+        if log is None:
+            simulation.tick()
+        else:
+            log.before_tick(simulation.time_us, simulation.plant.truth)
+            simulation.tick()
+            internals = simulation.autopilot.internals
+            if internals is not None and internals.sample is not None:
+                log.after_tick(internals.sample, internals.state)
         flight_stack.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
 
     def save(self, path: Path) -> None:
-        """Write the episode's arrays and close its MAVLink log; the flight goes on unrecorded."""
+        """Write the episode's arrays and close its logs; the flight goes on unrecorded."""
         if self.simulation is not None:
             strangers = np.array(self.flight_stack.strangers(), np.str_)
             save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
-            self._close_tlog()
+            self._close_logs()
 
-    def _close_tlog(self) -> None:
+    def _close_logs(self) -> None:
+        if self._flight_log is not None:
+            self._flight_log.close()
+            self._flight_log = None
         if self._tlog is not None:
             self.flight_stack.log_to(None)
             self._tlog.close()
@@ -274,7 +308,7 @@ class Firmware:
 
     def discard(self) -> None:
         """Forget the episode."""
-        self._close_tlog()
+        self._close_logs()
         if self.simulation is not None:
             if self.epoch_ns is not None:
                 gc.unfreeze()

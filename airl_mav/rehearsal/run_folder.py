@@ -31,6 +31,7 @@ from airl_mav.core.files import (
     replace_file,
     write_json,
 )
+from airl_mav.core.log_file import PARTIAL_SUFFIX
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
 from airl_mav.flight.record import EpisodeRecord
@@ -180,7 +181,7 @@ class RunFolder:
         _write_info(self.path / RUN_FILE, info)
 
     def tlog_path(self, index: int) -> Path:
-        """Return the path of an episode's raw MAVLink log."""
+        """Return the path of an episode's raw MAVLink log; the vehicle's log is beside it."""
         return self.path / f"flight-{index:03d}.tlog"
 
     def forget(self, indices: Collection[int]) -> None:
@@ -196,12 +197,12 @@ class RunFolder:
     def sweep(self) -> None:
         """Remove what processes left behind for an episode that was never finished.
 
-        The MAVLink log of a killed firmware is kept: whole records, up to its last second.
+        The logs of a killed firmware are kept: whole records, up to its last second.
         """
         for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
-        for log in self.path.glob("flight-*.tlog.part"):
+        for log in self.path.glob(f"flight-*{PARTIAL_SUFFIX}"):
             log.rename(log.with_suffix(""))
 
     def discard(self) -> None:

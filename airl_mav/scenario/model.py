@@ -256,7 +256,8 @@ class Flights(Workers):
     )
     tlogs: Annotated[bool, FREE] = Field(
         default=False,
-        description="level lockstep: write the MAVLink log of every flight; level sitl always does",
+        description="level lockstep: write the logs of every flight (.tlog, .ulg); level sitl"
+        " always does",
     )
 
 

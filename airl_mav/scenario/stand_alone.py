@@ -118,7 +118,9 @@ class StandAloneVehicle(Aircraft):
         description="with a goal radius: longest flight from the start of navigation",
     )
     tlog: Path | None = Field(
-        default=None, description="write the MAVLink log of the onboard link to this file"
+        default=None,
+        description="write the MAVLink log of the onboard link to this file, and the vehicle's log"
+        " (.ulg) beside it",
     )
 
     @property

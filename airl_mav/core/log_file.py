@@ -1,0 +1,59 @@
+"""A file that grows during a flight: under a temporary name until it is whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from airl_mav.core.constants import US_PER_S
+
+PARTIAL_SUFFIX = ".part"
+"""Added to the file's name until the log is complete."""
+
+_FLUSH_BYTES = 65_536
+_FLUSH_US = US_PER_S
+
+
+class LogFile:
+    """Takes whole records, and writes them at the latest after one second of simulated time.
+
+    A killed process leaves a valid log under the temporary name that lacks its last second at
+    most. Nothing is kept in memory for longer.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file, whose final name is `path`."""
+        self.path = path
+        self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
+        self._buffer = bytearray()
+        self._flushed_us: int | None = None
+        self._file = self.partial_path.open("wb", buffering=0)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the log is complete."""
+        return self._file.closed
+
+    def add(self, time_us: int, *parts: bytes) -> None:
+        """Add one record, in parts, at simulated `time_us` [µs]."""
+        for part in parts:
+            self._buffer += part
+        if self._flushed_us is None:
+            self._flushed_us = time_us
+        if len(self._buffer) >= _FLUSH_BYTES or time_us - self._flushed_us >= _FLUSH_US:
+            self.flush()
+            self._flushed_us = time_us
+
+    def flush(self) -> None:
+        """Write out what is buffered."""
+        view = memoryview(bytes(self._buffer))
+        while view:
+            view = view[self._file.write(view) :]
+        self._buffer.clear()
+
+    def close(self) -> None:
+        """Complete the log and give it its final name; harmless when called again."""
+        if self._file.closed:
+            return
+        self.flush()
+        self._file.close()
+        self.partial_path.replace(self.path)

@@ -1,0 +1,125 @@
+"""One vehicle's log: what is due after each tick goes to the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from airl_mav.core.constants import TICK_US
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
+from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
+from firmware_sim.flight_log.ulog import UlogWriter, Values
+from firmware_sim.interfaces import SensorSample, Truth
+
+GRID_US = 5 * TICK_US
+"""How often is looked for what is due [µs]: all intervals are multiples of it."""
+
+_PX4_RELEASE = 1 << 24 | 16 << 16 | 0 << 8 | 255
+"""ver_sw_release: the PX4 whose behaviour is emulated, 1.16.0."""
+
+_DATA_FORMAT = 2
+"""ver_data_format: by it Flight Review knows the names of fields, here those of PX4 1.16."""
+
+_SAMPLES = 0
+"""Number of `SENSOR_COMBINED` in the file; the other topics follow in their order."""
+
+
+class FlightLog:
+    """Writes what a vehicle does to a .ulg, tick after tick."""
+
+    def __init__(
+        self, path: Path, parameters: ParameterStore, start_us: int, boot_unix_us: int
+    ) -> None:
+        """Open the log; see `UlogWriter`.
+
+        Args:
+            path: Its final name; it has another one until it is closed.
+            parameters: Of the vehicle, as they are when the log begins.
+            start_us: Simulated time now [µs].
+            boot_unix_us: Calendar time of simulated time 0 [µs since 1970].
+        """
+        self._boot_unix_us = boot_unix_us
+        self._due_us = [start_us] * len(TOPICS)
+        self._last: list[Values | None] = [None] * len(TOPICS)
+        self._truth: Truth | None = None
+        """At the time of the newest sample, where all is logged."""
+        self._parameters = parameters
+        self._known = dict(_values(parameters))
+        self._writer = UlogWriter(
+            path,
+            start_us,
+            (SENSOR_COMBINED, *(logged.topic for logged in TOPICS)),
+            _info(),
+            self._known.items(),
+        )
+
+    @property
+    def path(self) -> Path:
+        """The log's final name."""
+        return self._writer.path
+
+    @property
+    def partial_path(self) -> Path:
+        """The log's name until it is closed."""
+        return self._writer.partial_path
+
+    def flush(self) -> None:
+        """Write out what is buffered, for somebody who reads it now."""
+        self._writer.flush()
+
+    def before_tick(self, time_us: int, truth: Callable[[], Truth]) -> None:
+        """Note the true state where the coming tick, of simulated `time_us` [µs], is logged."""
+        self._truth = truth() if time_us % GRID_US == 0 else None
+
+    def after_tick(self, sample: SensorSample, state: Callable[[], AutopilotState]) -> None:
+        """Log what is due; the sample is that which the tick took."""
+        now_us, truth = sample.time_us, self._truth
+        self._writer.sample(_SAMPLES, now_us, sensor_combined(sample))
+        if truth is not None:
+            self._log(Moment(state(), truth, self._boot_unix_us + now_us), now_us)
+
+    def text(self, message: Message, time_us: int) -> None:
+        """Log a text for the operator."""
+        self._writer.text(time_us, message.severity, message.text)
+
+    def parameters_changed(self) -> None:
+        """Log the parameters that have other values than before."""
+        for name, value in _values(self._parameters):
+            if self._known[name] != value:
+                self._known[name] = value
+                self._writer.parameter(name, value)
+
+    def close(self) -> None:
+        """Complete the log and give it its final name; harmless when called again."""
+        self._writer.close()
+
+    def _log(self, moment: Moment, now_us: int) -> None:
+        due_us, last = self._due_us, self._last
+        for i, logged in enumerate(TOPICS):
+            due = now_us >= due_us[i]
+            if not due and not logged.on_change:
+                continue
+            values = logged.values(moment)
+            if values is None or (not due and values == last[i]):
+                continue
+            last[i] = values
+            due_us[i] = now_us + logged.interval_us
+            self._writer.sample(1 + i, now_us, values)
+
+
+def _values(parameters: ParameterStore) -> Iterable[tuple[str, int | float]]:
+    for index in range(len(parameters)):
+        parameter = parameters.by_index(index)
+        if parameter is not None:
+            yield parameter.name, parameter.value
+
+
+def _info() -> Iterable[tuple[str, str | int]]:
+    """Return facts of the vehicle by ULog's keys."""
+    return (
+        ("sys_name", "airl-mav"),
+        ("ver_hw", "PX4_SITL"),
+        ("ver_sw_release", _PX4_RELEASE),
+        ("ver_data_format", _DATA_FORMAT),
+    )

@@ -1,0 +1,138 @@
+"""ULog, PX4's log format: what a file consists of, and a writer that keeps nothing in memory.
+
+Format: https://docs.px4.io/main/en/dev_log/ulog_file_format.html, version 1. Little endian; every
+message is the length of its content, its type, and its content.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from airl_mav.core.log_file import LogFile
+
+Values = tuple[float | int | bool, ...]
+
+_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
+_VERSION = 1
+_HEAD = struct.Struct("<HB")
+_FLAG_BYTES = 40
+"""Content of the flag message: compatible and incompatible flags, offsets of appended data."""
+
+_CODES = {
+    "int8_t": "b",
+    "uint8_t": "B",
+    "int16_t": "h",
+    "uint16_t": "H",
+    "int32_t": "i",
+    "uint32_t": "I",
+    "int64_t": "q",
+    "uint64_t": "Q",
+    "float": "f",
+    "double": "d",
+    "bool": "?",
+}
+"""ULog's types as `struct` has them."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A uORB topic: its name and its fields, each "type name" or "type[n] name"."""
+
+    name: str
+    fields: tuple[str, ...]
+    """Behind the timestamp, which every topic begins with."""
+
+    @cached_property
+    def definition(self) -> bytes:
+        """The content of its format message."""
+        return f"{self.name}:{';'.join(('uint64_t timestamp', *self.fields))};".encode("ascii")
+
+    @cached_property
+    def sample(self) -> struct.Struct:
+        """The layout of one sample: number of the topic, timestamp and fields."""
+        return struct.Struct("<HQ" + "".join(_code(field.split()[0]) for field in self.fields))
+
+
+def _code(kind: str) -> str:
+    name, _, count = kind.rstrip("]").partition("[")
+    return f"{count}{_CODES[name]}"
+
+
+class UlogWriter(LogFile):
+    """Writes a log of samples, texts and parameters."""
+
+    def __init__(
+        self,
+        path: Path,
+        start_us: int,
+        topics: Iterable[Topic],
+        info: Iterable[tuple[str, str | int]],
+        parameters: Iterable[tuple[str, int | float]],
+    ) -> None:
+        """Open the file, whose final name is `path`, and write its head.
+
+        Args:
+            path: The log.
+            start_us: Simulated time at which the log begins [µs].
+            topics: What can be written by `sample`, by their place in this order.
+            info: Facts of the vehicle by ULog's keys; a number is written as uint32_t.
+            parameters: Every parameter's name and value; an int is written as int32_t.
+        """
+        super().__init__(path)
+        topics = tuple(topics)
+        self._samples = [topic.sample for topic in topics]
+        self._now_us = start_us
+        self.add(start_us, _MAGIC, struct.pack("<BQ", _VERSION, start_us))
+        self._message(b"B", bytes(_FLAG_BYTES))
+        for topic in topics:
+            self._message(b"F", topic.definition)
+        for key, value in info:
+            self._message(b"I", _text(key, value) if isinstance(value, str) else _whole(key, value))
+        for name, number in parameters:
+            self.parameter(name, number)
+        for number, topic in enumerate(topics):
+            multi_id = 0
+            self._message(b"A", struct.pack("<BH", multi_id, number) + topic.name.encode("ascii"))
+        self.flush()
+
+    def sample(self, number: int, time_us: int, values: Values) -> None:
+        """Add one sample of topic `number`, taken at simulated `time_us` [µs].
+
+        Raises struct.error when the values are not those of the topic's fields.
+        """
+        layout = self._samples[number]
+        self._now_us = time_us
+        head = _HEAD.pack(layout.size, ord("D"))
+        self.add(time_us, head, layout.pack(number, time_us, *values))
+
+    def text(self, time_us: int, severity: int, text: str) -> None:
+        """Add a text of simulated `time_us` [µs], of severity 0 (emergency) to 7 (debug)."""
+        self._now_us = time_us
+        head = struct.pack("<BQ", ord("0") + severity, time_us)
+        self._message(b"L", head + text.encode("utf-8", errors="replace"))
+
+    def parameter(self, name: str, value: int | float) -> None:
+        """Add a parameter's value, from now on."""
+        kind, code = ("int32_t", "<i") if isinstance(value, int) else ("float", "<f")
+        self._message(b"P", _keyed(kind, name, struct.pack(code, value)))
+
+    def _message(self, kind: bytes, content: bytes) -> None:
+        self.add(self._now_us, _HEAD.pack(len(content), ord(kind)), content)
+
+
+def _text(key: str, value: str) -> bytes:
+    data = value.encode("utf-8")
+    return _keyed(f"char[{len(data)}]", key, data)
+
+
+def _whole(key: str, value: int) -> bytes:
+    return _keyed("uint32_t", key, struct.pack("<I", value))
+
+
+def _keyed(kind: str, key: str, data: bytes) -> bytes:
+    described = f"{kind} {key}".encode("ascii")
+    return bytes([len(described)]) + described + data

@@ -1,0 +1,157 @@
+"""The vehicle's log (.ulg), read by PX4's own reader."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pyulog import ULog
+from pyulog.px4 import PX4ULog
+
+from airl_mav import Scenario, load_run, rehearse
+from airl_mav.core.constants import TICK_US
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.parameters import parameter_values
+from airl_mav.profiles.vehicle import VehicleProfile
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.flight_log.flight_log import GRID_US
+from firmware_sim.flight_log.topics import NAVIGATION_STATES, TOPICS
+from firmware_sim.flight_log.ulog import Topic, UlogWriter
+
+ANSWER = Topic("answer", ("float[3] xyz", "int16_t number", "bool right", "double exact"))
+
+
+def write(path: Path) -> UlogWriter:
+    """Begin a log and write a little of everything."""
+    facts: list[tuple[str, str | int]] = [("sys_name", "a name"), ("ver_sw_release", 17)]
+    log = UlogWriter(path, 4_000, [ANSWER], facts, [("WHOLE", 3), ("REAL", 0.5)])
+    log.sample(0, 8_000, (1.0, 2.0, 3.0, -7, True, 1e-300))
+    log.sample(0, 12_000, (1.5, 2.5, 3.5, 7, False, 0.1))
+    log.text(12_000, 4, "a warning")
+    log.parameter("REAL", 0.25)
+    return log
+
+
+def topic(log: ULog, name: str) -> dict[str, Any]:
+    """Return the samples of a topic by field."""
+    data: dict[str, Any] = log.get_dataset(name).data
+    return data
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "log.ulg"
+    log = write(path)
+    assert not path.exists()
+    log.close()
+    log.close()
+    read = ULog(str(path))
+    assert not read.file_corruption
+    assert read.start_timestamp == 4_000
+    assert read.msg_info_dict == {"sys_name": "a name", "ver_sw_release": 17}
+    assert read.initial_parameters == {"WHOLE": 3, "REAL": 0.5}
+    assert read.changed_parameters == [(12_000, "REAL", 0.25)]
+    (text,) = read.logged_messages
+    assert (text.timestamp, text.log_level_str(), text.message) == (12_000, "WARNING", "a warning")
+    data = topic(read, "answer")
+    assert data["timestamp"].tolist() == [8_000, 12_000]
+    assert [data[f"xyz[{i}]"].tolist() for i in range(3)] == [[1.0, 1.5], [2.0, 2.5], [3.0, 3.5]]
+    assert data["number"].tolist() == [-7, 7]
+    assert data["right"].tolist() == [1, 0]
+    assert data["exact"].tolist() == [1e-300, 0.1]
+
+
+def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
+    path = tmp_path / "killed.ulg"
+    script = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from firmware_sim.flight_log.ulog import Topic, UlogWriter\n"
+        "log = UlogWriter(Path(sys.argv[1]), 0, [Topic('t', ('float x',))], [], [])\n"
+        "for i in range(5_000):\n"
+        "    log.sample(0, i * 4_000, (float(i),))\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    assert not path.exists()
+    times = topic(ULog(str(path) + ".part"), "t")["timestamp"]
+    assert len(times) > 4_700
+    assert np.all(np.diff(times) == 4_000)
+
+
+def test_every_mode_has_its_number() -> None:
+    assert set(NAVIGATION_STATES) == set(Mode)
+
+
+def test_intervals_are_met_by_the_grid() -> None:
+    assert [logged.topic.name for logged in TOPICS if logged.interval_us % GRID_US] == []
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ULog]:
+    """A flight in lockstep, and its log."""
+    folder = tmp_path_factory.mktemp("flown") / "run"
+    rehearse(Scenario(episodes=1, level="lockstep", tlogs=True, workers=1), out=folder)
+    return folder, ULog(str(folder / "flight-000.ulg"))
+
+
+def test_a_flight_is_logged_whole(flown: tuple[Path, ULog]) -> None:
+    folder, log = flown
+    assert not log.file_corruption
+    assert not log.dropouts
+    samples = topic(log, "sensor_combined")
+    assert np.all(np.diff(samples["timestamp"]) == TICK_US)
+    # Upright at rest it feels the ground push up.
+    resting = samples["accelerometer_m_s2[2]"][200:250]
+    assert resting.mean() == pytest.approx(-9.81, abs=0.1)
+    # The truth in the log is the path of the record.
+    record = load_run(folder).trajectories[0]
+    truth = topic(log, "vehicle_local_position_groundtruth")
+    times = truth["timestamp_sample"]
+    assert np.all(times <= samples["timestamp"][-1] + TICK_US)
+    inside = (times >= record.time_us[0]) & (times <= record.time_us[-1])
+    assert inside.sum() > 200
+    for axis, name in enumerate(("x", "y", "z")):
+        path = np.interp(times[inside], record.time_us, record.position[:, axis])
+        assert truth[name][inside] == pytest.approx(path, abs=2e-3)
+    # The estimate is near it, and so is what the motors do: a hover takes half of their range.
+    estimate = topic(log, "vehicle_local_position")
+    later = estimate["timestamp"] > 10_000_000
+    error = np.interp(estimate["timestamp"], truth["timestamp_sample"], truth["z"]) - estimate["z"]
+    assert np.abs(error[later]).max() < 1.0
+    motors = topic(log, "actuator_motors")
+    flying = motors["control[0]"][np.isfinite(motors["control[0]"])]
+    assert 0.3 < np.median(flying) < 0.8
+    assert np.isnan(motors["control[4]"]).all()
+
+
+def test_states_texts_and_parameters(flown: tuple[Path, ULog]) -> None:
+    _, log = flown
+    status = topic(log, "vehicle_status")
+    states = status["nav_state"][status["arming_state"] == 2]
+    order = [int(state) for state, _ in groupby(states)]
+    flown_modes = (Mode.TAKEOFF, Mode.HOLD, Mode.OFFBOARD, Mode.LAND)
+    assert order == [NAVIGATION_STATES[mode] for mode in flown_modes]
+    texts = [text.message for text in log.logged_messages]
+    assert "Takeoff detected" in texts
+    assert texts[-1] == "Disarmed by landing"
+    vehicle = load_profile("vehicles", "quad", VehicleProfile)
+    stored = parameter_values(vehicle.autopilot_parameters())
+    assert log.initial_parameters.keys() == stored.keys()
+    assert all(
+        log.initial_parameters[name] == pytest.approx(value, rel=1e-6)
+        for name, value in stored.items()
+    )
+
+
+def test_tools_of_px4_read_it(flown: tuple[Path, ULog]) -> None:
+    _, log = flown
+    px4 = PX4ULog(log)
+    px4.add_roll_pitch_yaw()
+    attitude = topic(log, "vehicle_attitude")
+    assert np.abs(attitude["roll"]).max() < 1.0
+    assert px4.get_mav_type() == "Quadrotor"
