@@ -27,6 +27,7 @@ from companion.camera import open_camera
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
+from companion.signing_proxy import signed
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,8 @@ def fly_alone(
     with (
         held_to(asked.cpu_quota),
         closing(open_camera(asked.camera, clock)) as frames,
-        closing(MavsdkLink(asked.connect, clock, abandon)) as link,
+        signed(asked.connect, asked.signing_key) as url,
+        closing(MavsdkLink(url, clock, abandon)) as link,
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)

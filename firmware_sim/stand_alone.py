@@ -34,5 +34,6 @@ def fly(
     for name, link in firmware.flight_stack.counters().items():
         say(
             f"{name:<8} received {link.rx}, malformed {link.malformed}, ignored {link.ignored}, "
-            f"dropped {link.dropped}, sent {link.tx}, not sent {link.send_errors}"
+            f"dropped {link.dropped}, "
+            f"refused {link.refused}, sent {link.tx}, not sent {link.send_errors}"
         )

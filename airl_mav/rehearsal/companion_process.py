@@ -36,6 +36,7 @@ from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import check_camera, fly_mission
+from companion.signing_proxy import signed
 
 CONNECT_TIMEOUT_S = 30.0
 """Longest wait for the flight controller [wall s]."""
@@ -83,9 +84,8 @@ class Missions:
         with (
             held_to(aircraft.cpu_quota),
             closing(open_camera(f"tcp://{LOOPBACK}:{camera_port}", clock)) as frames,
-            closing(
-                MavsdkLink(f"udpin://{LOOPBACK}:{aircraft.companion_port}", clock, self._abandon)
-            ) as link,
+            signed(f"udpin://{LOOPBACK}:{aircraft.companion_port}", aircraft.signing_key) as url,
+            closing(MavsdkLink(url, clock, self._abandon)) as link,
         ):
             self._channel.send(Ready())
             while not isinstance(request := self._requests.get(), Shutdown):

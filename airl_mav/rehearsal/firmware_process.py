@@ -17,6 +17,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
+from airl_mav.core.signing_key import StoredSigning
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.channel import (
     Begin,
@@ -88,9 +89,11 @@ def build_firmware(
             insecure=insecure,
         )
 
+    signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
+    insecure = insecure or signing is not None
     flight_stack: FlightStack
     if aircraft.firmware == "builtin":
-        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us(), pacing.clock))
+        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us(), pacing.clock, signing))
     else:
         flight_stack = real_firmware(Wanted(aircraft, vehicle, log, ends))
     try:

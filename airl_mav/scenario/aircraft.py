@@ -126,6 +126,11 @@ class Aircraft(ProfileModel):
         " sensors; see docs/how-to/real-firmware.md",
     )
     real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
+    signing_key: Annotated[Path | None, FREE] = Field(
+        default=None,
+        description="sign MAVLink with the key in this file (64 hexadecimal digits, mode 0600), and"
+        " refuse what is not signed with it",
+    )
     ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
 
     @property

@@ -66,6 +66,9 @@ def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None)
         speed: Simulated seconds per wall second; None: as usual.
     """
     firmware, real = asked.firmware, asked.real
+    if asked.signing_key is not None and (level != "sitl" or firmware != "builtin"):
+        accepted = "at level sitl, with firmware builtin"
+        raise FieldError("signing_key", asked.signing_key, accepted)
     given = {name for name, value in real if value not in (None, False)}
     for kind, names in REAL_FIRMWARE_NEEDS.items():
         mine = [name for name in names if name in given]

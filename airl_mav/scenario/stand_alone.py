@@ -76,8 +76,8 @@ class StandAloneVehicle(Aircraft):
     gcs_host: str = Field(default=LOOPBACK, description="IPv4 address of the ground station")
     insecure: bool = Field(
         default=False,
-        description="allow addresses that other machines can reach; MAVLink has no authentication"
-        " here yet",
+        description="allow addresses that other machines can reach without a signing key: MAVLink"
+        " has no other authentication",
     )
     lockstep: bool = Field(
         default=False,
@@ -147,6 +147,11 @@ class CompanionAddresses(ProfileModel):
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     """What flies a policy, by itself: on an onboard computer, or against any simulator."""
 
+    signing_key: Path | None = Field(
+        default=None,
+        description="sign MAVLink with the key in this file, that of the flight controller (64"
+        " hexadecimal digits, mode 0600); over udpin:// only",
+    )
     policy: PolicyName = DEFAULT_POLICY
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
@@ -211,6 +216,8 @@ def check_companion(asked: StandAloneCompanion) -> None:
     for metres in asked.goal:
         if not abs(metres) <= FARTHEST_M:
             raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")
+    if asked.lockstep and asked.signing_key is not None:
+        raise FieldError("signing_key", asked.signing_key, "without lockstep")
     _check_folder("log", asked.log)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic
+from airl_mav.core.signing import Signing
 from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
@@ -61,6 +62,7 @@ class Clients:
         endpoint: SharedEndpoint,
         welcome: Callable[[Peer, Endpoint], Client],
         clock: Clock | None = None,
+        signing: Signing | None = None,
     ) -> None:
         """Begin with the preset remote, where there is one.
 
@@ -69,11 +71,13 @@ class Clients:
             endpoint: Where its clients are.
             welcome: Makes a client of who is heard for the first time.
             clock: Measures the time that what arrives takes out of a tick; None: it may take any.
+            signing: Checks what strangers send; None: there is no key.
         """
         self.name = name
         self.endpoint = endpoint
         self._welcome = welcome
         self._clock = clock
+        self._signing = signing
         self._spent_us = 0
         self._clients: dict[Peer, Client] = {}
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
@@ -160,6 +164,10 @@ class Clients:
             return None, []
         messages = self._doorkeeper.feed(chunk)
         self._strangers.take(max(1, len(messages)), now_us)
+        if self._signing is not None and self._signing.key is not None:
+            heard = len(messages)
+            messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
+            self._gone += LinkCounters(0, 0, 0, 0, 0, refused=heard - len(messages))
         if not messages:
             return None, []
         end = self.endpoint.towards(peer)

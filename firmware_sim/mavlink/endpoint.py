@@ -183,7 +183,8 @@ class UdpEndpoint:
             remote: Where to send from the first tick; None = only to peers that sent something.
             local_option: The command line option that moves the local port, for messages.
             remote_option: The command line option that moves the remote, for messages.
-            insecure: Allow addresses that other machines can reach.
+            insecure: Allow addresses that other machines can reach: frames are signed, or the
+                network is trusted.
 
         Raises:
             UsageError: An address is unusable, taken, or reachable from outside without
@@ -271,6 +272,6 @@ def _usable(address: Address, option: str, *, lowest_port: int, insecure: bool) 
     if not ipaddress.IPv4Address(number).is_loopback and not insecure:
         raise UsageError(
             f"{option}: {host}:{port} can be reached from other machines and MAVLink is "
-            "unauthenticated (no signing yet): add --insecure to allow it on a trusted network"
+            "unauthenticated: give a --signing-key, or --insecure on a trusted network"
         )
     return number, port

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import (
     SYSTEM_ID,
@@ -68,6 +69,8 @@ class LinkCounters:
     dropped: int = 0
     """Received datagrams that exceeded what their sender may send, or came from one client too
     many."""
+    refused: int = 0
+    """Received frames without a valid signature, where there is a key."""
 
     def __add__(self, other: LinkCounters) -> LinkCounters:
         """Return the traffic of both together."""
@@ -78,6 +81,7 @@ class LinkCounters:
             self.ignored + other.ignored,
             self.send_errors + other.send_errors,
             self.dropped + other.dropped,
+            self.refused + other.refused,
         )
 
 
@@ -97,10 +101,13 @@ class Link:
         *,
         endpoint: Endpoint | None = None,
         system_id: int = SYSTEM_ID,
+        signing: Signing | None = None,
+        link_id: int = 0,
     ) -> None:
         """Open a link that can stream `builders`, and reply with `replies`; None = the same.
 
-        `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's.
+        `endpoint` sends to one client; None = the config's. `system_id` is the vehicle's. `signing`
+        signs what is sent, with `link_id`, and checks what arrives; None = neither.
         """
         self.name = config.name
         self.builders = builders
@@ -119,10 +126,13 @@ class Link:
             Encoder(system_id) if config.separate_replies else self._stream_encoder
         )
         self._decoder = Decoder(datagrams=config.endpoint.datagrams)
+        self._signing = signing
+        self._link_id = link_id
         self._pending: list[bytes] = []
         """This tick's telemetry."""
         self._rx = 0
         self._tx = 0
+        self._refused = 0
         self._unsendable = 0
 
     @property
@@ -134,6 +144,7 @@ class Link:
             malformed=self._decoder.malformed,
             ignored=self.ignored + self._decoder.unknown,
             send_errors=self._unsendable + self.endpoint.send_errors,
+            refused=self._refused,
         )
 
     def identify(self, system_id: int) -> None:
@@ -151,6 +162,10 @@ class Link:
     def decode(self, chunk: bytes) -> list[WireMessage]:
         """Return the messages in a chunk of bytes from this client."""
         messages = self._decoder.feed(chunk)
+        if self._signing is not None and self._signing.key is not None:
+            heard = len(messages)
+            messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
+            self._refused += heard - len(messages)
         self.note(messages)
         return messages
 
@@ -183,6 +198,7 @@ class Link:
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
             self.flush()  # frames leave in the order of their sequence numbers
+        frame = self._signed(frame)
         self.endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
@@ -219,11 +235,16 @@ class Link:
         if not frames:
             return
         self._pending = []
+        if self._signing is not None and self._signing.key is not None:
+            frames = [self._signed(frame) for frame in frames]
         self.endpoint.send_streams(frames)
         self._tx += len(frames)
         if self.tap is not None:
             for frame in frames:
                 self.tap(frame)
+
+    def _signed(self, frame: bytes) -> bytes:
+        return frame if self._signing is None else self._signing.sign(frame, self._link_id)
 
     def _packed(self, encoder: Encoder, message: WireMessage) -> bytes | None:
         try:

@@ -8,7 +8,14 @@ from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import sender
 
 COMMANDS = frozenset(
-    ("COMMAND_LONG", "COMMAND_INT", "SET_MODE", "SET_POSITION_TARGET_LOCAL_NED", "PARAM_SET")
+    (
+        "COMMAND_LONG",
+        "COMMAND_INT",
+        "SET_MODE",
+        "SET_POSITION_TARGET_LOCAL_NED",
+        "PARAM_SET",
+        "SETUP_SIGNING",
+    )
 )
 """Messages that change what the vehicle does."""
 

@@ -7,6 +7,8 @@ from itertools import chain
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.signing import Signing
+from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.clients import Client, Clients
@@ -44,6 +46,7 @@ class MavlinkServer:
         *,
         boot_unix_us: int,
         clock: Clock | None = None,
+        signing: StoredSigning | None = None,
     ) -> None:
         """Open the links: each streams its default rates from the first `send` on.
 
@@ -53,9 +56,15 @@ class MavlinkServer:
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
             clock: Measures what part of a tick goes into received messages, and bounds it; None,
                 or a clock that stands still meanwhile: it is bounded by their number only.
+            signing: The key that is asked for on all links; None: there is none until a client
+                sets one, which is forgotten with the server.
         """
         self._port: AutopilotPort | None = None
         self._clock = clock
+        self._stored = signing
+        self._signing = (
+            Signing(lambda: boot_unix_us + self._now_us) if signing is None else signing.signing
+        )
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
@@ -71,7 +80,7 @@ class MavlinkServer:
             "BATTERY_STATUS": self._battery_status,
             "TIMESYNC": peers.timesync_request,
         }
-        self._links = [self._open(config) for config in links]
+        self._links = [self._open(config, link_id) for link_id, config in enumerate(links)]
         if port is not None:
             self.attach(port)
 
@@ -151,6 +160,8 @@ class MavlinkServer:
             self._forget_us = now_us + FORGET_EVERY_US
             for clients in self._links:
                 clients.forget_silent(now_us)
+            if self._stored is not None:
+                self._stored.save_due()
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
         """Write both directions of a link to a tlog from now on; None ends it.
@@ -174,16 +185,26 @@ class MavlinkServer:
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
-        """Close the endpoints."""
+        """Close the endpoints, and keep the newest time stamp of signatures."""
+        if self._stored is not None:
+            self._stored.save()
         for clients in self._links:
             clients.endpoint.close()
 
-    def _open(self, config: LinkConfig) -> Clients:
+    def _open(self, config: LinkConfig, link_id: int) -> Clients:
         def welcome(peer: Peer, endpoint: Endpoint) -> Client:
             builders = self._link_builders()
             # A requested PING must not advance the sequence of those that are streamed.
             replies = self._link_builders() if config.separate_replies else builders
-            link = Link(config, builders, replies, endpoint=endpoint, system_id=self._system_id)
+            link = Link(
+                config,
+                builders,
+                replies,
+                endpoint=endpoint,
+                system_id=self._system_id,
+                signing=self._signing,
+                link_id=link_id,
+            )
             texts = TextEncoder()
             reply_texts = TextEncoder(REPLY_IDS) if config.separate_replies else texts
             client = Client(peer, link, texts, reply_texts, heard_us=self._now_us)
@@ -192,7 +213,7 @@ class MavlinkServer:
                 link.scheduler.restart()
             return client
 
-        return Clients(config.name, config.endpoint, welcome, self._clock)
+        return Clients(config.name, config.endpoint, welcome, self._clock, self._signing)
 
     def _connect(self, client: Client, port: AutopilotPort) -> None:
         client.link.identify(self._system_id)
@@ -202,6 +223,7 @@ class MavlinkServer:
             self._now_us,
             self._texts.append,
             self._broadcast,
+            self._signing,
             self._system_id,
         )
         client.announced_origin = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from airl_mav.core.clock import Clock
+from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.mavlink.endpoint import Address, Endpoint, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -57,7 +58,9 @@ def bind_udp_links(
     return UdpLinks(api, gcs)
 
 
-def udp_server(ends: UdpLinks, boot_unix_us: int, clock: Clock) -> MavlinkServer:
+def udp_server(
+    ends: UdpLinks, boot_unix_us: int, clock: Clock, signing: StoredSigning | None = None
+) -> MavlinkServer:
     """Return the server of both links, still without an autopilot; see `MavlinkServer`."""
     links = [onboard_link(ends.api), gcs_link(ends.gcs)]
-    return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock)
+    return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock, signing=signing)

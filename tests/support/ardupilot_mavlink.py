@@ -8,6 +8,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega
 
 from airl_mav.core.frames import heading_to_ned, quat_yaw
+from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import (
     AutopilotState,
     Landed,
@@ -133,7 +134,12 @@ class Manners:
 
     def _take(self, message: WireMessage, link: Link) -> None:
         context = Context(
-            link, self.copter.inner, self.copter.time_us, lambda _: None, lambda _: None
+            link,
+            self.copter.inner,
+            self.copter.time_us,
+            lambda _: None,
+            lambda _: None,
+            Signing(lambda: 0),
         )
         kind = message.get_type()
         if kind == "COMMAND_LONG" and for_vehicle(message, context):

@@ -14,6 +14,7 @@ from firmware_sim.mavlink.services import (
     params,
     peers,
     setpoints,
+    signing,
 )
 from firmware_sim.mavlink.services.context import Context, for_vehicle, for_vehicle_or_all
 
@@ -39,6 +40,7 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "PARAM_SET": (for_vehicle, params.handle_set),
         "SET_POSITION_TARGET_LOCAL_NED": (for_vehicle_or_all, setpoints.handle_setpoint),
         "HEARTBEAT": (_for_anyone, peers.handle_heartbeat),
+        "SETUP_SIGNING": (for_vehicle_or_all, signing.handle_setup),
         "PING": (_for_anyone, peers.handle_ping),
         "TIMESYNC": (_for_anyone, peers.handle_timesync),
         "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, absent.handle_file_transfer),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
@@ -28,6 +29,8 @@ class Context:
     """Sends a text to the operators: to all clients of all links."""
     broadcast: Callable[[WireMessage], None]
     """Sends a message to all clients of all links."""
+    signing: Signing
+    """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID
     """Of this vehicle."""
     next_parameter: int | None = None

@@ -1,0 +1,206 @@
+"""MAVLink 2 signing against pymavlink's, both ways; replays, forgeries, downgrades; key files."""
+
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from airl_mav.core.clock import SimClock
+from airl_mav.core.errors import UsageError
+from airl_mav.core.signing import (
+    EPOCH_UNIX_US,
+    LATE,
+    MAX_STREAMS,
+    SIGNATURE_BYTES,
+    UNIT_US,
+    Signing,
+    frames_of,
+)
+from airl_mav.core.signing_key import SAVE_EVERY_US, StoredSigning, read_key, write_key
+
+KEY = bytes(range(32))
+OTHER = bytes(range(1, 33))
+NOW_US = EPOCH_UNIX_US + 300_000_000_000_000
+NOW = (NOW_US - EPOCH_UNIX_US) // UNIT_US
+
+
+def peer(key: bytes = KEY, link_id: int = 5, timestamp: int = NOW) -> Any:
+    mav = dialect.MAVLink(None, 245, 190)
+    mav.signing.secret_key = key
+    mav.signing.link_id = link_id
+    mav.signing.timestamp = timestamp
+    mav.signing.sign_outgoing = True
+    return mav
+
+
+def signing(key: bytes | None = KEY) -> Signing:
+    return Signing(lambda: NOW_US, key)
+
+
+def messages() -> list[Any]:
+    return [
+        dialect.MAVLink_ping_message(1, 2, 3, 4),
+        dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3),
+        dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0),
+        dialect.MAVLink_statustext_message(6, b"x" * 50),
+        dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, list(range(251))),
+    ]
+
+
+def test_pymavlink_accepts_what_is_signed_here() -> None:
+    theirs, ours = peer(), signing()
+    plain = dialect.MAVLink(None, 1, 1)
+    for message in messages():
+        frame = ours.sign(message.pack(plain), 0)
+        decoded = theirs.decode(bytearray(frame))
+        assert decoded.get_signed()
+        assert decoded.to_dict() == message.to_dict()
+    assert theirs.signing.goodsig_count == len(messages())
+    assert ours.sign(frame, 0) == frame  # once is enough
+
+
+def test_what_pymavlink_signs_is_accepted_here() -> None:
+    theirs, ours = peer(), signing()
+    for message in messages():
+        assert ours.accepts(message.pack(theirs))
+    assert ours.refused == 0
+
+
+def test_every_bit_of_a_signed_frame_counts() -> None:
+    frame = messages()[0].pack(peer())
+    for position in range(len(frame) * 8):
+        if position // 8 == 0:
+            continue  # without its marker it is no frame
+        forged = bytearray(frame)
+        forged[position // 8] ^= 1 << position % 8
+        assert not signing().accepts(bytes(forged)), position
+
+
+def test_nothing_is_taken_twice_or_out_of_order() -> None:
+    theirs, ours = peer(), signing()
+    first, second = (m.pack(theirs) for m in messages()[:2])
+    assert ours.accepts(second)
+    assert not ours.accepts(second)
+    assert not ours.accepts(first)
+    # Another link id is another stream: the signature covers it.
+    assert ours.accepts(messages()[0].pack(peer(link_id=6)))
+    assert ours.refused == 2
+
+
+def test_a_forged_time_stamp_locks_nobody_out() -> None:
+    ours = signing()
+    assert not ours.accepts(messages()[0].pack(peer(OTHER, timestamp=NOW * 2)))
+    assert ours.accepts(messages()[0].pack(peer()))
+
+
+@pytest.mark.parametrize(("behind", "accepted"), [(LATE - 10, True), (LATE + 10, False)])
+def test_a_new_sender_may_lag_by_a_minute(behind: int, accepted: bool) -> None:
+    frame = messages()[0].pack(peer(timestamp=NOW - behind))
+    assert signing().accepts(frame) is accepted
+
+
+def test_unsigned_frames_are_refused_but_for_what_radios_send() -> None:
+    ours, plain = signing(), dialect.MAVLink(None, 245, 190)
+    passed = {
+        kind.msgname
+        for kind in dialect.mavlink_map.values()
+        if ours.accepts(_empty(kind).pack(plain))
+        or (kind.id < 256 and ours.accepts(_empty(kind).pack(plain, force_mavlink1=True)))
+    }
+    assert passed == {"HEARTBEAT", "RADIO_STATUS", "ADSB_VEHICLE", "COLLISION"}
+    assert signing(None).accepts(messages()[0].pack(plain))
+
+
+def _empty(kind: Any) -> Any:
+    values = {
+        name: b"" if of == "char" else [0] * n if n else 0
+        for name, of, n in zip(
+            kind.fieldnames,
+            kind.fieldtypes,
+            [kind.array_lengths[kind.ordered_fieldnames.index(n)] for n in kind.fieldnames],
+            strict=True,
+        )
+    }
+    return kind(*values.values())
+
+
+def test_time_stamps_only_rise_and_follow_the_newest_heard() -> None:
+    ours, plain = signing(), dialect.MAVLink(None, 1, 1)
+    frames = [ours.sign(messages()[0].pack(plain), 0) for _ in range(3)]
+    stamps = [int.from_bytes(frame[-12:-6], "little") for frame in frames]
+    assert stamps == [NOW, NOW + 1, NOW + 2]
+    assert ours.accepts(messages()[0].pack(peer(timestamp=NOW + 500)))
+    frame = ours.sign(messages()[0].pack(plain), 0)
+    assert int.from_bytes(frame[-12:-6], "little") == NOW + 501
+
+
+def test_senders_are_bounded() -> None:
+    ours = signing()
+    accepted = 0
+    for system in range(1, 256):
+        for link_id in (0, 1):
+            theirs = peer(link_id=link_id)
+            theirs.srcSystem = system
+            accepted += ours.accepts(messages()[0].pack(theirs))
+    assert accepted == MAX_STREAMS
+
+
+def test_frames_of_a_datagram() -> None:
+    plain, theirs = dialect.MAVLink(None, 1, 1), peer()
+    frames = [m.pack(plain) for m in messages()] + [m.pack(theirs) for m in messages()]
+    assert list(frames_of(b"".join(frames))) == frames
+    assert list(frames_of(b"noise" + frames[0] + frames[1][:-1])) == frames[:1]
+    assert len(frames[5]) == len(frames[0]) + SIGNATURE_BYTES
+
+
+# --- files
+
+
+def test_a_key_file_is_for_its_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    write_key(path, KEY)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert read_key(path) == KEY
+    path.chmod(0o640)
+    with pytest.raises(UsageError, match="mode 0640: others may read it; chmod 600 it"):
+        read_key(path)
+
+
+@pytest.mark.parametrize("text", ["", "12", "zz" * 32, "00" * 32, "11" * 33, "\xff" * 64])
+def test_what_is_no_key_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "key"
+    path.touch(mode=0o600)
+    path.write_text(text)
+    with pytest.raises(UsageError, match="must be 64 hexadecimal digits"):
+        read_key(path)
+
+
+def test_a_missing_key_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"nothing.*cannot be read: No such file"):
+        read_key(tmp_path / "nothing")
+
+
+def test_key_and_newest_time_stamp_outlive_the_program(tmp_path: Path) -> None:
+    path, clock = tmp_path / "key", SimClock()
+    write_key(path, KEY)
+    stored = StoredSigning(path, clock)
+    stored.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 3)))
+    stamp = tmp_path / "key.timestamp"
+    stored.save_due()
+    assert not stamp.exists()
+    clock.advance(SAVE_EVERY_US)
+    stored.save_due()
+    assert int(stamp.read_text()) == NOW * 3
+    # What was heard long before the newest of then is too old for a new program, too.
+    late = StoredSigning(path, clock)
+    assert late.signing.timestamp == NOW * 3
+    assert not late.signing.accepts(messages()[0].pack(peer(timestamp=NOW * 2)))
+    stored.signing.change(OTHER, 7)
+    assert read_key(path) == OTHER
+    assert StoredSigning(path).signing.timestamp == 7
+    stored.signing.change(None)
+    assert not path.exists()
