@@ -15,6 +15,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.mavlink.link import LinkCounters
@@ -152,11 +153,12 @@ class Firmware:
         pacing: Pacing,
         *,
         recording: bool = True,
+        failing: FailingEndpoint | None = None,
     ) -> None:
         """Put it together; there is no episode yet.
 
         `camera` is where frames go; None = no camera. Without `recording`, episodes cannot be
-        saved, and may last for ever.
+        saved, and may last for ever. `failing` is the companion's link, where that is to fail.
         """
         self.flight_stack = flight_stack
         self.clock = pacing.clock
@@ -168,6 +170,7 @@ class Firmware:
         self._camera = camera
         self._pacing = pacing
         self._recording = recording
+        self._failing = failing
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
         self._flight_log: FlightLog | None = None
@@ -215,6 +218,8 @@ class Firmware:
             autopilot.close()
             raise
         self.simulation = simulation
+        if self._failing is not None:
+            self._failing.begin(simulation.faults)
         simulation.tick()
         powered_us = simulation.time_us
         self.flight_stack.connect(self._tick_on_the_ground)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.flight.trajectory import TrajectoryRecorder
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Estimate, Setpoint
+from firmware_sim.faults.timeline import Acted
 from firmware_sim.plant.kinematics import POSE
 from firmware_sim.plant.plant import Plant
 
@@ -59,6 +61,17 @@ class SetpointLog:
             "motor_us": np.array(self._motor_us, np.int64),
             "setpoint": np.array([v for _, v in self._accepted[:n]], np.float32).reshape(n, 4),
         }
+
+
+def fault_arrays(acted: Sequence[Acted]) -> dict[str, NDArray[Any]]:
+    """Return the faults that have acted, by the names of an episode's file; nothing for none."""
+    if not acted:
+        return {}
+    return {
+        "faults/fault": np.array([each.fault for each in acted], np.str_),
+        "faults/from_us": np.array([each.from_us for each in acted], np.int64),
+        "faults/to_us": np.array([each.to_us for each in acted], np.int64),
+    }
 
 
 class FlightRecorder:

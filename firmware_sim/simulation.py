@@ -20,12 +20,15 @@ from airl_mav.vehicle.spread import draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.faults.camera import FailingCamera
+from firmware_sim.faults.controller import FailingParts
+from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
-from firmware_sim.interfaces import SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.plant.camera_server import DepthCamera
 from firmware_sim.plant.kinematics import POSITION, QUATERNION
 from firmware_sim.plant.plant import Plant
-from firmware_sim.recording import FlightRecorder
+from firmware_sim.recording import FlightRecorder, fault_arrays
 
 
 @dataclass(frozen=True)
@@ -95,12 +98,21 @@ class Simulation:
             computer_w=setup.computer_w,
         )
         self.autopilot.use_truth(self.plant.truth)
-        self._camera: DepthCamera | None = None
+        self.faults: FaultTimeline | None = None
+        """What fails in this episode; None: nothing does."""
+        self._fly: Callable[[SensorSample], ActuatorControls] = self.autopilot.step
+        if asked.faults:
+            self.faults = FaultTimeline(asked.faults, setup.seed, start_us)
+            self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
+        self._camera: DepthCamera | FailingCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
-            self._camera = DepthCamera(
+            camera = DepthCamera(
                 setup.vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed
             )
+            self._camera = camera
+            if self.faults is not None:
+                self._camera = FailingCamera(camera, self.faults, setup.seed)
         self.recorder = FlightRecorder(self.autopilot.internals) if recording else None
         """None = nothing is recorded."""
         self.start_us = start_us
@@ -115,6 +127,8 @@ class Simulation:
         if self.recorder is not None:
             self.recorder.begin()
         self.plant.begin()
+        if self.faults is not None:
+            self.faults.begin(self.start_us)
         if self._camera is not None:
             self._camera.restart(self.start_us)
 
@@ -128,10 +142,10 @@ class Simulation:
         plant, recorder = self.plant, self.recorder
         if recorder is None:
             plant.collisions.clear()
-            self._sample = plant.step(self.autopilot.step(self._sample))
+            self._sample = plant.step(self._fly(self._sample))
         else:
             recorder.before_controls()
-            controls = self.autopilot.step(self._sample)
+            controls = self._fly(self._sample)
             recorder.after_controls(self._clock.time_us())
             self._sample = plant.step(controls)
             recorder.moved(plant)
@@ -142,11 +156,14 @@ class Simulation:
         camera = self._camera
         if camera is not None and self.time_us >= camera.next_us:
             motion = self.plant.motion
-            publish(camera.capture(self.time_us, motion[POSITION], motion[QUATERNION]))
+            camera.offer(self.time_us, motion[POSITION], motion[QUATERNION], publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
-        return {} if self.recorder is None else self.recorder.arrays()
+        if self.recorder is None:
+            return {}
+        acted = [] if self.faults is None else self.faults.acted(self.time_us)
+        return self.recorder.arrays() | fault_arrays(acted)
 
     def close(self) -> None:
         """Release the physics server and the autopilot."""

@@ -32,6 +32,8 @@ from airl_mav.core.errors import (
     machine_failure,
 )
 from airl_mav.core.fields import range_of, validated
+from airl_mav.faults.model import Fault
+from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
 
@@ -45,6 +47,9 @@ REPEATED = "repeated"
 
 PREFIXED = ("payload", "sensors", "spread", "wind")
 """Tables whose options carry the table's name; those of the others are unique by themselves."""
+
+SINGULAR = {"faults": "fault"}
+"""Lists whose option, given once for each item, is called by one of them."""
 
 RENAMED: dict[str, tuple[str, ...]] = {
     "--hold": ("--hold-s",),
@@ -97,8 +102,10 @@ def scenario_of(options: BaseModel, **changes: Any) -> Scenario:
     """Return the scenario that a command's options hold; changes that are None are passed over."""
     given = {
         name: getattr(options, name)
-        for name in Scenario.model_fields
-        if name in type(options).model_fields and not isinstance(getattr(options, name), tuple)
+        for name, field in Scenario.model_fields.items()
+        if name in type(options).model_fields
+        # An experiment may have several where the scenario has one: they are its own to fly.
+        and (IN_WORDS in field.metadata or not isinstance(getattr(options, name), tuple))
     }
     given |= {name: value for name, value in changes.items() if value is not None}
     return Scenario(**{name: value for name, value in given.items() if value is not None})
@@ -124,6 +131,9 @@ def option_of(field: str) -> str:
     """Return the option of a field: --hold-s of hold_s, --leave-after-s of watchdog's."""
     # An element of a list is named by its option: goal.0 is the first word of --goal.
     table, _, name = re.sub(r"(\.\d+)+$", "", field).rpartition(".")
+    listed, _, _ = field.partition(".")
+    if listed in SINGULAR:
+        return f"--{SINGULAR[listed]}"
     full = f"{table}.{name}" if table in PREFIXED else name
     return "--" + full.replace("_", "-")
 
@@ -196,7 +206,13 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
             ]
         if REPEATED in field.metadata:
             marks.append(tyro.conf.UseAppendAction)
-        default = dataclasses.field(default=_default(field, held.get(name)))
+        there = held.get(name)
+        if IN_WORDS in field.metadata:
+            kind = tuple[str, ...]
+            marks = [tyro.conf.arg(help=_help(field), name=SINGULAR[name], metavar="TEXT")]
+            marks.append(tyro.conf.UseAppendAction)
+            there = [str(Fault.model_validate(item)) for item in there or ()]
+        default = dataclasses.field(default=_default(field, there))
         fields.append((name, Annotated[(kind, *marks)], default))
     made = dataclasses.make_dataclass(model.__name__, fields, frozen=True)
     made.__doc__ = inspect.getdoc(model)

@@ -20,6 +20,7 @@ class Stream(IntEnum):
     DEPTH = 14
     SOURCE = 15
     WIND = 16
+    FAULTS = 17
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:

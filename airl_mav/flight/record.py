@@ -19,6 +19,18 @@ SCHEMA = 1
 
 
 @dataclass(frozen=True)
+class FaultActed:
+    """A fault that has acted in a flight."""
+
+    fault: str
+    """In words (docs/how-to/faults.md)."""
+    from_us: int
+    """Simulated time at which it began [µs]."""
+    to_us: int
+    """Simulated time at which it ended, or the record does [µs]."""
+
+
+@dataclass(frozen=True)
 class EpisodeRecord:
     """What is kept of an episode beside its raw arrays."""
 
@@ -56,6 +68,8 @@ class EpisodeRecord:
     companion_use: ProcessUse | None = None
     """What the companion process took of its machine for the flight, from arming to the ground;
     None where it is no process of its own (gym, lockstep), and in older records."""
+    faults: tuple[FaultActed, ...] = ()
+    """What failed, as asked for or as a client injected it, in the order of its beginning."""
     zone: int | None = None
     """Curriculum zone that the goal was drawn in; None: the whole arena."""
     sha256: dict[str, str] | None = None

@@ -10,12 +10,13 @@ import numpy as np
 
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.stage import Stage
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
-from airl_mav.rehearsal.episode import join_stamps, judged_record, part_of
+from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, part_of
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Order, Supervisor
@@ -115,7 +116,10 @@ class _Flight:
             resolved.computer.onboard_watts,
         )
         with Stage(
-            transport_us=TRANSPORT_US, digest=self._digest, speed=resolved.speed
+            transport_us=TRANSPORT_US,
+            digest=self._digest,
+            speed=resolved.speed,
+            faults=resolved.scenario.faults,
         ) as self._stage:
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
@@ -176,8 +180,8 @@ class _Flight:
         self._observer.text(Text(time_us=now_us, severity=severity, text=message.text))
 
     def _flown(self, simulation: Simulation) -> FlownEpisode:
-        result = self._result
-        assert result is not None  # noqa: S101 (nothing broke)
+        # Nothing broke: where no mission was flown, a fault has kept the companion from beginning.
+        result = self._result or MissionResult(self._stage.unheard, (), DecisionLog())
         referee = self._supervisor.referee
         battery = self._judge.battery
         if referee.verdict is None:
@@ -203,6 +207,7 @@ class _Flight:
             slipped_us=0,
             battery_remaining=battery,
             notes=result.notes,
+            faults=faults_of(arrays),
             sha256={"flight": self._digest.hexdigest(), **self._digest.lanes()},
         )
         return FlownEpisode(record, trajectory, latency)

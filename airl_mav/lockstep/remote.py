@@ -65,7 +65,7 @@ class RemoteStage:
         )
         memory = MemoryEndpoint()
         self._conductor = Conductor(memory, self._partner, self._digest, asked.pace)
-        self.firmware = conducted_firmware(memory, camera, self._conductor)
+        self.firmware = conducted_firmware(memory, camera, self._conductor, asked.faults)
         self._judge = Judge(None, self._digest, order=self._partner.order)
 
     @property

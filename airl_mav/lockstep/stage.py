@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
 
 from airl_mav.core.errors import UsageError
+from airl_mav.faults.kinds import LINKS
+from airl_mav.faults.model import Fault
 from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
@@ -16,12 +18,17 @@ from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
-from companion.mavsdk_link import RAW_URL, MavsdkLink
+from companion.interfaces import LinkError
+from companion.mavsdk_link import RAW_TIMEOUT_S, RAW_URL, MavsdkLink
+from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 HEARD_TIMEOUT_S = 10.0
 """Longest wait of the companion for the heartbeat that it has been fed [wall s]."""
+
+CUT_TIMEOUT_S = 0.5
+"""MAVSDK's own time-out of a command, before it asks again [wall s]."""
 
 
 class Stage:
@@ -33,6 +40,7 @@ class Stage:
         transport_us: int = 0,
         digest: FlightDigest | None = None,
         speed: float | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         """Put everything together; nothing moves yet.
 
@@ -40,6 +48,7 @@ class Stage:
             transport_us: From a frame's exposure until it lies decoded in the companion [µs].
             digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
             speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
+            faults: What the episode's aircraft has of them; only those of the link matter here.
         """
         self._partner = ThreadPartner()
         self.abandon = threading.Event()
@@ -51,7 +60,9 @@ class Stage:
         self.camera = MemoryCamera(transport_us)
         """The companion's source of frames."""
         self.camera.clock = self.clock
-        self.firmware = conducted_firmware(endpoint, self.camera, self.conductor)
+        self.firmware = conducted_firmware(endpoint, self.camera, self.conductor, faults)
+        self.unheard = ""
+        """Why the companion never began: a fault has kept it from hearing the vehicle."""
         self._open = ExitStack()
 
     def __enter__(self) -> Stage:
@@ -101,9 +112,18 @@ class Stage:
         firmware, conductor = self.firmware, self.conductor
         started_us = firmware.load(setup, tlog, BOOT_UNIX_US).time_us
         begun(started_us)
+        simulation = firmware.simulation
+        if simulation is not None and simulation.faults is not None:
+            self._give_up_when_cut(simulation.faults)
 
         def connected() -> None:
-            self.link.connect(HEARD_TIMEOUT_S)
+            try:
+                self.link.connect(HEARD_TIMEOUT_S)
+            except LinkError as error:
+                if not setup.aircraft.faults:
+                    raise
+                self.unheard = str(error)
+                return
             program()
 
         self._partner.start(connected)
@@ -113,6 +133,18 @@ class Stage:
         self._raise_what_broke()
         assert firmware.simulation is not None  # noqa: S101 (loaded above)
         return firmware.simulation
+
+    def _give_up_when_cut(self, faults: FaultTimeline) -> None:
+        """Let MAVSDK give up a command on a link that is cut, as it does by itself elsewhere.
+
+        On a healthy link the answer is certain, and MAVSDK waits for it however slow the host is.
+        """
+
+        def changed() -> None:
+            cut = any(each.fault.kind == "cut" for each in faults.acting(*LINKS))
+            self.link.set_timeout(CUT_TIMEOUT_S if cut else RAW_TIMEOUT_S)
+
+        faults.on_change(changed)
 
     def _raise_what_broke(self) -> None:
         error = self._partner.error

@@ -14,7 +14,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
@@ -87,6 +87,7 @@ def join_episode(
             _read(decisions_path), part_of(arrays, "setpoints"), arrays["tick/slips_us"]
         )
     record = _record(episode, scenario, trajectory, latency, arrays["tick/slips_us"])
+    record = replace(record, faults=faults_of(arrays))
     figures = host_figures(
         flight_us=record.ended_us - record.started_us,
         slipped_us=record.slipped_us,
@@ -179,6 +180,15 @@ def judged_record(
         quality=quality,
         **known,
     )
+
+
+def faults_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[FaultActed, ...]:
+    """Return the faults that acted in a flight, of what the firmware has recorded of it."""
+    told = part_of(arrays, "faults")
+    if not told:
+        return ()
+    lines = zip(*(told[name].tolist() for name in ("fault", "from_us", "to_us")), strict=True)
+    return tuple(FaultActed(*line) for line in lines)
 
 
 COMPANION_STAMPS = tuple(name for name in STAMPS if name != "capture_us")

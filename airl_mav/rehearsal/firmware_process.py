@@ -18,6 +18,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing_key import StoredSigning
+from airl_mav.faults.model import link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.channel import (
     Begin,
@@ -37,6 +38,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
+from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
@@ -92,8 +94,13 @@ def build_firmware(
     signing = None if aircraft.signing_key is None else StoredSigning(aircraft.signing_key)
     insecure = insecure or signing is not None
     flight_stack: FlightStack
+    failing: FailingEndpoint | None = None
     if aircraft.firmware == "builtin":
-        flight_stack = BuiltinFlightStack(udp_server(ends(), unix_us(), pacing.clock, signing))
+        links = ends()
+        if link_fails(aircraft.faults):
+            failing = FailingEndpoint(links.api, pacing.clock)
+        server = udp_server(links, unix_us(), pacing.clock, signing, onboard=failing)
+        flight_stack = BuiltinFlightStack(server)
     else:
         flight_stack = real_firmware(Wanted(aircraft, vehicle, log, ends))
     try:
@@ -101,7 +108,7 @@ def build_firmware(
     except UsageError:
         flight_stack.close()
         raise
-    return Firmware(flight_stack, camera, pacing, recording=recording)
+    return Firmware(flight_stack, camera, pacing, recording=recording, failing=failing)
 
 
 class Service:

@@ -26,6 +26,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stages import Samples, Stage
 from airl_mav.report import theme
+from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.table import OUTCOME_LABELS, ms
 
 LONG_TAIL = 30.0
@@ -265,6 +266,8 @@ def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture
         ax.set_ylim(bottom=min(0.0, float(values.min())))
         if t[0] < 0.0:
             ax.axvspan(t[0], 0.0, color=theme.RULE, alpha=0.45, lw=0)
+        for begin_s, end_s in fault_spans_s(episode):
+            ax.axvspan(begin_s, end_s, color=theme.MARK, alpha=0.12, lw=0)
         theme.plain_axes(ax)
         ax.set_xlim(t[0], t[-1])
     if t[0] < 0.0:

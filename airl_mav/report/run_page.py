@@ -31,6 +31,7 @@ from airl_mav.report.energy import (
     energy_table,
     flight_energies,
 )
+from airl_mav.report.faults import faults_table
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.evidence import Cause
 from airl_mav.report.forensics.worst import (
@@ -135,6 +136,7 @@ def build_page(
             setup=setup_rows(run),
             quality=quality_table(summary),
             conduct=conduct_table(run, summary),
+            faults=faults_table(run),
             real_time=real_time_table(run, summary) if summary.timed else None,
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,

@@ -15,6 +15,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_verdict
+from airl_mav.report.faults import faults_table
 from airl_mav.report.forensics.worst import EXAMINED, ranked
 from airl_mav.report.run_page import build_page, pictured
 from airl_mav.report.run_summary import summarize_run
@@ -99,6 +100,8 @@ def print_report(
     views = [latency_table(summary), episodes_table(run, MAX_LISTED), quality_table(summary)]
     if (conduct := conduct_table(run, summary)) is not None:
         views.append(conduct)
+    if (faults := faults_table(run)) is not None:
+        views.append(faults)
     if summary.timed:
         views.append(real_time_table(run, summary))
     for view in views:

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.faults.model import Fault
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 
 VehicleName = Annotated[
@@ -24,6 +25,9 @@ FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
 
 FREE = "decides no flight"
 """Marks a field that may differ when a run is resumed."""
+
+IN_WORDS = "each in words on a command line"
+"""Marks a list whose items are written as texts, an option each."""
 
 NO_TWIN = "at level lockstep or sitl; the twin has none"
 """Marks a field that must be left as it is at level gym."""
@@ -115,6 +119,11 @@ class Aircraft(ProfileModel):
     wind: WindSettings = Field(default_factory=WindSettings, description="wind")
     spread: Spread = Field(default_factory=Spread, description="spread of the aircraft")
     sensors: SensorNoise = Field(default_factory=SensorNoise, description="sensors' noise")
+    faults: Annotated[tuple[Fault, ...], IN_WORDS] = Field(
+        default=(),
+        description="faults that happen in every flight, in words: gps off at 8s for 5s; see"
+        " docs/how-to/faults.md",
+    )
     estimator: Annotated[EstimatorName, NO_TWIN] = Field(
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"

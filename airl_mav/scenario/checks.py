@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from airl_mav.core.errors import FieldError
+from airl_mav.faults.kinds import LINKS
 from airl_mav.scenario.aircraft import GREATEST_PORT, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
 
@@ -34,10 +35,23 @@ def check_level(scenario: Scenario) -> None:
                 continue
             if (value := getattr(scenario, field)) != getattr(usual, field):
                 raise FieldError(field, value, NO_TWIN)
+    check_faults(scenario, level)
     if level != "lockstep" and scenario.tlogs:
         raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
     if level == "sitl" and scenario.workers is not None:
         raise FieldError("workers", scenario.workers, "at level gym or lockstep")
+
+
+def check_faults(asked: Aircraft, level: LevelName) -> None:
+    """Raise FieldError for a fault that the level, or the firmware, cannot have."""
+    for fault in asked.faults:
+        part = fault.part
+        if level == "gym":
+            raise FieldError("faults", str(fault), "at level lockstep or sitl; the twin has none")
+        if part in LINKS and asked.firmware != "builtin":
+            raise FieldError(
+                "faults", str(fault), "with firmware builtin: real firmware has links of its own"
+            )
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:

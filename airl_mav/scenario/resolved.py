@@ -251,3 +251,4 @@ def _conditions(scenario: Aircraft) -> Iterator[str]:
             yield f"{table}.{name} {value:g}"
     if scenario.battery_charge < 1.0:
         yield f"battery_charge {scenario.battery_charge:g}"
+    yield from (f"fault: {fault}" for fault in scenario.faults)

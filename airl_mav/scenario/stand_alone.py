@@ -13,7 +13,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.checks import check_firmware, check_ports
+from airl_mav.scenario.checks import check_faults, check_firmware, check_ports
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
@@ -21,6 +21,7 @@ from airl_mav.scenario.model import (
     ArenaName,
     Decisions,
     Lateness,
+    LevelName,
     PolicyName,
 )
 from airl_mav.scenario.piloting import TRANSPORT_US
@@ -196,7 +197,9 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
     """Raise FieldError for what can be seen to be wrong before a port is bound."""
     check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
-    check_firmware(asked, "lockstep" if asked.lockstep else "sitl", speed)
+    level: LevelName = "lockstep" if asked.lockstep else "sitl"
+    check_firmware(asked, level, speed)
+    check_faults(asked, level)
     low, high = LOCKSTEP_SPEEDS if asked.lockstep else SPEEDS
     if isinstance(speed, float) and not (low < speed <= high or low == speed > 0.0):
         sign = "<=" if asked.lockstep else "<"

@@ -31,8 +31,11 @@ class Endpoint(Protocol):
 
     datagrams: bool
     """True when each chunk from `receive` holds whole frames."""
-    send_errors: int
-    """Chunks that could not be sent."""
+
+    @property
+    def send_errors(self) -> int:
+        """Chunks that could not be sent."""
+        ...
 
     def receive(self) -> list[bytes]:
         """Return all chunks that have arrived, oldest first."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.signing_key import StoredSigning
-from firmware_sim.mavlink.endpoint import Address, Endpoint, UdpEndpoint
+from firmware_sim.mavlink.endpoint import Address, Endpoint, SharedEndpoint, UdpEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 
@@ -59,8 +59,16 @@ def bind_udp_links(
 
 
 def udp_server(
-    ends: UdpLinks, boot_unix_us: int, clock: Clock, signing: StoredSigning | None = None
+    ends: UdpLinks,
+    boot_unix_us: int,
+    clock: Clock,
+    signing: StoredSigning | None = None,
+    *,
+    onboard: SharedEndpoint | None = None,
 ) -> MavlinkServer:
-    """Return the server of both links, still without an autopilot; see `MavlinkServer`."""
-    links = [onboard_link(ends.api), gcs_link(ends.gcs)]
+    """Return the server of both links, still without an autopilot; see `MavlinkServer`.
+
+    `onboard` stands in for the end of the onboard link, which it wraps; None: the end itself.
+    """
+    links = [onboard_link(onboard or ends.api), gcs_link(ends.gcs)]
     return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock, signing=signing)

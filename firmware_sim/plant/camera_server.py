@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import zmq
@@ -60,6 +61,16 @@ class DepthCamera:
         self._start_us = self.next_us = time_us
         """`next_us`: simulated time from which on the next frame is due [µs]."""
         self._rate = Rate(self._rate_hz)
+
+    def offer(
+        self,
+        time_us: int,
+        position: Vector,
+        quaternion: Vector,
+        publish: Callable[[Frame], None],
+    ) -> None:
+        """Take a frame that is due and hand it to `publish`; see `capture`."""
+        publish(self.capture(time_us, position, quaternion))
 
     def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
         """Take a frame that is due; the next is due one period after the slot that this one fills.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -38,6 +38,14 @@ STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
 _ANY_LINK = -2
 """pybullet's filter of contacts that lets all links pass."""
+
+
+class Blowing(Protocol):
+    """Where the wind comes from; `vehicle.wind.Wind` is one."""
+
+    def step(self) -> Vector:
+        """Advance one tick and return the wind (3,) NED [m/s]; not to be written to."""
+        ...
 
 
 class Collision(NamedTuple):
@@ -87,7 +95,8 @@ class Plant:
         airframe = airframe or Airframe.from_profile(profile)
         noise, gusts = sensors_and_gusts(rng)
         self._sensors = SensorSuite(profile.sensors, noise, tick_s, asked.sensors.navigation_noise)
-        self._wind = Wind(asked.wind, gusts, tick_s)
+        self.wind: Blowing = Wind(asked.wind, gusts, tick_s)
+        """Asked once a tick for what blows; to be replaced between two ticks."""
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
@@ -132,7 +141,7 @@ class Plant:
     def step(self, controls: ActuatorControls) -> SensorSample:
         """Apply motor commands for one tick and return what the sensors then measure."""
         world, body, before = self.world, self._body, self.motion
-        client, wind = world.number, self._wind.step()
+        client, wind = world.number, self.wind.step()
         # An empty battery turns no motor.
         motors = controls.motors if self.battery_remaining > 0.0 else STOPPED
         speeds, here, force, torque = actuate(

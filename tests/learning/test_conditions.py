@@ -91,7 +91,7 @@ def test_a_simulation_draws_what_the_twin_draws() -> None:
         assert row.tolist() == list(plant._airframe)
         assert body[0] == row[0] != QUAD.body.mass_kg
         np.testing.assert_allclose(body[2], row[1:4], rtol=1e-12)
-        assert np.array_equal(twin._winds._air[0, 0], plant._wind.step())
+        assert np.array_equal(twin._winds._air[0, 0], plant.wind.step())
         plant.close()
 
 

@@ -55,12 +55,14 @@ class Rig:
         wind: WindSettings = CALM,
         vehicle: VehicleProfile | None = None,
         parameters: dict[str, float] | None = None,
+        faults: tuple[str, ...] = (),
     ) -> None:
         vehicle = vehicle or quad()
         merged = {**vehicle.parameters, **(parameters or {})}
         vehicle = vehicle.model_copy(update={"parameters": merged})
+        asked = Aircraft.model_validate({"wind": wind, "faults": faults})
         self.sim = Simulation(
-            EpisodeSetup(vehicle, arena, seed, Aircraft(wind=wind)), start_us=0, clock=SimClock()
+            EpisodeSetup(vehicle, arena, seed, asked), start_us=0, clock=SimClock()
         )
         self.texts: list[tuple[int, str]] = []
         """Time [µs] and text of everything said so far."""

@@ -1,0 +1,208 @@
+"""What can fail, how, and by how much: the one table of all faults.
+
+A fault is a part and a kind: `gps off`, `motor2 weak`. Each kind says what its amount means, in
+which unit and range, and at which levels of the fidelity ladder it can be flown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from airl_mav.core.constants import GRAVITY_M_S2
+
+Part = Literal[
+    "accel",
+    "gyro",
+    "mag",
+    "baro",
+    "gps",
+    "motor1",
+    "motor2",
+    "motor3",
+    "motor4",
+    "battery",
+    "wind",
+    "camera",
+    "link",
+    "uplink",
+    "downlink",
+]
+"""What fails. Motors have PX4's numbers: 1 front right, 2 rear left, 3 front left, 4 rear right.
+`uplink` is from the companion to the flight controller, `downlink` the other way, `link` both."""
+
+Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
+"""Phases of a flight that can set a fault off, by what the flight controller flies."""
+
+SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps")
+MOTORS: tuple[Part, ...] = ("motor1", "motor2", "motor3", "motor4")
+LINKS: tuple[Part, ...] = ("link", "uplink", "downlink")
+
+_SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3}
+_SHARE: Mapping[str, float] = {"": 1.0, "%": 0.01}
+_TIMES: Mapping[str, float] = {"": 1.0, "x": 1.0}
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of a fault: one number, or three along the axes."""
+
+    meaning: str
+    unit: str
+    """Unit of the numbers as they are kept; "" when they have none."""
+    low: float
+    high: float
+    """Least and greatest number allowed."""
+    units: Mapping[str, float]
+    """Units that may be written, and what a number in each is multiplied by."""
+    width: int = 1
+    """Numbers: 1 or 3."""
+
+    @property
+    def accepted(self) -> str:
+        """What is accepted, in words: "three numbers, -100 <= value <= 100 m"."""
+        limits = f"{self.low:g} <= value <= {self.high:g}" + (f" {self.unit}" if self.unit else "")
+        return limits if self.width == 1 else f"three numbers, {limits}"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One way in which a part can fail."""
+
+    meaning: str
+    amount: Amount | None = None
+    """None: it has no amount."""
+    lasts: bool = True
+    """Whether it can be given a duration; if not, it happens once and is not undone."""
+    needs_duration: bool = False
+    gym: bool = False
+    """Whether the batch twin can fly it."""
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """What the faults of one sensor are measured in."""
+
+    unit: str
+    bias: float
+    """Greatest bias."""
+    units: Mapping[str, float]
+    width: int = 3
+    off: str = "it measures nothing any more"
+    bias_meaning: str = "is added to what it measures"
+    more: Mapping[str, Kind] = field(default_factory=dict)
+
+
+_IMU_OFF = "its last sample is repeated: flight controllers count time by its samples"
+_METRES = {"m": 1.0}
+
+_SENSORS: Mapping[Part, _Sensor] = {
+    "accel": _Sensor("m/s2", 100.0, {"m/s2": 1.0, "g": GRAVITY_M_S2}, off=_IMU_OFF),
+    "gyro": _Sensor("rad/s", 35.0, {"rad/s": 1.0, "deg/s": math.pi / 180.0}, off=_IMU_OFF),
+    "mag": _Sensor("gauss", 10.0, {"gauss": 1.0, "uT": 0.01}),
+    "baro": _Sensor("hPa", 500.0, {"hPa": 1.0, "Pa": 0.01}, width=1),
+    "gps": _Sensor(
+        "m",
+        100_000.0,
+        _METRES,
+        bias_meaning="is added to the position, north, east, down: a jump",
+        more={
+            "drift": Kind(
+                "the position drifts away from the true one, and is right again at the end",
+                Amount("velocity, north, east, down", "m/s", -100.0, 100.0, {"m/s": 1.0}, 3),
+                gym=True,
+            )
+        },
+    ),
+}
+
+
+def _sensor_kinds(part: Part, sensor: _Sensor) -> dict[tuple[Part, str], Kind]:
+    bias = Amount(
+        sensor.bias_meaning, sensor.unit, -sensor.bias, sensor.bias, sensor.units, sensor.width
+    )
+    twin = part == "gps"
+    kinds = {
+        "off": Kind(sensor.off),
+        "stuck": Kind("it repeats its last sample"),
+        "noise": Kind(
+            "white noise of this many times the standard deviation that it has",
+            Amount("factor", "", 1.0, 1000.0, _TIMES),
+            gym=twin,
+        ),
+        "bias": Kind("what it measures is off by this much", bias, gym=twin),
+        "delay": Kind(
+            "its samples come later", Amount("by how much", "s", 0.0, 10.0, _SECONDS), gym=twin
+        ),
+        **sensor.more,
+    }
+    return {(part, kind): what for kind, what in kinds.items()}
+
+
+_LINK_KINDS = {
+    "delay": Kind("frames come later", Amount("by how much", "s", 0.0, 60.0, _SECONDS)),
+    "jitter": Kind(
+        "each frame comes later by a time of its own, uniform from 0; their order is kept",
+        Amount("at most by how much", "s", 0.0, 60.0, _SECONDS),
+    ),
+    "loss": Kind("frames are lost", Amount("share of them", "", 0.0, 1.0, _SHARE)),
+    "duplicate": Kind("frames come twice", Amount("share of them", "", 0.0, 1.0, _SHARE)),
+    "reorder": Kind(
+        "frames change places with the one after them",
+        Amount("share of them", "", 0.0, 1.0, _SHARE),
+    ),
+    "cut": Kind("nothing gets through"),
+}
+_MOTOR_KINDS = {
+    "off": Kind("it stops, whatever it is told"),
+    "weak": Kind(
+        "its thrust is less than it should be",
+        Amount("share of the thrust that is left", "", 0.0, 1.0, _SHARE),
+        gym=False,
+    ),
+}
+_OTHER_KINDS: dict[tuple[Part, str], Kind] = {
+    ("battery", "off"): Kind("the power module reads an empty battery; the motors go on"),
+    ("battery", "drop"): Kind(
+        "charge is gone at once",
+        Amount("share of a full battery", "", 0.0, 1.0, _SHARE),
+        lasts=False,
+    ),
+    ("battery", "sag"): Kind(
+        "the voltage that is read is lower",
+        Amount("by how much, a cell", "V", 0.0, 5.0, {"V": 1.0}),
+    ),
+    ("wind", "gust"): Kind(
+        "a discrete gust: up and down again as 1 - cos over its duration",
+        Amount("greatest velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
+        needs_duration=True,
+        gym=True,
+    ),
+    ("wind", "step"): Kind(
+        "more wind, at once",
+        Amount("velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
+        gym=True,
+    ),
+    ("camera", "off"): Kind("no frames"),
+    ("camera", "stuck"): Kind("every frame shows the same picture", gym=True),
+    ("camera", "noise"): Kind(
+        "noise of the depth, growing with its square as of a stereo camera",
+        Amount("sd at 10 m as a share", "", 0.0, 0.9, _SHARE),
+        gym=True,
+    ),
+    ("camera", "delay"): Kind("frames come later", Amount("by how much", "s", 0.0, 60.0, _SECONDS)),
+}
+KINDS: Mapping[tuple[Part, str], Kind] = {
+    **{k: v for part, sensor in _SENSORS.items() for k, v in _sensor_kinds(part, sensor).items()},
+    **{(part, kind): what for part in MOTORS for kind, what in _MOTOR_KINDS.items()},
+    **_OTHER_KINDS,
+    **{(part, kind): what for part in LINKS for kind, what in _LINK_KINDS.items()},
+}
+"""All faults, by part and kind."""
+
+
+def kinds_of(part: str) -> tuple[str, ...]:
+    """Return the names of the ways in which a part can fail; none for what is no part."""
+    return tuple(kind for known, kind in KINDS if known == part)

@@ -1,0 +1,105 @@
+"""One fault of a flight: what fails, how, how much, from when and for how long."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import Field, field_validator, model_validator
+
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, kinds_of
+from airl_mav.faults.words import fault_text, read_fault
+
+LONGEST_S = 100_000.0
+
+
+class Fault(ProfileModel):
+    """A fault, as a table of a scenario file: `[[faults]]`, or in words, as `gps off at 8s for 5s`.
+
+    Raises:
+        ValueError: The words, or the fields together, describe no fault (as pydantic has it).
+    """
+
+    part: Part = Field(description="what fails")
+    kind: str = Field(description="how it fails; each part has kinds of its own")
+    value: tuple[float, ...] = Field(
+        default=(), description="how much, in the unit of the kind: one number, or three"
+    )
+    phase: Phase | None = Field(
+        default=None,
+        description="phase of the flight that sets it off when it begins for the first time; by"
+        " default the start of the episode",
+    )
+    at_s: float = quantity(
+        "simulated time from the start of the episode, or of the phase, until it begins",
+        "s",
+        ge=0,
+        le=LONGEST_S,
+        default=0.0,
+    )
+    for_s: float | None = quantity(
+        "how long it lasts, in simulated time; by default to the end of the flight",
+        "s",
+        gt=0,
+        le=LONGEST_S,
+        default=None,
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_words(cls, data: Any) -> Any:
+        """Accept a fault that is written in words."""
+        return read_fault(data) if isinstance(data, str) else data
+
+    @field_validator("value", mode="before")
+    @classmethod
+    def _of_one_number(cls, value: Any) -> Any:
+        """Accept one number where a list of one is meant."""
+        return (value,) if isinstance(value, int | float) else value
+
+    @model_validator(mode="after")
+    def _is_a_fault(self) -> Fault:
+        if (self.part, self.kind) not in KINDS:
+            known = ", ".join(kinds_of(self.part))
+            raise ValueError(f"kind {self.kind!r} of {self.part}: accepted: {known}")
+        name, about = f"{self.part} {self.kind}", self.about
+        amount = about.amount
+        if amount is None and self.value:
+            raise ValueError(f"value of {name}: it has no amount")
+        if amount is not None:
+            numbers = self.value
+            if len(numbers) != amount.width or not all(
+                math.isfinite(v) and amount.low <= v <= amount.high for v in numbers
+            ):
+                given = ",".join(f"{v:g}" for v in numbers) or "none"
+                raise ValueError(
+                    f"value of {name}, {amount.meaning}, {given}: accepted: {amount.accepted}"
+                )
+        if self.for_s is not None and not about.lasts:
+            raise ValueError(f"for_s of {name}: it happens once, without a duration")
+        if self.for_s is None and about.needs_duration:
+            raise ValueError(f"for_s of {name}: missing; it has a duration")
+        return self
+
+    @property
+    def about(self) -> Kind:
+        """What the table says of it."""
+        return KINDS[self.part, self.kind]
+
+    @property
+    def amount(self) -> float:
+        """The one number of its value. Raises ValueError where it has none, or three."""
+        (number,) = self.value
+        return number
+
+    def __str__(self) -> str:
+        """Return it in words that read as the same fault."""
+        told: Mapping[str, Any] = self.model_dump()
+        return fault_text(told)
+
+
+def link_fails(faults: Iterable[Fault]) -> bool:
+    """Return whether any of these is a fault of the link between companion and firmware."""
+    return any(fault.part in LINKS for fault in faults)

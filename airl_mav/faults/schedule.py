@@ -1,0 +1,62 @@
+"""When faults act: pure functions of simulated time and of the phases a flight has gone through."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.faults.model import Fault
+
+FOREVER_US = 1 << 62
+"""End of what has none [µs]."""
+
+
+def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | None:
+    """Return from when to when a fault acts [µs since the start of the episode].
+
+    Args:
+        fault: The fault.
+        entered_us: When each phase of the flight began for the first time [µs since the start].
+
+    Returns:
+        Begin, included, and end, excluded; None: the phase that sets it off has not begun.
+    """
+    origin_us = 0 if fault.phase is None else entered_us.get(fault.phase)
+    if origin_us is None:
+        return None
+    begin_us = origin_us + round(fault.at_s * US_PER_S)
+    if fault.for_s is None:
+        return begin_us, FOREVER_US
+    return begin_us, begin_us + max(1, round(fault.for_s * US_PER_S))
+
+
+def active(faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]) -> tuple[int, ...]:
+    """Return the indices of the faults that act at a time [µs since the start of the episode]."""
+    windows = ((i, window_us(fault, entered_us)) for i, fault in enumerate(faults))
+    return tuple(i for i, at in windows if at is not None and at[0] <= time_us < at[1])
+
+
+def next_change_us(faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]) -> int:
+    """Return when the next fault begins or ends after a time, `FOREVER_US` for never [µs].
+
+    A phase that has not begun is not known to begin.
+    """
+    edges = (
+        edge
+        for fault in faults
+        if (at := window_us(fault, entered_us)) is not None
+        for edge in at
+        if edge > time_us
+    )
+    return min(edges, default=FOREVER_US)
+
+
+def gust_share(elapsed_s: float, duration_s: float) -> float:
+    """Return how much of a discrete gust blows, 0 to 1, so long after its begin [s].
+
+    (1 - cos(2 pi t / T)) / 2: up to its peak and down again (MIL-F-8785C, 3.7.1.3, discrete gusts).
+    """
+    if not 0.0 <= elapsed_s <= duration_s:
+        return 0.0
+    return 0.5 * (1.0 - math.cos(2.0 * math.pi * elapsed_s / duration_s))

@@ -1,0 +1,90 @@
+"""A depth camera that fails: no frames, always the same picture, noise, frames that come late."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.noise import noisy_frame
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.profiles.conditions import SensorNoise
+from firmware_sim.faults.timeline import Acting, FaultTimeline
+from firmware_sim.plant.camera_server import DepthCamera
+
+NOISE_SEED = 1 << 32
+"""Added to a fault's number in the episode: its noise is not that of the healthy camera."""
+
+
+class FailingCamera:
+    """A camera as the simulation asks for its frames: there only where faults are asked for."""
+
+    def __init__(self, camera: DepthCamera, timeline: FaultTimeline, seed: int) -> None:
+        """Take the healthy camera, the faults of the episode, and its seed."""
+        self._camera = camera
+        self._timeline = timeline
+        self._seed = seed
+        self._acting: list[Acting] = []
+        self._frozen: NDArray[np.uint16] | None = None
+        self._late: deque[tuple[int, Frame]] = deque()
+        timeline.on_change(self._rearrange)
+
+    @property
+    def next_us(self) -> int:
+        """Simulated time from which on there is something to do [µs]."""
+        next_us = self._camera.next_us
+        return min(next_us, self._late[0][0]) if self._late else next_us
+
+    def restart(self, time_us: int) -> None:
+        """Begin an episode at `time_us` [µs]."""
+        self._late.clear()
+        self._camera.restart(time_us)
+
+    def offer(
+        self,
+        time_us: int,
+        position: Vector,
+        quaternion: Vector,
+        publish: Callable[[Frame], None],
+    ) -> None:
+        """Hand the frames that are due to `publish`; see `DepthCamera.offer`."""
+        if time_us >= self._camera.next_us:
+            self._camera.offer(
+                time_us, position, quaternion, lambda frame: self._take(frame, publish)
+            )
+        while self._late and self._late[0][0] <= time_us:
+            publish(self._late.popleft()[1])
+
+    def _take(self, frame: Frame, publish: Callable[[Frame], None]) -> None:
+        delay_us = 0
+        for each in self._acting:
+            kind = each.fault.kind
+            if kind == "off":
+                return
+            if kind == "delay":
+                delay_us += round(each.fault.amount * US_PER_S)
+            elif kind == "noise":
+                noise = SensorNoise(depth_noise=each.fault.amount)
+                seed = NOISE_SEED * (each.number + 1) + self._seed
+                depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
+                frame = replace(frame, depth_mm=depth)
+            else:  # stuck
+                if self._frozen is None:
+                    self._frozen = frame.depth_mm
+                frame = replace(frame, depth_mm=self._frozen)
+        if delay_us or self._late:
+            # A frame that was taken later must not overtake: a camera's frames come in order.
+            due_us = frame.capture_time_us + delay_us
+            self._late.append((max(due_us, self._late[-1][0]) if self._late else due_us, frame))
+        else:
+            publish(frame)
+
+    def _rearrange(self) -> None:
+        self._acting = self._timeline.acting("camera")
+        if all(each.fault.kind != "stuck" for each in self._acting):
+            self._frozen = None

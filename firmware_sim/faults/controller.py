@@ -1,0 +1,89 @@
+"""A flight controller behind failing sensors and motors: there only where faults are asked for."""
+
+from __future__ import annotations
+
+from airl_mav.faults.kinds import MOTORS, SENSORS
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.vehicle.airframe import Airframe
+from firmware_sim.faults.actuation import misread, thrust_left, weakened
+from firmware_sim.faults.sensors import Effect, effect_of, failed
+from firmware_sim.faults.timeline import Acting, FaultTimeline
+from firmware_sim.faults.wind import Gusts, gust_at
+from firmware_sim.flight_controller import FlightController
+from firmware_sim.interfaces import ActuatorControls, SensorSample
+from firmware_sim.plant.plant import Plant
+
+
+class FailingParts:
+    """What lies between the plant and the flight controller, and fails.
+
+    It works on any flight controller: the built-in one, or real firmware behind its simulator
+    interface.
+    """
+
+    def __init__(
+        self,
+        controller: FlightController,
+        plant: Plant,
+        vehicle: VehicleProfile,
+        timeline: FaultTimeline,
+    ) -> None:
+        """Put it in between; nothing fails yet.
+
+        Args:
+            controller: Who flies.
+            plant: What is flown: gusts are added to its wind, and its charge drops.
+            vehicle: Its profile: noise of the sensors, the battery, the motors' curve.
+            timeline: The faults of the episode.
+        """
+        self._controller = controller
+        self._plant = plant
+        self._vehicle = vehicle
+        self._curve = Airframe.from_profile(vehicle).thrust_curve
+        self._tick_s = 1.0 / controller.rate_hz
+        self._timeline = timeline
+        self._memories: dict[int, Effect] = {}
+        self._effects: list[tuple[str, Effect]] = []
+        self._battery: list[Acting] = []
+        self._left: dict[int, float] = {}
+        self._gusts = Gusts(plant.wind)
+        plant.wind = self._gusts
+        self._wind: list[Acting] = []
+        self._dropped: set[int] = set()
+        timeline.on_change(self._rearrange)
+
+    def step(self, sample: SensorSample) -> ActuatorControls:
+        """Advance the flight controller by what it is let to measure; return what motors do."""
+        self._timeline.update(sample.time_us, self._controller.flight)
+        if self._effects:
+            sample = failed(sample, self._effects)
+        if self._battery:
+            reading = misread(sample.battery, self._battery, self._vehicle.battery)
+            sample = sample._replace(battery=reading)
+        if self._wind:
+            self._gusts.more = gust_at(self._wind, sample.time_us)
+        controls = self._controller.step(sample)
+        return weakened(controls, self._left, self._curve) if self._left else controls
+
+    def _rearrange(self) -> None:
+        timeline, before = self._timeline, self._memories
+        sensors = timeline.acting(*SENSORS)
+        self._memories = {
+            each.number: before.get(each.number) or self._effect_of(each) for each in sensors
+        }
+        self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
+        self._left = thrust_left(timeline.acting(*MOTORS))
+        battery = timeline.acting("battery")
+        for each in battery:
+            if each.fault.kind == "drop" and each.number not in self._dropped:
+                self._dropped.add(each.number)
+                left = self._plant.battery_remaining - each.fault.amount
+                self._plant.battery_remaining = max(0.0, left)
+        self._battery = [each for each in battery if each.fault.kind != "drop"]
+        self._wind = timeline.acting("wind")
+        if not self._wind:
+            self._gusts.more = None
+
+    def _effect_of(self, acting: Acting) -> Effect:
+        rng = self._timeline.generator(acting.number)
+        return effect_of(acting, self._vehicle.sensors, self._tick_s, rng)

@@ -1,0 +1,252 @@
+"""A MAVLink link that fails: delay, jitter, loss, duplicates, changed order, nothing at all.
+
+It lies around an endpoint, and is there only where faults of the link are asked for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from airl_mav.core.clock import Clock
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.faults.kinds import Part
+from firmware_sim.faults.timeline import Acting, FaultTimeline
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
+
+UP, DOWN = 0, 1
+"""To the flight controller, and from it."""
+
+PARTS: tuple[tuple[Part, Part], tuple[Part, Part]] = (("link", "uplink"), ("link", "downlink"))
+"""Parts whose faults each direction has."""
+
+MAVLINK_2 = 0xFD
+
+STREAMED_UP = frozenset(
+    {
+        dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED,
+        dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_GLOBAL_INT,
+        dialect.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET,
+        dialect.MAVLINK_MSG_ID_MANUAL_CONTROL,
+    }
+)
+"""Messages that a companion repeats and nobody answers."""
+
+
+Frame = TypeVar("Frame")
+
+
+class Lane(Generic[Frame]):
+    """One direction of a link: what is under way, and what becomes of each frame."""
+
+    def __init__(self) -> None:
+        self._acting: list[tuple[Acting, np.random.Generator]] = []
+        self._under_way: deque[tuple[int, Frame]] = deque()
+        self._held: Frame | None = None
+
+    @property
+    def quiet(self) -> bool:
+        """Whether frames pass as on a healthy link."""
+        return not self._acting and not self._under_way and self._held is None
+
+    @property
+    def cut(self) -> bool:
+        """Whether nothing gets through."""
+        return any(each.fault.kind == "cut" for each, _ in self._acting)
+
+    def set(self, acting: list[tuple[Acting, np.random.Generator]]) -> None:
+        """Take the faults that act from now on, each with its randomness."""
+        self._acting = acting
+
+    def clear(self) -> None:
+        """Forget what is under way, and the faults."""
+        self._acting = []
+        self._under_way.clear()
+        self._held = None
+
+    def put(self, frame: Frame, now_us: int) -> None:
+        """Send a frame on its way at simulated `now_us` [µs]."""
+        due_us, copies, wait = now_us, 1, False
+        for each, rng in self._acting:
+            kind = each.fault.kind
+            if kind == "cut":
+                return
+            amount = each.fault.amount
+            if kind == "delay":
+                due_us += round(amount * US_PER_S)
+            elif kind == "jitter":
+                due_us += round(rng.uniform(0.0, amount) * US_PER_S)
+            elif rng.random() < amount:
+                if kind == "loss":
+                    return
+                copies += kind == "duplicate"
+                wait = wait or kind == "reorder"
+        if self._under_way:
+            due_us = max(due_us, self._under_way[-1][0])
+        if wait and self._held is None:
+            self._held = frame
+            return
+        self._under_way.extend([(due_us, frame)] * copies)
+        if self._held is not None:
+            self._under_way.append((due_us, self._held))
+            self._held = None
+
+    def arrived(self, now_us: int) -> Iterator[Frame]:
+        """Take out what has arrived by simulated `now_us` [µs], in order, one by one."""
+        while self._under_way and self._under_way[0][0] <= now_us:
+            yield self._under_way.popleft()[1]
+
+    def hurry(self) -> None:
+        """Let all that is under way arrive at once."""
+        frames = [frame for _, frame in self._under_way]
+        if self._held is not None:
+            frames.append(self._held)
+            self._held = None
+        self._under_way = deque((0, frame) for frame in frames)
+
+
+class FailingSender:
+    """What sends to one peer over a failing link. Implements `endpoint.Endpoint`."""
+
+    def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
+        """Take what sends over a healthy link; the rest as of `FailingEndpoint`."""
+        self.datagrams = endpoint.datagrams
+        self.lane: Lane[bytes] = Lane()
+        """Towards the peer."""
+        self._endpoint, self._clock, self._conducted = endpoint, clock, conducted
+
+    @property
+    def send_errors(self) -> int:
+        """Chunks that could not be sent."""
+        return self._endpoint.send_errors
+
+    def receive(self) -> list[bytes]:
+        """Return nothing: `FailingEndpoint.arrivals` has it."""
+        return []
+
+    def send(self, data: bytes) -> None:
+        """Send one frame: an answer."""
+        lane = self.lane
+        if lane.quiet or (self._conducted and not lane.cut):
+            self._endpoint.send(data)
+            return
+        lane.put(data, self._clock.time_us())
+
+    def send_streams(self, frames: Sequence[bytes]) -> None:
+        """Send the telemetry of one tick, with what is under way and due."""
+        lane = self.lane
+        if lane.quiet:
+            self._endpoint.send_streams(frames)
+            return
+        now_us = self._clock.time_us()
+        for frame in frames:
+            lane.put(frame, now_us)
+        if arrived := list(lane.arrived(now_us)):
+            self._endpoint.send_streams(arrived)
+
+    def fileno(self) -> int | None:
+        """Return the descriptor to wait on, or None when there is none."""
+        return self._endpoint.fileno()
+
+    def close(self) -> None:
+        """Release the resources."""
+        self._endpoint.close()
+
+
+class FailingEndpoint(FailingSender):
+    """An endpoint behind a failing link. Implements `endpoint.SharedEndpoint`."""
+
+    def __init__(self, endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> None:
+        """Take the healthy endpoint and simulated time.
+
+        Args:
+            endpoint: What it lies around.
+            clock: Simulated time.
+            conducted: Whether a companion in lockstep is at the other end. A command and its answer
+                are one moment of simulated time then: only a cut stops them, all other faults act
+                on setpoints and telemetry. Frames arrive with a tick, so that the flight is the
+                same every time.
+        """
+        super().__init__(endpoint, clock, conducted=conducted)
+        self._shared = endpoint
+        self._timeline: FaultTimeline | None = None
+        self._up: Lane[tuple[Peer, bytes]] = Lane()
+        self._senders: list[FailingSender] = [self]
+        self._generators: dict[tuple[int, ...], np.random.Generator] = {}
+
+    def begin(self, timeline: FaultTimeline | None) -> None:
+        """Begin an episode: what was under way is lost, and these faults act; None: nothing fails.
+
+        To be called once for every episode.
+        """
+        self._timeline = timeline
+        self._generators.clear()
+        self._up.clear()
+        for sender in self._senders:
+            sender.lane.clear()
+        if timeline is not None:
+            timeline.on_change(self._rearrange)
+            self._rearrange()
+
+    def receive(self) -> list[bytes]:
+        """Return all chunks that have arrived, oldest first."""
+        return [chunk for _, chunk in self.arrivals()]
+
+    def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
+        """Yield what has arrived and from whom, oldest first; see `SharedEndpoint`."""
+        lane = self._up
+        if lane.quiet:
+            yield from self._shared.arrivals()
+            return
+        now_us = self._clock.time_us()
+        for peer, chunk in self._shared.arrivals():
+            if self._conducted and not lane.cut and not _is_streamed(chunk):
+                # Nothing overtakes: what was sent before a command hurries along with it.
+                lane.hurry()
+                yield from lane.arrived(now_us)
+                yield peer, chunk
+            else:
+                lane.put((peer, chunk), now_us)
+        if not self._conducted or now_us % TICK_US == 0:
+            yield from lane.arrived(now_us)
+
+    def towards(self, peer: Peer) -> Endpoint | None:
+        """Return an endpoint that sends to one peer; None for a preset remote that is not set."""
+        healthy = self._shared.towards(peer)
+        if healthy is None:
+            return None
+        sender = FailingSender(healthy, self._clock, conducted=self._conducted)
+        self._senders.append(sender)
+        self._rearrange()
+        return sender
+
+    def _rearrange(self) -> None:
+        if self._timeline is None:
+            return
+        self._up.set(self._acting(UP, 0))
+        for number, sender in enumerate(self._senders):
+            sender.lane.set(self._acting(DOWN, number))
+
+    def _acting(self, direction: int, lane: int) -> list[tuple[Acting, np.random.Generator]]:
+        """Return the faults of a direction, each with the randomness that a lane of it has."""
+        timeline = self._timeline
+        if timeline is None:
+            return []
+        acting = []
+        for each in timeline.acting(*PARTS[direction]):
+            key = each.number, direction, lane
+            if key not in self._generators:
+                self._generators[key] = timeline.generator(*key)
+            acting.append((each, self._generators[key]))
+        return acting
+
+
+def _is_streamed(frame: bytes) -> bool:
+    """Return whether a chunk begins with a setpoint, which nobody answers."""
+    if not frame or frame[0] != MAVLINK_2:
+        return False
+    return int.from_bytes(frame[7:10], "little") in STREAMED_UP

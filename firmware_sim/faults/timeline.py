@@ -1,0 +1,166 @@
+"""Which faults of an episode act now, and which have acted: what all places of faults share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.streams import Stream, stream
+from airl_mav.faults.kinds import Part
+from airl_mav.faults.model import Fault
+from airl_mav.faults.schedule import FOREVER_US, active, next_change_us, window_us
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.commander import Flight, Phase
+
+PHASE_OF_MODE = {
+    "TAKEOFF": "climb",
+    "HOLD": "hold",
+    "OFFBOARD": "offboard",
+    "MISSION": "mission",
+    "RETURN": "return",
+    "LAND": "landing",
+}
+"""Phase of a flight in the air, by the name of the mode that is flown."""
+
+
+class Acting(NamedTuple):
+    """A fault that acts now."""
+
+    number: int
+    """Which one of the episode it is, from 0."""
+    fault: Fault
+    since_us: int
+    """When it began [µs]."""
+    until_us: int
+    """When it ends; `FOREVER_US` for never [µs]."""
+
+
+class Acted(NamedTuple):
+    """A fault that has acted."""
+
+    fault: str
+    """In words."""
+    from_us: int
+    to_us: int
+
+
+def phase_of(flight: Flight) -> str | None:
+    """Return the phase of a flight, as faults name it; None for one that sets nothing off."""
+    if flight.phase is Phase.AIR:
+        return PHASE_OF_MODE.get(Mode(flight.mode).name)
+    return None if flight.phase is Phase.BOOT else "ground"
+
+
+class FaultTimeline:
+    """The faults of one episode. Asked once a tick; everything else only when something changes."""
+
+    def __init__(self, faults: Sequence[Fault], seed: int, start_us: int) -> None:
+        """Begin an episode.
+
+        Args:
+            faults: What was asked for.
+            seed: Of the episode.
+            start_us: When it begins [µs].
+        """
+        self._faults = list(faults)
+        self._seed = seed
+        self._entered: dict[str, int] = {}
+        self._acting: tuple[int, ...] = ()
+        self._spans: list[Acted] = []
+        self._open: dict[int, int] = {}
+        self._listeners: list[Callable[[], None]] = []
+        self.begin(start_us)
+
+    def begin(self, start_us: int) -> None:
+        """Say that the episode begins at `start_us` [µs]; what acted before is forgotten."""
+        self._start_us = start_us
+        self._entered.clear()
+        self._spans.clear()
+        self._open.clear()
+        self._acting = ()
+        self._phase: str | None = None
+        self._next_us = 0
+        self._now_us = start_us
+        self._tell()
+
+    def on_change(self, listener: Callable[[], None]) -> None:
+        """Have `listener` called whenever a fault begins or ends."""
+        self._listeners.append(listener)
+
+    def update(self, time_us: int, flight: Flight) -> None:
+        """Look what begins or ends at simulated `time_us` [µs], in this state of the flight."""
+        phase, since_us = phase_of(flight), time_us - self._start_us
+        self._now_us = time_us
+        if phase is not self._phase:
+            self._phase = phase
+            if phase is not None and phase not in self._entered:
+                self._entered[phase] = since_us
+                self._next_us = 0
+        if since_us >= self._next_us:
+            self._renew(since_us)
+
+    def acting(self, *parts: Part) -> list[Acting]:
+        """Return the faults of these parts that act now, in the order of the episode's faults."""
+        return [
+            self._acting_at(index) for index in self._acting if self._faults[index].part in parts
+        ]
+
+    def generator(self, index: int, *more: int) -> np.random.Generator:
+        """Return the randomness of a fault: of the episode's seed, of no other's draws."""
+        return stream(self._seed, Stream.FAULTS, index, *more)
+
+    def inject(self, fault: Fault) -> None:
+        """Let a fault act from now on, whatever it says of its beginning."""
+        at_s = max(0, self._now_us - self._start_us) / US_PER_S
+        self._faults.append(fault.model_copy(update={"phase": None, "at_s": at_s}))
+        self._renew(self._now_us - self._start_us)
+
+    def clear(self, *parts: Part) -> None:
+        """End all that acts on these parts, as if its time were over."""
+        since_us = self._now_us - self._start_us
+        for index in self._acting:
+            fault = self._faults[index]
+            if fault.part in parts:
+                begin_us = self._window(index)[0]
+                for_s = max(1, since_us - begin_us) / US_PER_S
+                self._faults[index] = fault.model_copy(update={"for_s": for_s})
+        self._renew(since_us)
+
+    def acted(self, now_us: int) -> list[Acted]:
+        """Return all that has acted by `now_us` [µs], in the order of its beginning."""
+        open_ = [
+            Acted(str(self._faults[index]), from_us, now_us)
+            for index, from_us in self._open.items()
+        ]
+        return sorted([*self._spans, *open_], key=lambda span: span.from_us)
+
+    def _renew(self, since_us: int) -> None:
+        before = self._acting
+        self._acting = active(self._faults, since_us, self._entered)
+        self._next_us = next_change_us(self._faults, since_us, self._entered)
+        if self._acting == before:
+            return
+        for index in before:
+            if index not in self._acting:
+                from_us = self._open.pop(index)
+                self._spans.append(Acted(str(self._faults[index]), from_us, self._now_us))
+        for index in self._acting:
+            self._open.setdefault(index, self._now_us)
+        self._tell()
+
+    def _tell(self) -> None:
+        for listener in self._listeners:
+            listener()
+
+    def _window(self, index: int) -> tuple[int, int]:
+        window = window_us(self._faults[index], self._entered)
+        assert window is not None  # noqa: S101 (it acts, or has acted)
+        return window
+
+    def _acting_at(self, index: int) -> Acting:
+        begin_us, end_us = self._window(index)
+        until_us = end_us if end_us == FOREVER_US else self._start_us + end_us
+        return Acting(index, self._faults[index], self._start_us + begin_us, until_us)

@@ -1,0 +1,75 @@
+"""Flights with faults, in lockstep: recorded, reported, and the same every time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from airl_mav.cli import sitl
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.lockstep.flight import fly
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.faults import faults_table
+from airl_mav.scenario.file import read_scenario_file
+from airl_mav.scenario.model import Scenario
+from tests.support.lockstep_kit import SEED, demo_scenario
+
+
+def flown(*faults: str) -> EpisodeRecord:
+    resolved = demo_scenario(faults=faults, time_limit_s=30.0)
+    return fly(resolved, resolved.fresh_policy(SEED), 0, SEED).record
+
+
+def test_a_flight_with_every_sort_of_fault_is_the_same_every_time() -> None:
+    faults = (
+        "gyro noise 3x at 2s",
+        "gps delay 200ms at climb",
+        "motor1 weak 90% at offboard",
+        "wind gust 3,0,0m/s at offboard for 1s",
+        "camera delay 100ms at offboard",
+        "link jitter 60ms",
+        "downlink loss 20% at climb",
+        "uplink duplicate 20%",
+    )
+    once, again = flown(*faults), flown(*faults)
+    assert once == again
+    assert once.outcome is Outcome.SUCCESS
+    assert len(once.faults) == len(faults)
+    gust = next(each for each in once.faults if each.fault.startswith("wind"))
+    assert gust.to_us - gust.from_us == 1_000_000
+    assert once.sha256 != flown().sha256
+
+
+@pytest.mark.parametrize(
+    ("fault", "outcome", "note"),
+    [
+        ("link cut at climb", Outcome.ABORTED, "leaving offboard failed: timeout"),
+        ("uplink cut at offboard+1s", Outcome.SUCCESS, "landing failed: timeout"),
+        ("motor2 off at offboard+1s", Outcome.COLLISION, ""),
+    ],
+)
+def test_what_becomes_of_a_mission(fault: str, outcome: Outcome, note: str) -> None:
+    record = flown(fault)
+    assert record.outcome is outcome
+    assert note in "; ".join(record.notes)
+    assert [each.fault for each in record.faults] == [fault]
+
+
+def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    console = Console(record=True, width=200)
+    fault = "camera stuck at offboard+500ms for 300ms"
+    options = {"level": "lockstep", "episodes": 1, "seed": SEED, "out": out, "faults": [fault]}
+    assert sitl.run(sitl.OPTIONS.model_validate(options), console) == 0
+    run = load(out)
+    table = faults_table(run)
+    assert table is not None
+    assert table.rows[0][:4] == ("0", "camera stuck at offboard+0.5s for 0.3s", "0.40", "0.70")
+    assert "camera stuck at offboard+0.5s" in console.export_text()
+    page = (out / "report.html").read_text()
+    assert "camera stuck at offboard+0.5s for 0.3s" in page
+    again = Scenario.model_validate(read_scenario_file(out / "scenario.toml"))
+    assert [str(each) for each in again.faults] == ["camera stuck at offboard+0.5s for 0.3s"]
