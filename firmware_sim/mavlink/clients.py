@@ -25,6 +25,12 @@ from firmware_sim.mavlink.texts import TextEncoder
 MAX_CLIENTS = 32
 """Clients of a link at a time, the preset remote not counted."""
 
+MAX_COMPONENTS = 64
+"""Systems and components behind one client, as behind a router."""
+
+FORWARDS_PER_S = 250
+"""Frames of one client that are passed on to others for long; a flood must not reach them."""
+
 SILENT_US = 600 * US_PER_S
 """A client that has said nothing for so long in simulated time is forgotten [µs]."""
 
@@ -51,6 +57,15 @@ class Client:
     heard_us: int = 0
     """When it last sent a valid frame, in simulated time [µs]."""
     allowance: Allowance = field(default_factory=Allowance)
+    forwards: Allowance = field(default_factory=lambda: Allowance(FORWARDS_PER_S, FORWARDS_PER_S))
+    """What of it is passed on to others."""
+    components: set[tuple[int, int]] = field(default_factory=set)
+    """System and component ids of who has been heard from its side."""
+
+    def hear(self, message: WireMessage) -> None:
+        """Note whose message has come from this client."""
+        if len(self.components) < MAX_COMPONENTS:
+            self.components.add((message.get_srcSystem(), message.get_srcComponent()))
 
 
 class Clients:
@@ -116,6 +131,7 @@ class Clients:
         self._strangers.renew()
         for client in self._clients.values():
             client.allowance.renew()
+            client.forwards.renew()
             client.heard_us = now_us
 
     def receive(self, now_us: int) -> Iterator[tuple[Client, WireMessage]]:

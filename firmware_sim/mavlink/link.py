@@ -195,6 +195,13 @@ class Link:
             self._unsendable += 1
         return True
 
+    def pass_on(self, frame: bytes) -> None:
+        """Send somebody else's frame as it is."""
+        self.endpoint.send(frame)
+        self._tx += 1
+        if self.tap is not None:
+            self.tap(frame)
+
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
             self.flush()  # frames leave in the order of their sequence numbers

@@ -14,6 +14,7 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.endpoint import Endpoint, Peer
+from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
@@ -80,6 +81,7 @@ class MavlinkServer:
             "BATTERY_STATUS": self._battery_status,
             "TIMESYNC": peers.timesync_request,
         }
+        self._forwarder = Forwarder(self._all)
         self._links = [self._open(config, link_id) for link_id, config in enumerate(links)]
         if port is not None:
             self.attach(port)
@@ -245,10 +247,12 @@ class MavlinkServer:
         if client.context is None:
             return False
         client.context.now_us = self._now_us
+        client.hear(message)
         effective = handle(message, client.context)
         if effective:
             self._senders.note(message)
-        return effective
+        forwarded = self._forwarder.forward(message, client, self._system_id, self._now_us)
+        return effective or forwarded
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""

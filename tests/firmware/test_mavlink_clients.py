@@ -183,13 +183,16 @@ def test_clients_are_bounded_and_those_that_live_stay(field: Field) -> None:
 # --- floods
 
 
-def flood(hub: MemoryHub, per_tick: int) -> Callable[[], object]:
+def flood(
+    hub: MemoryHub, per_tick: int, message: dialect.MAVLink_message | None = None
+) -> Callable[[], object]:
+    """Return what sends a message again and again; by default one that is answered."""
     talker = hub.client(66)
-    ping = dialect.MAVLink_ping_message(1, 1, 0, 0)
+    frame = talker.pack(message or dialect.MAVLink_param_request_read_message(1, 1, b"", 0))
 
     def send() -> None:
         for _ in range(per_tick):
-            talker.send(ping)
+            talker.endpoint.inbox.append(frame)
 
     return send
 
@@ -228,6 +231,21 @@ def test_a_flood_on_one_link_leaves_the_other_alone(per_tick: int, seconds: floa
     other.command(400, 1)
     field.tick()
     assert len(other.received("COMMAND_ACK")) == 1
+
+
+def test_a_flood_of_broadcasts_is_passed_on_at_a_bounded_rate() -> None:
+    field = Field()
+    RawClient(field.onboard).send(heartbeat())  # so that it is somebody to pass on to
+    talker, numbers = field.hub.client(66), count()
+
+    def everything() -> None:
+        for _ in range(16):
+            talker.send(dialect.MAVLink_ping_message(next(numbers), 1, 0, 0))
+
+    frames = flight(field, 3.0, everything)
+    ours = [frame for frame in frames if frame[5] == 1]
+    assert len(frames) - len(ours) <= (3 + 1) * clients.FORWARDS_PER_S + 1
+    assert ours == quiet_flight(3.0)
 
 
 class CostlyClock(SimClock):
