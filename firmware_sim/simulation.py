@@ -22,6 +22,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
+from firmware_sim.faults.injection import ClientFaults
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
@@ -101,9 +102,11 @@ class Simulation:
         self.faults: FaultTimeline | None = None
         """What fails in this episode; None: nothing does."""
         self._fly: Callable[[SensorSample], ActuatorControls] = self.autopilot.step
+        self._setup = setup
         if asked.faults:
-            self.faults = FaultTimeline(asked.faults, setup.seed, start_us)
-            self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
+            self._let_fail(start_us)
+        if self.autopilot.internals is not None:
+            self.autopilot.internals.failures = ClientFaults(self._faults_now)
         self._camera: DepthCamera | FailingCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
@@ -131,6 +134,18 @@ class Simulation:
             self.faults.begin(self.start_us)
         if self._camera is not None:
             self._camera.restart(self.start_us)
+
+    def _let_fail(self, start_us: int) -> FaultTimeline:
+        """Put between plant and flight controller what may fail, and return its faults."""
+        setup = self._setup
+        self.faults = FaultTimeline(setup.aircraft.faults, setup.seed, start_us)
+        self._fly = FailingParts(self.autopilot, self.plant, setup.vehicle, self.faults).step
+        return self.faults
+
+    def _faults_now(self) -> FaultTimeline:
+        faults = self.faults or self._let_fail(self.start_us)
+        faults.update(self.time_us, self.autopilot.flight)
+        return faults
 
     @property
     def truth(self) -> Truth:

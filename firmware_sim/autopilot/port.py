@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from airl_mav.faults.kinds import Part
+from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.requests import Request
@@ -41,6 +43,18 @@ class ParameterStore(Protocol):
         ...
 
 
+class Failures(Protocol):
+    """Makes parts of the simulated vehicle fail at a client's word."""
+
+    def inject(self, fault: Fault) -> None:
+        """Let a part fail from now on."""
+        ...
+
+    def clear(self, part: Part) -> None:
+        """End all that acts on a part."""
+        ...
+
+
 class AutopilotPort(Protocol):
     """Commands in, state out. Every call happens between two ticks, on one thread."""
 
@@ -52,6 +66,11 @@ class AutopilotPort(Protocol):
     @property
     def plans(self) -> Plans:
         """The mission, the geofence and the rally points that are stored aboard."""
+        ...
+
+    @property
+    def failures(self) -> Failures | None:
+        """What makes parts fail; None: nobody simulates them."""
         ...
 
     @property

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mavsdk.plugins.failure import Failure, FailureError, FailureType, FailureUnit
+from mavsdk.plugins.param import Param
 from rich.console import Console
 
 from airl_mav.cli import sitl
+from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.stage import Stage
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.rehearsal.episode import faults_of
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.faults import faults_table
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
+from firmware_sim.simulation import EpisodeSetup
 from tests.support.lockstep_kit import SEED, demo_scenario
 
 
@@ -73,3 +81,45 @@ def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> N
     assert "camera stuck at offboard+0.5s for 0.3s" in page
     again = Scenario.model_validate(read_scenario_file(out / "scenario.toml"))
     assert [str(each) for each in again.faults] == ["camera stuck at offboard+0.5s for 0.3s"]
+
+
+def test_mavsdk_s_failure_plugin_makes_sensors_fail() -> None:
+    """As PX4's SITL: what it knows succeeds, what it lacks does not; it has to be enabled."""
+    answers: list[str] = []
+
+    def program(stage: Stage) -> None:
+        stage.clock.sleep_until(3 * US_PER_S)
+        failure, param = Failure(stage.link._system), Param(stage.link._system)
+        try:
+            for unit, kind in (
+                (FailureUnit.SENSOR_GPS, FailureType.OFF),
+                (FailureUnit.SENSOR_GPS, FailureType.STUCK),
+                (FailureUnit.SENSOR_BARO, FailureType.STUCK),
+            ):
+                answers.append(_told(lambda u=unit, k=kind: failure.inject(u, k, 0)))  # type: ignore[misc]
+            stage.clock.sleep_until(4 * US_PER_S)
+            answers.append(_told(lambda: failure.inject(FailureUnit.SENSOR_GPS, FailureType.OK, 0)))
+            param.set_param_int("SYS_FAILURE_EN", 0)
+            answers.append(
+                _told(lambda: failure.inject(FailureUnit.SENSOR_MAG, FailureType.OFF, 0))
+            )
+        finally:
+            failure.destroy()
+            param.destroy()
+
+    with Stage() as stage:
+        setup = EpisodeSetup(load_vehicle("quad"), None, 1)
+        simulation = stage.run(setup, lambda: program(stage))
+        acted = faults_of(simulation.arrays())
+    assert answers == ["ok", "UNSUPPORTED", "ok", "ok", "DENIED"]
+    assert [each.fault.split(" at ")[0] for each in acted] == ["gps off", "baro stuck"]
+    assert acted[0].to_us - acted[0].from_us == US_PER_S
+
+
+def _told(call: Callable[[], object]) -> str:
+    """Return ok, or the name of MAVSDK's result."""
+    try:
+        call()
+    except FailureError as error:
+        return str(getattr(error.args[0], "name", error.args[0]))
+    return "ok"

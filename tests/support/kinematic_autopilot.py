@@ -27,7 +27,7 @@ from firmware_sim.autopilot.autopilot_state import (
 )
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
-from firmware_sim.autopilot.port import ParameterValue
+from firmware_sim.autopilot.port import Failures, ParameterValue
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
@@ -86,6 +86,7 @@ class KinematicAutopilot:
     def __init__(self, parameters: Parameters | None = None, start_us: int = 0) -> None:
         self.parameters = parameters or Parameters()
         self.plans = Plans()
+        self.failures: Failures | None = None
         self.time_us = start_us
         self.ready_us = start_us + READY_US
         self.position = np.zeros(3)

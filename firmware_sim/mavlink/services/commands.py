@@ -12,7 +12,7 @@ import math
 
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import message_requests, standard_modes, without_effect
+from firmware_sim.mavlink.services import failure, message_requests, standard_modes, without_effect
 from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import (
     ANY,
@@ -82,6 +82,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
+    **failure.ACTIONS,
     **message_requests.ACTIONS,
     **standard_modes.ACTIONS,
     **without_effect.ACTIONS,
