@@ -19,11 +19,13 @@ from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 4
 """Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
@@ -48,6 +50,7 @@ class MavlinkServer:
         boot_unix_us: int,
         clock: Clock | None = None,
         signing: StoredSigning | None = None,
+        storage: Storage | None = None,
     ) -> None:
         """Open the links: each streams its default rates from the first `send` on.
 
@@ -55,6 +58,7 @@ class MavlinkServer:
             links: What they are made of.
             port: The autopilot; None: it comes later (`attach`).
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
+            storage: The vehicle's files, for MAVLink FTP; None: temporary ones. Closed with it.
             clock: Measures what part of a tick goes into received messages, and bounds it; None,
                 or a clock that stands still meanwhile: it is bounded by their number only.
             signing: The key that is asked for on all links; None: there is none until a client
@@ -66,6 +70,8 @@ class MavlinkServer:
         self._signing = (
             Signing(lambda: boot_unix_us + self._now_us) if signing is None else signing.signing
         )
+        self._storage = storage or Storage()
+        self._calibration = RunningCalibration()
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
@@ -99,6 +105,7 @@ class MavlinkServer:
         self._system_id = _system_id(port)
         self._senders.forget()
         self._vibration = VibrationMeter()
+        self._calibration = RunningCalibration()
         for clients in self._links:
             clients.restart(self._now_us)
             for client in clients:
@@ -187,11 +194,12 @@ class MavlinkServer:
         return [number for number in numbers if number is not None]
 
     def close(self) -> None:
-        """Close the endpoints, and keep the newest time stamp of signatures."""
+        """Close endpoints and storage, and keep the newest time stamp of signatures."""
         if self._stored is not None:
             self._stored.save()
         for clients in self._links:
             clients.endpoint.close()
+        self._storage.close()
 
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
         def welcome(peer: Peer, endpoint: Endpoint) -> Client:
@@ -227,6 +235,8 @@ class MavlinkServer:
             self._broadcast,
             self._signing,
             self._system_id,
+            storage=self._storage,
+            calibration=self._calibration,
         )
         client.announced_origin = None
 

@@ -51,16 +51,17 @@ def test_ping(rig: Rig) -> None:
     assert np.diff([m.seq for m in rig.client.received("PING")]).tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("opcode", [0, 1, 2, 3, 4, 14, 15])
-def test_there_are_no_files(rig: Rig, opcode: int) -> None:
-    body = struct.pack("<HBBBBBxI", 65_535, 4, opcode, 5, 0, 0, 0) + b"@PARA"
+def test_mavproxys_packed_parameters_are_no_file(rig: Rig) -> None:
+    """MAVProxy asks for them when it connects, and falls back to the list of parameters."""
+    name, opened = b"@PARAM/param.pck", 4
+    body = struct.pack("<HBBBBBxI", 65_535, 0, opened, len(name), 0, 0, 0) + name
     message = dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, list(body.ljust(251, b"\0")))
     (answer,) = [m for m in rig.exchange(message) if m.get_type() == "FILE_TRANSFER_PROTOCOL"]
     sequence, session, code, size, asked, _, _ = struct.unpack_from(
         "<HBBBBBxI", bytes(answer.payload)
     )
-    assert (sequence, session, code, size, asked) == (0, 4, 129, 1, opcode)
-    assert answer.payload[12] == 7  # unknown command
+    assert (sequence, session, code, size, asked) == (0, 0, 129, 1, opened)
+    assert answer.payload[12] == 10  # file not found
 
 
 def test_answers_about_files_are_not_answered(rig: Rig) -> None:

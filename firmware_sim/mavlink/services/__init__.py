@@ -7,9 +7,10 @@ from types import MappingProxyType
 
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import (
-    absent,
+    calibration,
     commands,
     data_streams,
+    ftp,
     missions,
     params,
     peers,
@@ -43,7 +44,7 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "SETUP_SIGNING": (for_vehicle_or_all, signing.handle_setup),
         "PING": (_for_anyone, peers.handle_ping),
         "TIMESYNC": (_for_anyone, peers.handle_timesync),
-        "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, absent.handle_file_transfer),
+        "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, ftp.handle_request),
         "MISSION_REQUEST_LIST": (missions.is_addressed, missions.handle_list),
         "MISSION_REQUEST": (missions.is_addressed, missions.handle_request),
         "MISSION_REQUEST_INT": (missions.is_addressed, missions.handle_request),
@@ -65,7 +66,12 @@ def handle(message: WireMessage, context: Context) -> bool:
     )
 
 
-PENDING: tuple[Callable[[Context], None], ...] = (params.send_pending, missions.send_pending)
+PENDING: tuple[Callable[[Context], None], ...] = (
+    params.send_pending,
+    missions.send_pending,
+    ftp.send_pending,
+    calibration.send_pending,
+)
 """Send the next part of what a client is getting piece by piece; once a tick and client."""
 
 

@@ -12,7 +12,13 @@ import math
 
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services import failure, message_requests, standard_modes, without_effect
+from firmware_sim.mavlink.services import (
+    calibration,
+    failure,
+    message_requests,
+    standard_modes,
+    without_effect,
+)
 from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import (
     ANY,
@@ -84,6 +90,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
     **message_requests.ACTIONS,
+    **calibration.ACTIONS,
     **standard_modes.ACTIONS,
     **without_effect.ACTIONS,
 }

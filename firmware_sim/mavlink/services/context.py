@@ -10,7 +10,10 @@ from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
+from firmware_sim.mavlink.services.ftp_session import FtpClient
 from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
+from firmware_sim.mavlink.services.running_calibration import RunningCalibration
+from firmware_sim.storage import Storage
 
 ANY = 0
 """System or component id of a broadcast."""
@@ -37,6 +40,12 @@ class Context:
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
     """The link's part in the mission protocol."""
+    storage: Storage = field(default_factory=Storage)
+    """The vehicle's files, the same for all clients."""
+    ftp: FtpClient = field(default_factory=FtpClient)
+    """The client's part in MAVLink FTP."""
+    calibration: RunningCalibration = field(default_factory=RunningCalibration)
+    """The vehicle's, the same for all clients."""
 
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:

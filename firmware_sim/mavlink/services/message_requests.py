@@ -7,17 +7,21 @@ no stream FAILED.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.mavlink.codec import dialect, message_id
 from firmware_sim.mavlink.scheduler import OFF
+from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import flight_modes
-from firmware_sim.mavlink.streams.units import INT32_MAX
+from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
 _INTERVAL_DISABLED, _INTERVAL_UNAVAILABLE = -1, 0
+_MIB = 1024.0 * 1024.0
 
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 """Messages that PX4 sends at rates of its own: no client can change them."""
@@ -73,9 +77,34 @@ def _request_modes(command: Command, context: Context) -> Result:
     return Result.ACCEPTED
 
 
+def _request_storage(command: Command, context: Context) -> Result:
+    """Parameter 2: storage number; 0 = all. There is one, with number 1."""
+    number, count, empty = 1, 1, b""
+    if command.integer(2) not in (None, 0, number):
+        return Result.DENIED
+    disk = shutil.disk_usage(context.storage.folder)
+    sizes = (size / _MIB for size in (disk.total, disk.used, disk.free))
+    no_speed = 0.0
+    context.link.send(
+        dialect.MAVLink_storage_information_message(
+            *(boot_ms(context.now_us), number, count, dialect.STORAGE_STATUS_READY),
+            *(*sizes, no_speed, no_speed, dialect.STORAGE_TYPE_UNKNOWN, empty),
+        )
+    )
+    return Result.ACCEPTED
+
+
+def _first_as_second(command: Command) -> Command:
+    first = command.params[0]
+    return replace(command, params=(first, first, *command.params[2:]))
+
+
 _SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
     dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL: _request_interval,
     dialect.MAVLINK_MSG_ID_AVAILABLE_MODES: _request_modes,
+    dialect.MAVLINK_MSG_ID_COMPONENT_METADATA: component_metadata.request_metadata,
+    dialect.MAVLINK_MSG_ID_COMPONENT_INFORMATION: component_metadata.request_information,
+    dialect.MAVLINK_MSG_ID_STORAGE_INFORMATION: _request_storage,
 }
 """Messages that are no streams, or whose request has parameters."""
 
@@ -115,6 +144,6 @@ ACTIONS: dict[int, Action] = {
         lambda _, context: send_stream("FLIGHT_INFORMATION", context)
     ),
     dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: (
-        lambda _, context: send_stream("STORAGE_INFORMATION", context)
+        lambda command, context: _request_storage(_first_as_second(command), context)
     ),
 }

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
+from firmware_sim.mavlink.crc32 import crc32part
 from firmware_sim.mavlink.services.context import Context, sender
 
 HASH_NAME = "_HASH_CHECK"
@@ -17,7 +17,6 @@ PARAMETERS_PER_TICK = 3
 """Parameters of a full list that are sent per tick: it has hundreds."""
 
 _NO_INDEX = 65_535
-_ALL_ONES = 0xFFFF_FFFF
 _ERROR_TYPE_MISMATCH = 7
 """MAV_PARAM_ERROR_TYPE_MISMATCH, newer than pymavlink's dialect."""
 
@@ -127,6 +126,5 @@ def parameter_hash(store: ParameterStore) -> int:
         if parameter is None:
             continue
         data = parameter.name.encode("ascii") + _encoded(parameter.value)
-        # zlib inverts before and after; PX4's crc32part() does not.
-        crc = zlib.crc32(data, crc ^ _ALL_ONES) ^ _ALL_ONES
+        crc = crc32part(data, crc)
     return crc

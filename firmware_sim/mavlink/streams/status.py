@@ -21,8 +21,9 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
+    | dialect.MAV_PROTOCOL_CAPABILITY_FTP
 )
-"""Of a real PX4's 0xE8FF only what is true here: no FTP, attitude setpoints or flight
+"""Of a real PX4's 0xE8FF only what is true here: no attitude setpoints or flight
 termination."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255

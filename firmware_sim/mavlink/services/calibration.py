@@ -1,0 +1,196 @@
+"""Sensor calibration, as a PX4 SITL goes through it: texts that ground stations follow.
+
+The simulated sensors are calibrated from the start, so nothing is estimated. What is real is what a
+client sees: a calibration is refused while the vehicle is armed or another one runs, it fails when
+the vehicle moves, it takes its time, and one that needs the vehicle turned by hand waits until it
+is cancelled. Source: PX4 1.16, Commander::handle_command and what a running SITL said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
+from firmware_sim.interfaces import SensorSample
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.services.command import Action, Command
+from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.running_calibration import Step
+
+MOVING_RAD_S = 0.2
+"""A body rate that counts as motion [rad/s]."""
+
+_GYRO_STEP_S, _LEVEL_STEP_S, _REST_S, _AGAIN_S = 0.15, 0.5, 1.0, 5.0
+
+
+def _info(text: str, after_s: float = 0.0) -> Step:
+    return Step(after_s, Message(Severity.INFO, text))
+
+
+def _critical(text: str, after_s: float = 0.0) -> Step:
+    return Step(after_s, Message(Severity.CRITICAL, text))
+
+
+def _started(sensor: str) -> Step:
+    return _info(f"[cal] calibration started: 2 {sensor}")
+
+
+def _done(sensor: str) -> Step:
+    return _info(f"[cal] calibration done: {sensor}")
+
+
+def failed(sensor: str) -> Step:
+    """Return the end of a calibration that failed."""
+    return _critical(f"[cal] calibration failed: {sensor}")
+
+
+def _at_rest(
+    context: Context, sensor: str, percents: range, step_s: float, needs_rest: bool = True
+) -> Iterator[Step]:
+    """A calibration that a vehicle at rest goes through by itself."""
+    yield _started(sensor)
+    for percent in percents:
+        if needs_rest and _moving(context.port.sample):
+            yield _critical("ERROR: Motion during calibration")
+            yield failed(sensor)
+            return
+        yield _info(f"[cal] progress <{percent}>", step_s)
+    yield _done(sensor)
+
+
+def _moving(sample: SensorSample | None) -> bool:
+    return sample is None or float(np.abs(sample.gyro).max()) > MOVING_RAD_S
+
+
+def _gyro(context: Context) -> Iterator[Step]:
+    return _at_rest(context, "gyro", range(0, 101, 10), _GYRO_STEP_S)
+
+
+def _level(context: Context) -> Iterator[Step]:
+    return _at_rest(context, "level", range(0, 101, 20), _LEVEL_STEP_S)
+
+
+def _barometer(context: Context) -> Iterator[Step]:
+    return _at_rest(context, "baro", range(0), _LEVEL_STEP_S, needs_rest=False)
+
+
+def _one_side(context: Context, sensor: str) -> Iterator[Step]:
+    """The side on which the vehicle stands: the first of six."""
+    yield _started(sensor)
+    yield _info("[cal] pending: back front left right up down")
+    yield _info("[cal] hold vehicle still on a pending side")
+    if _moving(context.port.sample):
+        yield failed(sensor)
+        return
+    yield _info("[cal] detected rest position, hold still...", _REST_S)
+    yield _info("[cal] down orientation detected")
+
+
+def _accelerometer(context: Context) -> Iterator[Step]:
+    yield from _one_side(context, "accel")
+    yield _info("[cal] Hold still, measuring down side")
+    sample = context.port.sample
+    if sample is not None:
+        x, y, z = sample.accel.tolist()
+        yield _info(f"[cal] down side result: [{x:.3f} {y:.3f} {z:.3f}]", _REST_S)
+    yield _info("[cal] progress <17>")
+    yield _info("[cal] down side done, rotate to a different side")
+    while True:  # nobody turns it
+        yield _info("[cal] pending: back front left right up", _AGAIN_S)
+        yield _info("[cal] hold vehicle still on a pending side")
+
+
+def _magnetometer(context: Context) -> Iterator[Step]:
+    yield from _one_side(context, "mag")
+    yield _info("[cal] Rotate vehicle")
+    while True:
+        yield _info("[cal] Rotate vehicle", _AGAIN_S)
+
+
+def _airspeed(_context: Context) -> Iterator[Step]:
+    yield _started("airspeed")
+    yield _critical("[cal] Ensure sensor is not measuring wind")
+    yield _critical("[cal] calibration failed: airspeed", _AGAIN_S)  # there is no such sensor
+
+
+def _silent(_context: Context) -> Iterator[Step]:
+    return iter(())
+
+
+def _trim(_context: Context) -> Iterator[Step]:
+    yield _info("trim cal done")
+
+
+def _rc_begins(_context: Context) -> Iterator[Step]:
+    yield _info("Calibration: Disabling RC input")
+
+
+Routine = Callable[[Context], Iterator[Step]]
+
+ROUTINES: dict[tuple[int, int], tuple[str, Routine]] = {
+    (1, 1): ("gyro", _gyro),
+    (2, 1): ("mag", _magnetometer),
+    (3, 1): ("baro", _barometer),
+    (4, 1): ("rc", _rc_begins),
+    (4, 2): ("trim", _trim),
+    (5, 1): ("accel", _accelerometer),
+    (5, 2): ("level", _level),
+    (5, 4): ("quick", _silent),
+    (6, 1): ("airspeed", _airspeed),
+    (6, 2): ("airspeed", _airspeed),
+}
+"""Sensor and routine by parameter number and value, in the order in which PX4 looks."""
+
+_ESC = 7
+
+
+def _calibrate(command: Command, context: Context) -> Result:
+    """PREFLIGHT_CALIBRATION: one parameter says what; all zero cancels."""
+    running = context.calibration
+    asked = {number: command.integer(number) or 0 for number in range(1, 8)}
+    if context.port.state().status.arming is Arming.ARMED:
+        return Result.TEMPORARILY_REJECTED
+    if running.active:
+        if any(asked.values()):
+            return Result.TEMPORARILY_REJECTED
+        cancelled = (_critical("[cal] calibration cancelled"), failed(running.sensor))
+        running.start(running.sensor, iter(cancelled), context.now_us)
+        return Result.ACCEPTED
+    for (number, value), (sensor, routine) in ROUTINES.items():
+        if asked[number] == value:
+            running.start(sensor, routine(context), context.now_us)
+            return Result.ACCEPTED
+    if asked[_ESC] == 1:
+        text = "[cal] calibration failed: Disconnect battery and try again"
+        context.announce(Message(Severity.CRITICAL, text))
+        return Result.DENIED
+    return Result.ACCEPTED if asked[4] == 0 else Result.UNSUPPORTED
+
+
+def _quick_magnetometer(command: Command, context: Context) -> Result:
+    """FIXED_MAG_CAL_YAW, parameter 1: heading [deg]."""
+    if context.calibration.active or context.port.state().status.arming is Arming.ARMED:
+        return Result.TEMPORARILY_REJECTED
+    heading = command.integer(1) or 0
+    for text in (
+        f"Assuming vehicle is facing heading {heading:.1f} degrees",
+        "Mag quick calibration finished",
+    ):
+        context.announce(Message(Severity.INFO, text))
+    return Result.ACCEPTED
+
+
+def send_pending(context: Context) -> None:
+    """Say what is due of a running calibration; call once per tick."""
+    running = context.calibration
+    if running.active:
+        for message in running.due(context.now_us):
+            context.announce(message)
+
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_PREFLIGHT_CALIBRATION: _calibrate,
+    dialect.MAV_CMD_FIXED_MAG_CAL_YAW: _quick_magnetometer,
+}

@@ -1,0 +1,100 @@
+"""Component metadata: what a ground station learns of this vehicle's parameters, as files.
+
+COMPONENT_METADATA (and the older COMPONENT_INFORMATION) say where the general file lies; that names
+the file with the parameters. Both are read over MAVLink FTP. Source of the formats:
+https://mavlink.io/en/services/component_information.html, `general.schema.json`,
+`parameter.schema.json`.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import lzma
+import math
+from typing import Any
+
+from airl_mav.profiles.parameters import SPECS, ParameterSpec
+from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.crc32 import crc32part
+from firmware_sim.mavlink.services.command import Command
+from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.streams.units import boot_ms
+from firmware_sim.storage import Storage
+
+_FOLDER = "etc/extras"
+_GENERAL, _PARAMETERS = "component_general.json.xz", "parameters.json.xz"
+_TYPE_PARAMETERS = 1
+"""COMP_METADATA_TYPE_PARAMETER."""
+
+
+@functools.cache
+def files() -> dict[str, bytes]:
+    """Return the files by their names; made when they are first wanted."""
+    parameters = _compressed({"version": 1, "parameters": [_described(s) for s in SPECS]})
+    uri = f"mftp://{_FOLDER}/{_PARAMETERS}"
+    entry = {"type": _TYPE_PARAMETERS, "uri": uri, "fileCrc": crc32part(parameters)}
+    general = _compressed({"version": 1, "metadataTypes": [entry]})
+    return {_GENERAL: general, _PARAMETERS: parameters}
+
+
+def provide(storage: Storage) -> None:
+    """Put the files onto a vehicle's storage, unless they are there."""
+    folder = storage.folder / _FOLDER
+    if folder.is_dir():
+        return
+    folder.mkdir(parents=True)
+    for name, data in files().items():
+        (folder / name).write_bytes(data)
+
+
+def request_metadata(_command: Command, context: Context) -> Result:
+    """Send COMPONENT_METADATA."""
+    context.link.send(
+        dialect.MAVLink_component_metadata_message(
+            boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri()
+        )
+    )
+    return Result.ACCEPTED
+
+
+def request_information(_command: Command, context: Context) -> Result:
+    """Send COMPONENT_INFORMATION, what the same was before."""
+    no_crc, no_uri = 0, b""
+    context.link.send(
+        dialect.MAVLink_component_information_message(
+            boot_ms(context.now_us), crc32part(files()[_GENERAL]), _uri(), no_crc, no_uri
+        )
+    )
+    return Result.ACCEPTED
+
+
+def _uri() -> bytes:
+    return f"mftp://{_FOLDER}/{_GENERAL}".encode("ascii")
+
+
+def _compressed(document: dict[str, Any]) -> bytes:
+    data = json.dumps(document, separators=(",", ":"), ensure_ascii=False).encode()
+    # The small decoders of ground stations know this check only.
+    return lzma.compress(data, format=lzma.FORMAT_XZ, check=lzma.CHECK_CRC32)
+
+
+def _described(spec: ParameterSpec) -> dict[str, Any]:
+    whole = isinstance(spec.default, int)
+    kind = int if whole else float
+    described: dict[str, Any] = {
+        "name": spec.name,
+        "type": "Int32" if whole else "Float",
+        "default": spec.default,
+        "group": spec.name.split("_", 1)[0],
+        "shortDesc": spec.meaning or "Has no effect on the simulated vehicle",
+    }
+    if spec.unit:
+        described["units"] = spec.unit
+    described |= {
+        key: kind(limit)
+        for key, limit in (("min", spec.low), ("max", spec.high))
+        if math.isfinite(limit)
+    }
+    return described

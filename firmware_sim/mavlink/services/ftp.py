@@ -1,0 +1,123 @@
+"""MAVLink FTP: requests in, answers and bursts out.
+
+Source: https://mavlink.io/en/services/ftp.html and PX4 1.16, MavlinkFTP. What is done with files
+stands in `ftp_files`; nobody gets out of the vehicle's storage.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.services import component_metadata
+from firmware_sim.mavlink.services.context import Context, sender
+from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, read_at
+from firmware_sim.mavlink.services.ftp_session import Burst, Code, RefusedError, Request
+
+_HEADER = struct.Struct("<HBBBBBxI")
+"""Sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
+
+_PAYLOAD_BYTES = 251
+_BURST = 15
+_ACK, _NAK = 128, 129
+
+BURST_MESSAGES = 8
+"""Messages of a burst that are sent per tick: half a megabyte a second."""
+
+_IDLE_US = 10 * US_PER_S
+"""A session without activity is closed then, when another client wants one [µs]."""
+
+_SMALL_BYTES = 4
+"""Answers with at most this much data are kept, to be sent again when they were lost (as PX4)."""
+
+
+def handle_request(message: WireMessage, context: Context) -> bool:
+    """Carry out a request and answer it."""
+    payload = bytes(message.payload)
+    sequence, session, opcode, size, _, _, offset = _HEADER.unpack_from(payload)
+    if opcode in (_ACK, _NAK):
+        return False
+    client, asker = context.ftp, sender(message)
+    if sequence == client.last_sequence:
+        _send(client.last_answer, asker, context)
+        return True
+    if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
+        client.session.close()
+    client.used_us = context.now_us
+    data = payload[_HEADER.size :][: min(size, DATA_BYTES)]
+    request = Request(session, opcode, offset, size, data)
+    try:
+        if size > DATA_BYTES:
+            raise RefusedError(Code.INVALID_DATA_SIZE)
+        if opcode == _BURST:
+            client.session.opened(request)
+            client.burst = Burst((sequence + 1) & 0xFFFF, offset, asker)
+            return True
+        answer = _carried_out(request, context)
+        kind = _ACK
+    except (RefusedError, OSError) as error:
+        answer, kind = _error(error), _NAK
+    client.burst = None
+    body = _packed((sequence + 1) & 0xFFFF, kind, opcode, offset, answer)
+    small = len(answer) <= _SMALL_BYTES
+    client.last_sequence, client.last_answer = (sequence, body) if small else (None, b"")
+    _send(body, asker, context)
+    return True
+
+
+def send_pending(context: Context) -> None:
+    """Send the next messages of a burst; call once per tick."""
+    client = context.ftp
+    if client.burst is None:
+        return
+    for _ in range(BURST_MESSAGES):
+        burst = client.burst
+        if burst is None:
+            return
+        kind, offset, file = _ACK, burst.offset, client.session.file
+        try:
+            if file is None:
+                raise RefusedError(Code.INVALID_SESSION)
+            data = read_at(file, offset, DATA_BYTES)
+            burst.offset += len(data)
+        except (RefusedError, OSError) as error:
+            data, kind, client.burst = _error(error), _NAK, None
+        body = _packed(burst.sequence, kind, _BURST, offset, data)
+        burst.sequence = (burst.sequence + 1) & 0xFFFF
+        client.used_us = context.now_us
+        _send(body, burst.asker, context)
+
+
+def _carried_out(request: Request, context: Context) -> bytes:
+    operation = OPERATIONS.get(request.opcode)
+    if operation is None:
+        raise RefusedError(Code.UNKNOWN_COMMAND)
+    component_metadata.provide(context.storage)
+    return operation(request, context.ftp.session, context.storage)
+
+
+def _error(error: RefusedError | OSError) -> bytes:
+    """Return the data of a NAK."""
+    if isinstance(error, RefusedError):
+        return bytes([error.code])
+    number = error.errno or 0
+    code = {
+        errno.EEXIST: Code.FILE_EXISTS,
+        errno.ENOENT: Code.FILE_NOT_FOUND,
+        errno.EACCES: Code.FILE_PROTECTED,
+        errno.ELOOP: Code.FILE_PROTECTED,
+    }.get(number)
+    return bytes([Code.FAIL_ERRNO, number & 0xFF]) if code is None else bytes([code])
+
+
+def _packed(sequence: int, kind: int, opcode: int, offset: int, data: bytes) -> bytes:
+    session = complete = 0
+    header = _HEADER.pack(sequence, session, kind, len(data), opcode, complete, offset)
+    return (header + data).ljust(_PAYLOAD_BYTES, b"\0")
+
+
+def _send(body: bytes, asker: tuple[int, int], context: Context) -> None:
+    network = 0
+    context.link.send(dialect.MAVLink_file_transfer_protocol_message(network, *asker, list(body)))

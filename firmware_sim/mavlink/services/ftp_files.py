@@ -1,0 +1,209 @@
+"""What MAVLink FTP does with files: one function per request, on the vehicle's storage.
+
+Requests, answers and error codes: https://mavlink.io/en/services/ftp.html, and what a running PX4
+1.16 (MavlinkFTP) answers. Like PX4's, a session has the number 0, and each client has one.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from firmware_sim.mavlink.crc32 import crc32part
+from firmware_sim.mavlink.services.ftp_session import Code, RefusedError, Request, Session
+from firmware_sim.storage import Storage
+
+DATA_BYTES = 239
+"""Most data in one message."""
+
+READ_ONLY = "etc"
+"""Folder of the vehicle's own files: clients may read it."""
+
+_CHUNK_BYTES = 1 << 16
+_SIZE = struct.Struct("<I")
+
+
+Operation = Callable[[Request, Session, Storage], bytes]
+"""Carries out a request and returns the data of its answer.
+
+Raises RefusedError or OSError for a NAK.
+"""
+
+
+def _list(request: Request, _session: Session, storage: Storage) -> bytes:
+    """List a folder from entry number `offset` on: D and name, or F, name, tab and size."""
+    folder = storage.path(request.name)
+    if not folder.is_dir():
+        raise RefusedError(Code.FILE_NOT_FOUND)
+    found = bytearray()
+    for number, entry in enumerate(_entries(folder)):
+        if number < request.offset:
+            continue
+        if len(found) + len(entry) > DATA_BYTES:
+            break
+        found += entry
+    if not found:
+        raise RefusedError(Code.END_OF_FILE)
+    return bytes(found)
+
+
+def _entries(folder: Path) -> Iterator[bytes]:
+    for path in sorted(folder.iterdir()):
+        name = os.fsencode(path.name)
+        if path.is_symlink():
+            yield b"S\0"  # skipped, as by PX4
+        elif path.is_dir():
+            yield b"D" + name + b"\0"
+        elif path.is_file():
+            yield b"F" + name + b"\t%d" % path.stat().st_size + b"\0"
+        else:
+            yield b"S\0"
+
+
+def _open_to_read(request: Request, session: Session, storage: Storage) -> bytes:
+    path = storage.path(request.name)
+    _check_free(session)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    session.file = path.open("rb")
+    session.size = path.stat().st_size
+    return _SIZE.pack(session.size)
+
+
+def _create(request: Request, session: Session, storage: Storage) -> bytes:
+    return _open_to_write(request, session, storage, os.O_TRUNC)
+
+
+def _open_existing(request: Request, session: Session, storage: Storage) -> bytes:
+    return _open_to_write(request, session, storage, 0)
+
+
+def _open_to_write(request: Request, session: Session, storage: Storage, flags: int) -> bytes:
+    path = _writable(request.name, storage)
+    _check_free(session)
+    storage.check_room(0)
+    number = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | flags, 0o666)
+    session.file = os.fdopen(number, "r+b", buffering=0)
+    session.size = path.stat().st_size
+    return _SIZE.pack(session.size)
+
+
+def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
+    """Return what a file has there. Raises RefusedError at its end."""
+    file.seek(offset)
+    data = file.read(min(size, DATA_BYTES))
+    if not data:
+        raise RefusedError(Code.END_OF_FILE)
+    return data
+
+
+def _read(request: Request, session: Session, _storage: Storage) -> bytes:
+    return read_at(session.opened(request), request.offset, request.size)
+
+
+def _write(request: Request, session: Session, storage: Storage) -> bytes:
+    file = session.opened(request)
+    end = request.offset + len(request.data)
+    if end > session.size:
+        if end // _CHUNK_BYTES != session.size // _CHUNK_BYTES:
+            storage.check_room(end - session.size)
+        session.size = end
+    file.seek(request.offset)
+    return _SIZE.pack(file.write(request.data))
+
+
+def _terminate(request: Request, session: Session, _storage: Storage) -> bytes:
+    session.opened(request)
+    session.close()
+    return b""
+
+
+def _reset(_request: Request, session: Session, _storage: Storage) -> bytes:
+    session.close()
+    return b""
+
+
+def _remove_file(request: Request, _session: Session, storage: Storage) -> bytes:
+    _writable(request.name, storage).unlink()
+    return b""
+
+
+def _make_folder(request: Request, _session: Session, storage: Storage) -> bytes:
+    path = _writable(request.name, storage)
+    storage.check_room(0)
+    path.mkdir()
+    return b""
+
+
+def _remove_folder(request: Request, _session: Session, storage: Storage) -> bytes:
+    _writable(request.name, storage).rmdir()
+    return b""
+
+
+def _truncate(request: Request, _session: Session, storage: Storage) -> bytes:
+    path = _writable(request.name, storage)
+    more = request.offset - path.stat().st_size
+    if more > 0:
+        storage.check_room(more)
+    os.truncate(path, request.offset)
+    return b""
+
+
+def _rename(request: Request, _session: Session, storage: Storage) -> bytes:
+    old, separator, rest = request.data.partition(b"\0")
+    new = rest.split(b"\0", 1)[0]
+    if not separator or not new:
+        raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+    source = _writable(os.fsdecode(old), storage)
+    source.rename(_writable(os.fsdecode(new), storage))
+    return b""
+
+
+def _crc32(request: Request, _session: Session, storage: Storage) -> bytes:
+    crc = 0
+    with storage.path(request.name).open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            crc = crc32part(chunk, crc)
+    return _SIZE.pack(crc)
+
+
+def _nothing(_request: Request, _session: Session, _storage: Storage) -> bytes:
+    return b""
+
+
+def _check_free(session: Session) -> None:
+    if session.file is not None:
+        raise RefusedError(Code.NO_SESSIONS)
+
+
+def _writable(name: str, storage: Storage) -> Path:
+    """Return the path of a file that clients may change. Raises RefusedError for another."""
+    path = storage.path(name)
+    parts = path.relative_to(storage.folder).parts
+    if not parts or parts[0] == READ_ONLY:
+        raise RefusedError(Code.FILE_PROTECTED)
+    return path
+
+
+OPERATIONS: dict[int, Operation] = {
+    0: _nothing,
+    1: _terminate,
+    2: _reset,
+    3: _list,
+    4: _open_to_read,
+    5: _read,
+    6: _create,
+    7: _write,
+    8: _remove_file,
+    9: _make_folder,
+    10: _remove_folder,
+    11: _open_existing,
+    12: _truncate,
+    13: _rename,
+    14: _crc32,
+}
+"""By opcode; burst reads stand in `ftp`."""
