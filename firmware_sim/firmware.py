@@ -18,14 +18,12 @@ from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
+from firmware_sim.flight_log.log_folder import ULOG_SUFFIX, LogFolder
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
-
-ULOG_SUFFIX = ".ulg"
-"""Of a vehicle's own log."""
 
 IDLE_S = 0.02
 """How often requests are checked while no episode is loaded [s]."""
@@ -251,6 +249,7 @@ class Firmware:
                 path, internals.parameters, now_us, start_unix_us - now_us
             )
             internals.parameters.on_change(log.parameters_changed)
+            internals.logs = LogFolder(path.parent, log)
 
     def _hear(self, message: Message) -> None:
         if self._flight_log is not None and self.simulation is not None:

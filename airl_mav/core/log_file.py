@@ -25,8 +25,14 @@ class LogFile:
         self.path = path
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
+        self._written = 0
         self._flushed_us: int | None = None
         self._file = self.partial_path.open("wb", buffering=0)
+
+    @property
+    def size_bytes(self) -> int:
+        """Size by now, with what is not yet written."""
+        return self._written + len(self._buffer)
 
     @property
     def closed(self) -> bool:
@@ -47,7 +53,9 @@ class LogFile:
         """Write out what is buffered."""
         view = memoryview(bytes(self._buffer))
         while view:
-            view = view[self._file.write(view) :]
+            count = self._file.write(view)
+            self._written += count
+            view = view[count:]
         self._buffer.clear()
 
     def close(self) -> None:

@@ -34,7 +34,7 @@ from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.autopilot.port import Failures
+from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
@@ -81,6 +81,8 @@ class BuiltinAutopilot:
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
         """What makes parts fail at a client's word; set by whoever simulates them."""
+        self.logs: LogStore = NoLogs()
+        """Where clients find the flight logs; whoever writes them sets it."""
         self.on_setpoint: Callable[[Setpoint, int], None] | None = None
         """Called with every accepted setpoint and its time of receipt, if set."""
         self.on_message: Callable[[Message], None] | None = None

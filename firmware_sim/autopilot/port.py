@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
@@ -55,6 +56,58 @@ class Failures(Protocol):
         ...
 
 
+class LogEntry(NamedTuple):
+    """One flight log aboard."""
+
+    utc_s: int
+    """When it began, or was completed [s since 1970]."""
+    size_bytes: int
+
+
+class OpenLog(NamedTuple):
+    """The log that is being written."""
+
+    number: int
+    """Its place in `LogStore.entries`."""
+    head_bytes: int
+    """Size of what describes the log: format, parameters."""
+    size_bytes: int
+    """Size by now; a message ends here."""
+
+
+class LogStore(Protocol):
+    """The flight logs aboard; a log's number is its place in `entries`."""
+
+    def entries(self) -> Sequence[LogEntry]:
+        """Return the logs, oldest first."""
+        ...
+
+    def read(self, number: int, offset: int, count: int) -> bytes:
+        """Return up to `count` bytes of a log, fewer at its end; none when there is no such log."""
+        ...
+
+    def open_log(self) -> OpenLog | None:
+        """Return the log that is being written, None when there is none."""
+        ...
+
+
+class NoLogs:
+    """A vehicle that keeps no logs. Implements `LogStore`."""
+
+    def entries(self) -> Sequence[LogEntry]:
+        """Return nothing."""
+        return ()
+
+    def read(self, number: int, offset: int, count: int) -> bytes:
+        """Return nothing."""
+        del number, offset, count
+        return b""
+
+    def open_log(self) -> None:
+        """Return nothing."""
+        return
+
+
 class AutopilotPort(Protocol):
     """Commands in, state out. Every call happens between two ticks, on one thread."""
 
@@ -71,6 +124,11 @@ class AutopilotPort(Protocol):
     @property
     def failures(self) -> Failures | None:
         """What makes parts fail; None: nobody simulates them."""
+        ...
+
+    @property
+    def logs(self) -> LogStore:
+        """The flight logs aboard."""
         ...
 
     @property

@@ -40,6 +40,8 @@ class FlightLog:
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970].
         """
         self._boot_unix_us = boot_unix_us
+        self.began_unix_us = boot_unix_us + start_us
+        """Calendar time of its beginning [µs since 1970]."""
         self._due_us = [start_us] * len(TOPICS)
         self._last: list[Values | None] = [None] * len(TOPICS)
         self._truth: Truth | None = None
@@ -63,6 +65,21 @@ class FlightLog:
     def partial_path(self) -> Path:
         """The log's name until it is closed."""
         return self._writer.partial_path
+
+    @property
+    def head_bytes(self) -> int:
+        """Size of what stands before the first sample."""
+        return self._writer.head_bytes
+
+    @property
+    def size_bytes(self) -> int:
+        """Size by now; a message ends here."""
+        return self._writer.size_bytes
+
+    @property
+    def closed(self) -> bool:
+        """Whether the log is complete."""
+        return self._writer.closed
 
     def flush(self) -> None:
         """Write out what is buffered, for somebody who reads it now."""

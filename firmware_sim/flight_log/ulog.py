@@ -98,6 +98,8 @@ class UlogWriter(LogFile):
             multi_id = 0
             self._message(b"A", struct.pack("<BH", multi_id, number) + topic.name.encode("ascii"))
         self.flush()
+        self.head_bytes = self.size_bytes
+        """Size of all that stands before the first sample."""
 
     def sample(self, number: int, time_us: int, values: Values) -> None:
         """Add one sample of topic `number`, taken at simulated `time_us` [µs].

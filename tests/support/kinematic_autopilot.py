@@ -27,7 +27,7 @@ from firmware_sim.autopilot.autopilot_state import (
 )
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
-from firmware_sim.autopilot.port import Failures, ParameterValue
+from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
@@ -87,6 +87,7 @@ class KinematicAutopilot:
         self.parameters = parameters or Parameters()
         self.plans = Plans()
         self.failures: Failures | None = None
+        self.logs: LogStore = NoLogs()
         self.time_us = start_us
         self.ready_us = start_us + READY_US
         self.position = np.zeros(3)

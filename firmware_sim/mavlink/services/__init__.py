@@ -11,6 +11,7 @@ from firmware_sim.mavlink.services import (
     commands,
     data_streams,
     ftp,
+    logs,
     missions,
     params,
     peers,
@@ -45,6 +46,11 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "PING": (_for_anyone, peers.handle_ping),
         "TIMESYNC": (_for_anyone, peers.handle_timesync),
         "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, ftp.handle_request),
+        "LOG_REQUEST_LIST": (for_vehicle_or_all, logs.handle_list),
+        "LOG_REQUEST_DATA": (for_vehicle_or_all, logs.handle_data),
+        "LOG_REQUEST_END": (for_vehicle_or_all, logs.handle_end),
+        "LOG_ERASE": (for_vehicle_or_all, logs.handle_erase),
+        "LOGGING_ACK": (for_vehicle_or_all, logs.handle_ack),
         "MISSION_REQUEST_LIST": (missions.is_addressed, missions.handle_list),
         "MISSION_REQUEST": (missions.is_addressed, missions.handle_request),
         "MISSION_REQUEST_INT": (missions.is_addressed, missions.handle_request),
@@ -71,6 +77,7 @@ PENDING: tuple[Callable[[Context], None], ...] = (
     missions.send_pending,
     ftp.send_pending,
     calibration.send_pending,
+    logs.send_pending,
 )
 """Send the next part of what a client is getting piece by piece; once a tick and client."""
 

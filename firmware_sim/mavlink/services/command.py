@@ -18,6 +18,8 @@ class Command:
     """MAV_CMD."""
     params: tuple[float, float, float, float, float, float, float]
     """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
+    sender: tuple[int, int] = (0, 0)
+    """System and component id of who asks."""
     frame: int | None = None
     """MAV_FRAME of a COMMAND_INT."""
 

@@ -15,6 +15,7 @@ from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import (
     calibration,
     failure,
+    logs,
     message_requests,
     standard_modes,
     without_effect,
@@ -89,6 +90,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_SET_HOME: _set_home,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
+    **logs.ACTIONS,
     **message_requests.ACTIONS,
     **calibration.ACTIONS,
     **standard_modes.ACTIONS,
@@ -100,14 +102,14 @@ ACTIONS: dict[int, Action] = {
 def handle_command_long(message: WireMessage, context: Context) -> bool:
     """Carry out and acknowledge a COMMAND_LONG."""
     params = tuple(getattr(message, f"param{number}") for number in range(1, 8))
-    return _handle(message, Command(message.command, params), context)
+    return _handle(Command(message.command, params, sender(message)), context)
 
 
 def handle_command_int(message: WireMessage, context: Context) -> bool:
     """Carry out and acknowledge a COMMAND_INT."""
     four = (message.param1, message.param2, message.param3, message.param4)
     params = (*four, message.x / 1e7, message.y / 1e7, message.z)
-    return _handle(message, Command(message.command, params, message.frame), context)
+    return _handle(Command(message.command, params, sender(message), message.frame), context)
 
 
 def handle_set_mode(message: WireMessage, context: Context) -> bool:
@@ -119,12 +121,12 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _handle(message: WireMessage, command: Command, context: Context) -> bool:
+def _handle(command: Command, context: Context) -> bool:
     action = ACTIONS.get(command.number)
     result = Result.UNSUPPORTED if action is None else action(command, context)
     if result is not None:
         context.link.send(
-            dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *sender(message))
+            dialect.MAVLink_command_ack_message(command.number, result, 0, 0, *command.sender)
         )
     return True
 

@@ -1,0 +1,178 @@
+"""Flight logs: list, download, and the stream of the log that is being written.
+
+Protocol: LOG_REQUEST_LIST and its kin of MAVLink's common set, and MAV_CMD_LOGGING_START with
+LOGGING_DATA(_ACKED), as PX4 1.16 answers them (mavlink_log_handler.cpp, mavlink_ulog.cpp).
+"""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.services.command import Action, Command
+from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.log_transfer import (
+    PIECE_BYTES,
+    LogDownload,
+    LogStream,
+    Piece,
+)
+
+ENTRIES_PER_TICK = 1
+PACKETS_PER_TICK = 8
+"""LOG_DATA of one client: 180 kB a second."""
+PIECES_PER_TICK = 2
+"""LOGGING_DATA of one client: 125 kB a second; the log grows by 25 kB."""
+
+_PACKET_BYTES = 90
+"""LOG_DATA.data."""
+_ACK_TIMEOUT_US = 50_000
+_ACK_TRIES = 50
+"""ulog_stream_ack: ACK_TIMEOUT, ACK_MAX_TRIES."""
+
+
+def send_pending(context: Context) -> None:
+    """Send the next of what a client is getting; call once per tick."""
+    if context.log_listing:
+        _send_entries(context)
+    if context.log_download is not None:
+        _send_data(context, context.log_download)
+    if context.log_stream is not None:
+        _stream(context, context.log_stream)
+
+
+# --- list and download
+
+
+def handle_list(message: WireMessage, context: Context) -> bool:
+    """Begin to send the entries from `start` to `end`."""
+    total = len(context.port.logs.entries())
+    if total == 0:
+        number, size, utc_s, last = 0, 0, 0, 0
+        context.link.send(dialect.MAVLink_log_entry_message(number, 0, last, utc_s, size))
+        return True
+    context.log_listing = range(min(message.start, total - 1), min(message.end, total - 1) + 1)
+    return True
+
+
+def handle_data(message: WireMessage, context: Context) -> bool:
+    """Begin to send a part of a log."""
+    end = message.ofs + message.count
+    context.log_download = LogDownload(message.id, message.ofs, end)
+    return True
+
+
+def handle_end(_message: WireMessage, context: Context) -> bool:
+    """Stop sending."""
+    context.log_listing, context.log_download = range(0), None
+    return True
+
+
+def handle_erase(_message: WireMessage, context: Context) -> bool:
+    """Refuse: a flight's log is its record, which no client may delete."""
+    context.announce(Message(Severity.WARNING, "Logs are not erased: they belong to the run"))
+    return True
+
+
+def _send_entries(context: Context) -> None:
+    entries = context.port.logs.entries()
+    now, rest = context.log_listing[:ENTRIES_PER_TICK], context.log_listing[ENTRIES_PER_TICK:]
+    context.log_listing = rest
+    for number in now:
+        if number < len(entries):
+            entry, total = entries[number], len(entries)
+            context.link.send(
+                dialect.MAVLink_log_entry_message(
+                    number, total, total - 1, entry.utc_s, entry.size_bytes
+                )
+            )
+
+
+def _send_data(context: Context, download: LogDownload) -> None:
+    wanted = min(PACKETS_PER_TICK * _PACKET_BYTES, download.end - download.offset)
+    data = context.port.logs.read(download.number, download.offset, wanted)
+    # A packet that is not full tells the client that the log ends.
+    for at in range(0, max(len(data), 1), _PACKET_BYTES):
+        part = data[at : at + _PACKET_BYTES]
+        context.link.send(
+            dialect.MAVLink_log_data_message(
+                download.number,
+                download.offset + at,
+                len(part),
+                part.ljust(_PACKET_BYTES, b"\0"),
+            )
+        )
+    download.offset += len(data)
+    if len(data) < wanted or download.offset >= download.end:
+        context.log_download = None
+
+
+# --- the stream of the log that is being written
+
+
+def _start(command: Command, context: Context) -> Result:
+    log = context.port.logs.open_log()
+    if log is None:
+        return Result.FAILED
+    context.log_stream = LogStream(log.number, log.head_bytes, command.sender)
+    return Result.ACCEPTED
+
+
+def _stop(_command: Command, context: Context) -> None:
+    """End the stream. PX4 does not acknowledge it."""
+    context.log_stream = None
+
+
+ACTIONS: dict[int, Action] = {
+    dialect.MAV_CMD_LOGGING_START: _start,
+    dialect.MAV_CMD_LOGGING_STOP: _stop,
+}
+
+
+def handle_ack(message: WireMessage, context: Context) -> bool:
+    """Go on behind a piece of the head."""
+    stream = context.log_stream
+    if stream is None or stream.waiting is None or stream.waiting.sequence != message.sequence:
+        return False
+    stream.waiting = None
+    return True
+
+
+def _stream(context: Context, stream: LogStream) -> None:
+    if stream.waiting is not None:
+        if context.now_us - stream.sent_us < _ACK_TIMEOUT_US:
+            return
+        if stream.tries >= _ACK_TRIES:
+            context.log_stream = None
+            return
+        _send_acked(context, stream, stream.waiting)
+        return
+    logs = context.port.logs
+    for _ in range(PIECES_PER_TICK):
+        if stream.in_head:
+            piece = stream.next_piece(logs.read)
+            if piece is not None:
+                stream.waiting, stream.tries = piece, 0
+                _send_acked(context, stream, piece)
+            log = logs.open_log()
+            if not stream.in_head and log is not None:
+                # What was flown before the client asked is for the download.
+                stream.skip_to(log.size_bytes)
+            return
+        piece = stream.next_piece(logs.read)
+        if piece is None:
+            return
+        context.link.send(dialect.MAVLink_logging_data_message(*stream.target, *_fields(piece)))
+
+
+def _send_acked(context: Context, stream: LogStream, piece: Piece) -> None:
+    stream.sent_us, stream.tries = context.now_us, stream.tries + 1
+    context.link.send(dialect.MAVLink_logging_data_acked_message(*stream.target, *_fields(piece)))
+
+
+def _fields(piece: Piece) -> tuple[int, int, int, bytes]:
+    return (
+        piece.sequence,
+        len(piece.data),
+        piece.first_message,
+        piece.data.ljust(PIECE_BYTES, b"\0"),
+    )
