@@ -12,7 +12,7 @@ from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ, TICK_S
-from airl_mav.core.frames import Geodetic, local_to_geodetic
+from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
@@ -31,11 +31,14 @@ from firmware_sim.autopilot.failsafe import FailsafeTimers
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.modes.interface import here
+from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import Place, Request
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -60,6 +63,8 @@ class BuiltinAutopilot:
         """For consistency checks."""
         self._state = self.estimator.state
         self._guidance = Guidance(value, self._say)
+        self._navigator = Navigator(self.plans, value, self)
+        self._guidance.context.return_place = self._return_place
         self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
@@ -78,6 +83,8 @@ class BuiltinAutopilot:
         self._gps: GpsFix | None = None
         self._home: Geodetic | None = None
         self._armed_us = self._takeoff_us = 0
+        self._home_is_chosen = False
+        """Whether a client or a mission has placed home: arming does not move it."""
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
         """What makes parts fail at a client's word; set by whoever simulates them."""
@@ -113,6 +120,8 @@ class BuiltinAutopilot:
                 self._say(due)
             else:
                 self._handle(due)
+        if time_us >= self._navigator.due_us:
+            self._navigate()
         self._demand = self._guidance.demand(self._state, self.flight.phase, time_us)
         if self._demand is not None:
             self._motors = self._controller.fly(self._state, self._demand)
@@ -121,6 +130,45 @@ class BuiltinAutopilot:
             self._controller.rest()
         self._detect_ground(time_us)
         return ActuatorControls(time_us, self._motors, self.flight.phase >= _GROUND)
+
+    def _navigate(self) -> None:
+        situation, flight = self._situation(), self.flight
+        if situation is None:
+            return
+        navigator, context = self._navigator, self._guidance.context
+        armed = flight.phase >= _GROUND
+        navigator.step(situation, flight.mode, self._fenced_place, armed=armed)
+        context.triplet, context.mission_over = navigator.triplet, navigator.mission_over
+
+    def _fenced_place(self) -> Geodetic:
+        """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS."""
+        origin = self.estimator.origin
+        by_gps = self.parameters.value("GF_SOURCE") > 0.0 or origin is None
+        if self._gps is not None and by_gps:
+            return self._gps.position
+        if origin is None:
+            raise RuntimeError("no fix yet: the vehicle is nowhere on the globe")
+        return local_to_geodetic(self._state[P:V], origin)
+
+    def _return_place(self) -> Place:
+        """Return where Return goes: home, or what RTL_TYPE prefers."""
+        context, now = self._guidance.context, self._situation()
+        if now is not None:
+            goal = self._navigator.return_to(
+                now.home, local_to_geodetic(self._state[P:V], now.origin)
+            )
+            if goal != now.home:
+                return Place(now.local(goal), context.home_yaw)
+        return Place(context.home, context.home_yaw)
+
+    def _situation(self) -> Situation | None:
+        """Return what missions go by; None before the first fix."""
+        sample, home, origin = self.sample, self._home, self.estimator.origin
+        if sample is None or home is None or origin is None:
+            return None
+        place = here(self._state)
+        landed = self.flight.phase is not _AIR
+        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin)
 
     def _detect_ground(self, time_us: int) -> None:
         phase = self.flight.phase
@@ -148,12 +196,14 @@ class BuiltinAutopilot:
             return step.result
         asked_for_more = request is not None and step.result is Result.ACCEPTED
         if step.flight.mode is not before.mode or asked_for_more:
+            self._navigator.due_us = 0
             self._guidance.enter(step.flight.mode, self._state, request)
         if step.flight.phase is not before.phase:
             self._note_times(step.flight.phase)
         if before.phase < _GROUND <= step.flight.phase:
             self._failsafe.armed()
-            self._set_home()
+            if not self._home_is_chosen:
+                self._set_home()
             self._guidance.enter(step.flight.mode, self._state)
         return step.result
 
@@ -220,6 +270,8 @@ class BuiltinAutopilot:
         blind = self.flight.mode is Mode.OFFBOARD and not self._failsafe.setpoint_fresh(
             self._now_us
         )
+        if self.flight.mode is Mode.MISSION:
+            blind = not self._navigator.mission_is_valid(self._situation())
         return self._handle(Event.ARM_BLIND if blind and not force else Event.ARM)
 
     def disarm(self, *, force: bool) -> Result:
@@ -246,6 +298,8 @@ class BuiltinAutopilot:
             return self._handle(Ask(mode, self._failsafe.setpoint_fresh(self._now_us)))
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
+        if mode is Mode.MISSION:
+            return self._handle(Ask(mode, self._navigator.mission_is_valid(self._situation())))
         return self._handle(Ask(mode), request)
 
     def change_speed(self, speed_m_s: float) -> None:
@@ -257,7 +311,53 @@ class BuiltinAutopilot:
         if self.estimator.origin is None:
             return Result.TEMPORARILY_REJECTED
         self._set_home()
+        self._home_is_chosen = False
         return Result.ACCEPTED
+
+    def start_mission(self, index: int) -> Result:
+        """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
+        if not self._navigator.mission_is_valid(self._situation()):
+            self.say(Message(Severity.CRITICAL, "Mission start denied! No valid mission"))
+            return Result.DENIED
+        if not -1 <= index < len(self.plans.mission):
+            return Result.DENIED
+        self._handle(Ask(Mode.MISSION))
+        if self.flight.phase < _GROUND and self.arm(force=False) is not Result.ACCEPTED:
+            return Result.TEMPORARILY_REJECTED
+        if index >= 0:
+            self.plans.set_current(index)
+        return Result.ACCEPTED
+
+    # --- towards the mission (navigation.executor.Crew)
+
+    def say(self, message: Message) -> None:
+        """Tell the operator."""
+        self._say(message)
+
+    def set_home(self, place: Geodetic | None) -> Result:
+        """Move home; None = to the present place."""
+        origin = self.estimator.origin
+        if place is None or origin is None:
+            return self.set_home_here()
+        self._home, self._home_is_chosen = place, True
+        north, east, down = geodetic_to_local(place, origin).tolist()
+        self._guidance.context.home = north, east, down
+        self._guidance.context.home_amsl_m = place.altitude_m
+        self._snapshot = None
+        return Result.ACCEPTED
+
+    def look_at(self, place: Geodetic | None) -> None:
+        """Turn to a place while a mission is flown; None = to none."""
+        roi = self._navigator.mission.roi
+        if place is None:
+            roi.reset()
+        else:
+            roi.look_at(place)
+
+    def return_to_launch(self) -> None:
+        """End the mission and return."""
+        self.say(Message(Severity.INFO, "Returning to launch"))
+        self.set_mode(Mode.RETURN)
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
@@ -305,6 +405,7 @@ class BuiltinAutopilot:
             armed_us=self._armed_us,
             takeoff_us=self._takeoff_us,
             mission=progress(self.plans),
+            fence=self._navigator.fence.status,
         )
         return self._snapshot
 

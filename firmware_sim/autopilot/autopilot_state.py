@@ -39,6 +39,7 @@ class Mode(IntEnum):
     POSITION = 5
     """Position Control: only as the offboard-loss fallback. Without a pilot's input PX4 was
     measured to brake and to descend to the ground."""
+    MISSION = 6
 
 
 MODE_NAMES = {
@@ -48,6 +49,7 @@ MODE_NAMES = {
     Mode.LAND: "Land",
     Mode.RETURN: "Return",
     Mode.POSITION: "Position",
+    Mode.MISSION: "Mission",
 }
 """As PX4's texts name them."""
 
@@ -154,6 +156,29 @@ class MissionProgress(NamedTuple):
 NO_MISSION = MissionProgress()
 
 
+class FenceStatus(NamedTuple):
+    """Which limits of the geofence are violated, and how often that began."""
+
+    distance: bool = False
+    """Farther from home than GF_MAX_HOR_DIST."""
+    altitude: bool = False
+    """Higher above home than GF_MAX_VER_DIST."""
+    custom: bool = False
+    """Outside the uploaded fence, or inside what it excludes."""
+    breaches: int = 0
+    """How many there were since boot."""
+    time_us: int = 0
+    """When the newest breach began [µs]."""
+
+    @property
+    def breached(self) -> tuple[bool, bool, bool]:
+        """What is violated now: distance, altitude, custom."""
+        return self.distance, self.altitude, self.custom
+
+
+NO_BREACH = FenceStatus()
+
+
 class AutopilotState(NamedTuple):
     """One consistent snapshot after a tick."""
 
@@ -186,3 +211,4 @@ class AutopilotState(NamedTuple):
     takeoff_us: int = 0
     """When it left the ground [µs], 0 before."""
     mission: MissionProgress = NO_MISSION
+    fence: FenceStatus = NO_BREACH

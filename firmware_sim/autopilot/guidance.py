@@ -53,6 +53,7 @@ class Guidance:
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> AnyDemand | None:
         """Return what to fly now; None = the motors are stopped."""
+        self.context.standing = phase is not _AIR
         if phase is _AIR:
             self._spool_since_us = None
             return self._flown.demand(state, time_us)

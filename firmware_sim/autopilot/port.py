@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from airl_mav.core.frames import Geodetic
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
@@ -164,8 +165,16 @@ class AutopilotPort(Protocol):
         """Set the horizontal speed of the present automatic mode [m/s]."""
         ...
 
-    def set_home_here(self) -> Result:
-        """Make the present position home (MAV_CMD_DO_SET_HOME with param1 = 1)."""
+    def start_mission(self, index: int) -> Result:
+        """Arm and fly the mission from an item on; -1 = as it stands."""
+        ...
+
+    def look_at(self, place: Geodetic | None) -> None:
+        """Turn to a place while a mission is flown; None = to none."""
+        ...
+
+    def set_home(self, place: Geodetic | None) -> Result:
+        """Move home; None = to the present place."""
         ...
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:

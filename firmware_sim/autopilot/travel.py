@@ -42,12 +42,25 @@ class Travel:
         """Begin anew at the vehicle when the next leg is flown."""
         self._time_us = None
 
+    def launch(self, state: Vector, time_us: int, climb_m_s: float) -> None:
+        """Begin at the vehicle, which is about to leave the ground at a climb rate [m/s]."""
+        self._trajectory.restart(_three(state, P), (0.0, 0.0, -climb_m_s))
+        self._yaw, self._yaw_rate, self._wanted_yaw = quat_yaw(state[Q:RATES]), 0.0, None
+        self._time_us = time_us
+
     def fly(
-        self, state: Vector, time_us: int, leg: Leg, *, yaw: float = math.nan
+        self,
+        state: Vector,
+        time_us: int,
+        leg: Leg,
+        *,
+        yaw: float = math.nan,
+        limits: PathLimits | None = None,
     ) -> TrajectoryDemand:
         """Return the demand at a time [µs] on the way along a leg.
 
-        `yaw`: heading [rad]; NaN = towards the target, and at the target as before.
+        `yaw`: heading [rad]; NaN = towards the target, and at the target as before. `limits`: None
+        = those of the parameters.
         """
         position, velocity = _three(state, P), _three(state, V)
         now = quat_yaw(state[Q:RATES])
@@ -59,7 +72,7 @@ class Travel:
             elapsed_s = (time_us - self._time_us) / US_PER_S
         self._time_us = time_us
         path = self._trajectory
-        path.advance(position, leg, self.limits(), elapsed_s)
+        path.advance(position, leg, limits or self.limits(), elapsed_s)
         self._turn(self._heading(position, now, leg.target) if math.isnan(yaw) else yaw, elapsed_s)
         return TrajectoryDemand(
             path.position, path.velocity, path.acceleration, self._yaw, self._yaw_rate

@@ -20,6 +20,7 @@ from firmware_sim.interfaces import SensorSample, Truth
 
 NAVIGATION_STATES: dict[Mode, int] = {
     Mode.POSITION: 2,
+    Mode.MISSION: 3,
     Mode.HOLD: 4,
     Mode.RETURN: 5,
     Mode.OFFBOARD: 14,

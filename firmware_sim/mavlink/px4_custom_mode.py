@@ -18,6 +18,7 @@ _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.RETURN: (MAIN_AUTO, 5),
     Mode.OFFBOARD: (MAIN_OFFBOARD, 0),
     Mode.POSITION: (MAIN_POSCTL, 0),
+    Mode.MISSION: (MAIN_AUTO, 4),
 }
 
 
@@ -26,7 +27,7 @@ def _unavailable(name: str) -> str:
 
 
 # What can be asked for, by main mode, and in AUTO by sub mode. The texts: modes of a real PX4 that
-# need a pilot's input or a mission, known by name, never available.
+# need a pilot's input, known by name, never available.
 _MAIN_MODES: dict[int, Mode | str] = {
     MAIN_OFFBOARD: Mode.OFFBOARD,
     MAIN_POSCTL: Mode.POSITION,
@@ -37,8 +38,7 @@ _MAIN_MODES: dict[int, Mode | str] = {
 }
 _AUTO_MODES: dict[int, Mode | str] = {
     **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO},
-    0: _unavailable("Mission"),
-    4: _unavailable("Mission"),
+    0: Mode.MISSION,
     8: _unavailable("Follow Target"),
     9: _unavailable("Precision Landing"),
     **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},

@@ -7,9 +7,11 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.autopilot_state import Arming
+from firmware_sim.autopilot.autopilot_state import Arming, Result
+from firmware_sim.autopilot.navigation.plan import Kind
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
+from tests.support.mission_kit import at
 
 NAN = math.nan
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
@@ -118,21 +120,22 @@ def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:
     [
         ((1, 1, 0), "Switching to Manual is currently not available"),
         ((1, 7, 0), "Switching to Stabilized is currently not available"),
-        ((1, 4, 4), "Switching to Mission is currently not available"),
-        ((1, 4, 0), "Switching to Mission is currently not available"),
         ((1, 4, 99), "Unsupported auto mode"),
-        ((4, 0, 0), "Switching to Mission is currently not available"),  # base mode: auto
         ((64, 0, 0), "Switching to Manual is currently not available"),
         ((80, 0, 0), "Switching to Stabilized is currently not available"),
     ],
 )
-def test_modes_that_need_a_pilot_or_a_mission(
-    rig: Rig, params: tuple[float, ...], text: str
-) -> None:
+def test_modes_that_need_a_pilot(rig: Rig, params: tuple[float, ...], text: str) -> None:
     result, messages = rig.command(176, *params)
     assert result == REJECTED
     assert text_of(messages) == [(2, text)]
     assert rig.autopilot.commands == []
+
+
+@pytest.mark.parametrize("params", [(1, 4, 4), (1, 4, 0), (4, 0, 0)])
+def test_mission_mode_is_asked_for_in_three_ways(rig: Rig, params: tuple[float, ...]) -> None:
+    assert rig.command(176, *params)[0] == ACCEPTED
+    assert rig.autopilot.commands == ["mode MISSION"]
 
 
 def test_set_mode_message_has_no_acknowledgement(rig: Rig) -> None:
@@ -148,7 +151,27 @@ def test_set_home(rig: Rig) -> None:
     assert rig.command(179, 1)[0] == ACCEPTED
     assert rig.autopilot.home is not None
     assert rig.autopilot.home.altitude_m > ORIGIN.altitude_m + 2.0
-    assert rig.command(179, 0, 0, 0, 0, 47.0, 8.0, 500.0)[0] == DENIED
+    assert rig.command(179, 0, 0, 0, 0, 47.0, 8.0, 500.0)[0] == ACCEPTED
+    assert rig.autopilot.home == (47.0, 8.0, 500.0)
+    assert rig.command(179, 0, 0, 0, 0, 47.0, math.nan, 500.0)[0] == DENIED
+
+
+def test_missions_are_started_and_places_looked_at(rig: Rig) -> None:
+    assert rig.command(300, 0)[0] == DENIED  # none is stored
+    assert rig.command(189)[0] == Result.FAILED
+    rig.autopilot.plans.store(Kind.MISSION, (at(0, 0, 5), at(0, 0, 0, 21)), 1)
+    assert rig.command(300, 0)[0] == ACCEPTED
+    assert rig.command(300, math.nan)[0] == DENIED
+    assert rig.command(189)[0] == ACCEPTED
+    assert rig.autopilot.commands[-2:] == ["mission from 0", "mission from 1"]
+    for number, params, seen in (
+        (195, (0, 0, 0, 0, 47.0, 8.0, 500.0), (47.0, 8.0, 500.0)),
+        (197, (), None),
+        (201, (3, 0, 0, 0, 46.0, 8.0, 500.0), (46.0, 8.0, 500.0)),
+        (201, (0,), None),
+    ):
+        assert rig.command(number, *params)[0] == ACCEPTED
+        assert rig.autopilot.looked_at == seen
 
 
 def test_reboot_is_refused(rig: Rig) -> None:
@@ -158,7 +181,7 @@ def test_reboot_is_refused(rig: Rig) -> None:
     assert rig.command(246, 1)[0] == DENIED
 
 
-@pytest.mark.parametrize("number", [192, 16, 300, 31_000])
+@pytest.mark.parametrize("number", [192, 16, 18, 31_000])
 def test_unknown_commands_are_unsupported(rig: Rig, number: int) -> None:
     assert rig.command(number, 1, 2, 3)[0] == UNSUPPORTED
 

@@ -109,6 +109,7 @@ class KinematicAutopilot:
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
         self.commands: list[str] = []
+        self.looked_at: Geodetic | None = None
         self.requests: list[Request | None] = []
         self.messages: list[Message] = []
         self.offboard_loss_us = US_PER_S
@@ -167,11 +168,18 @@ class KinematicAutopilot:
         self.failsafe = False
         return Result.ACCEPTED
 
-    def set_home_here(self) -> Result:
+    def set_home(self, place: Geodetic | None) -> Result:
         if self.origin is None:
             return Result.TEMPORARILY_REJECTED
-        self.home = local_to_geodetic(self.position, self.origin)
+        self.home = place or local_to_geodetic(self.position, self.origin)
         return Result.ACCEPTED
+
+    def start_mission(self, index: int) -> Result:
+        self.commands.append(f"mission from {index}")
+        return Result.ACCEPTED if self.plans.mission else Result.DENIED
+
+    def look_at(self, place: Geodetic | None) -> None:
+        self.looked_at = place
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         self.setpoints.append((setpoint, time_us))

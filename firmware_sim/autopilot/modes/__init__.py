@@ -9,6 +9,7 @@ from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode
 from firmware_sim.autopilot.modes.land import Land
+from firmware_sim.autopilot.modes.mission import Mission
 from firmware_sim.autopilot.modes.offboard import Offboard
 from firmware_sim.autopilot.modes.position import Position
 from firmware_sim.autopilot.modes.return_to_launch import ReturnToLaunch
@@ -22,6 +23,7 @@ MODES: Mapping[Mode, Callable[[FlightContext], FlightMode]] = MappingProxyType(
         Mode.LAND: Land,
         Mode.RETURN: ReturnToLaunch,
         Mode.POSITION: Position,
+        Mode.MISSION: Mission,
     }
 )
 """What flies each mode."""

@@ -13,6 +13,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
 from firmware_sim.autopilot.requests import Place, Request
 from firmware_sim.autopilot.travel import Travel
 
@@ -43,6 +44,14 @@ class FlightContext:
     """How the automatic modes move."""
     setpoint: Setpoint | None = None
     """The newest offboard setpoint."""
+    return_place: Callable[[], Place] | None = None
+    """Chooses where Return goes; None = home."""
+    triplet: Triplet = STANDING
+    """What Mission mode flies."""
+    mission_over: bool = False
+    """Whether the mission has come to its end."""
+    standing: bool = True
+    """Whether the vehicle stands on the ground."""
 
     def __post_init__(self) -> None:
         self.travel = Travel(self.value)

@@ -1,4 +1,4 @@
-"""Return: climb, fly home, wait if asked to, land.
+"""Return: climb, fly home or to a rally point, wait if asked to, land.
 
 Source: PX4 1.16, RtlDirect and RTL::calculate_return_alt_from_cone_half_angle.
 """
@@ -44,13 +44,16 @@ class ReturnToLaunch(FlightMode):
         """Begin with the climb, if it takes one."""
         context = self._context
         self._home = Place(context.home, context.home_yaw)
+        if context.return_place is not None:
+            self._home = context.return_place()
         self._start = here(state)
         self._waiting_since_us = None
-        height = context.height(state)
+        height = self._height(state)
         at = self._return_height(height, self._away(state))
         self._down = self._home.position[2] - at
         self._stage = _Stage.CLIMB if height < at else _Stage.GO_HOME
-        above_sea = math.ceil(context.home_amsl_m + at)
+        ground = context.home_amsl_m + context.home[2] - self._home.position[2]
+        above_sea = math.ceil(ground + at)
         text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
         context.say(Message(Severity.INFO, text))
 
@@ -67,7 +70,7 @@ class ReturnToLaunch(FlightMode):
             yaw = self._home.yaw if near else math.nan
             return travel.fly(state, time_us, Leg((north, east, self._down)), yaw=yaw)
         if self._stage is _Stage.LAND:
-            speed = landing_speed(self._context.value, self._context.height(state))
+            speed = landing_speed(self._context.value, self._height(state))
             leg = Leg((north, east, math.nan), vertical_m_s=speed)
             return travel.fly(state, time_us, leg, yaw=self._home.yaw)
         leg = Leg((north, east, self._waiting_down))
@@ -103,6 +106,10 @@ class ReturnToLaunch(FlightMode):
     def _land(self) -> None:
         self._stage = _Stage.LAND
         self._context.say(Message(Severity.INFO, "RTL: land at destination"))
+
+    def _height(self, state: Vector) -> float:
+        """Return the height above where it will land [m]."""
+        return self._home.position[2] - state.item(P + 2)
 
     def _away(self, state: Vector) -> float:
         """Return the horizontal distance from home [m]."""

@@ -17,6 +17,7 @@ from firmware_sim.mavlink.services import (
     failure,
     logs,
     message_requests,
+    mission_commands,
     standard_modes,
     without_effect,
 )
@@ -67,12 +68,6 @@ def _set_mode(command: Command, context: Context) -> Result:
     return change_mode(base, main, sub, context)
 
 
-def _set_home(command: Command, context: Context) -> Result:
-    if command.integer(1) == 1:
-        return context.port.set_home_here()
-    return Result.DENIED  # another place than the present one
-
-
 def _reboot(command: Command, _context: Context) -> Result:
     """PX4 SITL has no board to reset: doing nothing is all it accepts, armed or not."""
     return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
@@ -87,12 +82,12 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_NAV_LAND: lambda _, context: context.port.set_mode(Mode.LAND),
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, context: context.port.set_mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
-    dialect.MAV_CMD_DO_SET_HOME: _set_home,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
     **logs.ACTIONS,
     **message_requests.ACTIONS,
     **calibration.ACTIONS,
+    **mission_commands.ACTIONS,
     **standard_modes.ACTIONS,
     **without_effect.ACTIONS,
 }

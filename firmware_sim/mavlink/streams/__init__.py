@@ -46,6 +46,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
+        "FENCE_STATUS": status.fence_status,
         "HOME_POSITION": pose.home_position,
         "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,

@@ -149,6 +149,18 @@ def mission_current(state: AutopilotState) -> Values:
     return mission.current, total, _UNKNOWN_STATE, _UNKNOWN_STATE, *ids
 
 
+def fence_status(state: AutopilotState) -> Values:
+    """What of the geofence is breached; PX4 itself has no such stream, so it is sent on request."""
+    fence = state.fence
+    kind = dialect.FENCE_BREACH_NONE
+    if fence.distance or fence.custom:
+        kind = dialect.FENCE_BREACH_BOUNDARY
+    elif fence.altitude:
+        kind = dialect.FENCE_BREACH_MAXALT
+    breached = int(any(fence.breached))
+    return breached, uint16(fence.breaches), kind, boot_ms(fence.time_us)
+
+
 def autopilot_version(state: AutopilotState) -> Values:  # noqa: ARG001 - a builder
     """The identity and the true capabilities of the built-in autopilot."""
     os_version = vendor = product = 0

@@ -1,0 +1,111 @@
+"""Mission: flies the way that the mission's executor gives it."""
+
+from __future__ import annotations
+
+import math
+
+from airl_mav.control.demand import AnyDemand, Demand
+from airl_mav.core.frames import Vector, quat_yaw
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
+from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.navigation.triplet import Triplet, TripletKind
+from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.trajectory import Leg, PathLimits
+
+_TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
+
+_MOVES_M_S = 0.5
+"""Along its way a vehicle turns from this speed on [m/s] (MPC_YAW_MODE = 3)."""
+
+
+class Mission(FlightMode):
+    """Follows `FlightContext.triplet`, with PX4's speeds at and between waypoints."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._triplet: Triplet | None = None
+
+    @property
+    def lifts(self) -> bool:
+        """Whether the mission leads off the ground."""
+        return self._context.triplet.kind not in (_IDLE, _LAND)
+
+    def enter(self, _state: Vector, _request: Request | None, /) -> None:
+        """Begin; the executor says with what."""
+        self._triplet = None
+
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Fly on."""
+        context = self._context
+        triplet, position, travel = context.triplet, triple(state, P), context.travel
+        if context.standing:
+            # The trajectory begins where the vehicle is once it has left the ground.
+            travel.launch(state, time_us, context.climb.speed_m_s)
+            north, east, _ = position
+            yaw = quat_yaw(state[Q:RATES])
+            return Demand((north, east, math.nan), (math.nan,) * 3, yaw, math.nan)
+        if triplet is not self._triplet:
+            if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
+                travel.speed_m_s = triplet.cruise_m_s
+            self._triplet = triplet
+        yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
+        leg, limits = _leg(triplet, position), self._limits(state)
+        if triplet.kind is _LAND:
+            speed = landing_speed(context.value, context.height(state))
+            north, east, _ = triplet.target
+            leg = Leg((north, east, math.nan), vertical_m_s=speed)
+        return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
+
+    def is_done(self, _state: Vector, /) -> bool:
+        """Return whether the mission is over."""
+        return self._context.mission_over
+
+    def _limits(self, state: Vector) -> PathLimits:
+        value, triplet = self._context.value, self._context.triplet
+        limits = self._context.travel.limits()._replace(acceptance_m=triplet.acceptance_m)
+        if triplet.kind is _TAKEOFF and self._context.height(state) < value("MPC_LAND_ALT1"):
+            speed = value("MPC_TKO_SPEED")
+            gentle = min(limits.up_m_s2, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
+            limits = limits._replace(up_m_s=speed, up_m_s2=gentle)
+        return limits
+
+    def _heading(self, state: Vector) -> float:
+        """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, or as it is near it."""
+        mode, home = round(self._context.value("MPC_YAW_MODE")), self._context.home
+        if mode == 3:
+            north, east, _ = triple(state, V)
+            return math.atan2(east, north) if math.hypot(north, east) > _MOVES_M_S else math.nan
+        if mode not in (1, 2):
+            return math.nan
+        position = triple(state, P)
+        north, east = home[0] - position[0], home[1] - position[1]
+        if math.hypot(north, east) < self._context.triplet.acceptance_m:
+            return math.nan
+        return math.atan2(east, north) if mode == 1 else math.atan2(-east, -north)
+
+
+def _leg(triplet: Triplet, position: Vec) -> Leg:
+    """Return the way to fly; a vehicle beside or beyond its line finds back to it.
+
+    Source: PX4 1.16, FlightTaskAuto::_getCurrentState, _updateInternalWaypoints.
+    """
+    start, target = triplet.previous, triplet.target
+    direct = Leg(target, start, triplet.next)
+    if start is None:
+        return direct
+    line = [b - a for a, b in zip(start, target, strict=True)]
+    length = math.hypot(*line)
+    if length < 1e-6:
+        return direct
+    unit = [c / length for c in line]
+    along = math.fsum(u * (p - s) for u, p, s in zip(unit, position, start, strict=True))
+    if along > length:
+        return Leg(target, position, triplet.next)
+    if along < 0.0 and math.dist(start, position) > triplet.acceptance_m:
+        return Leg(start, position, target)
+    north, east, down = (s + u * along for s, u in zip(start, unit, strict=True))
+    if math.dist((north, east, down), position) > triplet.acceptance_m:
+        return Leg((north, east, down), position, target)
+    return direct

@@ -1,0 +1,381 @@
+"""Flies a stored mission, item by item: PX4's navigator in Mission mode.
+
+Source of the order of events, conditions and texts: PX4 1.16, MissionBase, Mission and
+MissionBlock, as they treat a multicopter. It runs at `PERIOD_US`, as PX4's navigator does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Protocol
+
+from airl_mav.core.frames import Geodetic
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.navigation import jumps
+from firmware_sim.autopilot.navigation.feasibility import Verdict
+from firmware_sim.autopilot.navigation.flown_item import (
+    Arrival,
+    FlownItem,
+    Situation,
+    as_flown,
+)
+from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
+from firmware_sim.autopilot.navigation.roi import RegionOfInterest
+from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet, TripletKind
+
+_N = NavCommand
+NAN = math.nan
+
+PERIOD_US = 50_000
+"""PX4's navigator runs at 20 Hz."""
+
+_LOITERS = (_N.LOITER_UNLIM, _N.LOITER_TIME, _N.LOITER_TO_ALT)
+
+
+class Crew(Protocol):
+    """Who carries out what a mission asks for besides flying."""
+
+    def say(self, message: Message, /) -> None:
+        """Tell the operator."""
+        ...
+
+    def set_home(self, place: Geodetic | None, /) -> object:
+        """Move home; None = to the present place."""
+        ...
+
+    def return_to_launch(self) -> None:
+        """End the mission and return."""
+        ...
+
+
+class _Work(Enum):
+    """What is done for the present item before it is flown itself."""
+
+    ITEM = auto()
+    CLIMB = auto()
+    """To its altitude, at the present place."""
+    MOVE_TO_LAND = auto()
+    """Over the place to land at."""
+
+
+class MissionExecutor:
+    """Goes through the mission; `triplet` is what to fly."""
+
+    def __init__(
+        self,
+        plans: Plans,
+        value: Callable[[str], float],
+        crew: Crew,
+        check: Callable[[Situation], Verdict],
+    ) -> None:
+        """Take the plans, a lookup of parameters, the crew, and the check of feasibility."""
+        self._plans, self._value, self._crew, self._check = plans, value, crew, check
+        self.triplet = STANDING
+        """What to fly."""
+        self.valid = False
+        """Whether there is a mission that can be flown."""
+        self.finished = False
+        """Whether the mission has come to its end, in this run."""
+        self.cruise_m_s = NAN
+        """Speed that DO_CHANGE_SPEED asked for; NaN = MPC_XY_CRUISE."""
+        self.roi = RegionOfInterest()
+        self._running = False
+        self._active = False
+        self._work = _Work.ITEM
+        self._flown = FlownItem(_N.WAYPOINT, (0.0, 0.0, 0.0))
+        self._arrival = Arrival(value)
+        self._climb_down = NAN
+        """Height NED to climb to before the mission begins; NaN = none."""
+        self._began_before = False
+        """Whether this mission has been flown before."""
+        self._disarmed_meanwhile = False
+        self._activated_at = 0
+        self._speed_to_restore = NAN
+        self._seen = (0, 0)
+        self._home_altitude_m = NAN
+        self._checked_for: object = None
+
+    # --- what the autopilot calls
+
+    def idle(self, situation: Situation, *, armed: bool) -> None:
+        """Keep an eye on the plans while another mode flies."""
+        if not armed:
+            self._disarmed_meanwhile = True
+        self._look()
+        self.review(situation)
+
+    def activate(self, situation: Situation) -> None:
+        """Mission mode begins."""
+        plans = self._plans
+        self._look()
+        self._validate(situation)
+        over = len(plans.mission) > 0 and plans.current + 1 == len(plans.mission)
+        if self._disarmed_meanwhile and self._began_before and over:
+            # It has been flown to its end, and the vehicle was disarmed: from the start again.
+            plans.current = 0
+            plans.jumps_done.clear()
+        self._began_before, self._disarmed_meanwhile = True, False
+        self.cruise_m_s = NAN
+        self._active, self.triplet = True, STANDING
+        self._begin(situation.landed)
+        self._speed_to_restore = self._speed_before(plans.current)
+        self._climb_first(situation)
+        self._take_item(situation)
+        self._activated_at = plans.current
+
+    def deactivate(self) -> None:
+        """Another mode begins; the present item is begun anew when the mission goes on."""
+        self._active = self._running = False
+        self._work = _Work.ITEM
+        self._plans.reached = -1
+
+    def update(self, situation: Situation) -> None:
+        """Advance; to be called every PERIOD_US in Mission mode."""
+        if self._look():
+            self.review(situation)
+            self.triplet = STANDING
+            self._begin(situation.landed)
+            self._take_item(situation)
+        self._follow_home(situation)
+        if not math.isnan(self._speed_to_restore) and self._plans.current > self._activated_at:
+            self.cruise_m_s, self._speed_to_restore = self._speed_to_restore, NAN
+        if self._running and self._arrival.is_done(self._flown, self.triplet.target, situation):
+            if self._work is not _Work.CLIMB:
+                self._plans.reached = self._plans.current
+            self._arrival.restart()
+            if self._flown.autocontinue:
+                self._advance(situation)
+        self._look_at_roi(situation)
+
+    # --- the mission as a whole
+
+    def _look(self) -> bool:
+        """Return whether a client has changed the mission or the item to go on with."""
+        plans = self._plans
+        mission = plans.stored(Kind.MISSION)
+        seen = (mission.revision, plans.set_current_count)
+        if seen == self._seen:
+            return False
+        if mission.revision != self._seen[0]:
+            self._began_before = False
+        self._seen = seen
+        return True
+
+    def review(self, situation: Situation) -> None:
+        """Check the mission when it, the fence or home has changed."""
+        revisions = tuple(self._plans.stored(kind).revision for kind in (Kind.MISSION, Kind.FENCE))
+        if (revisions, situation.home) != self._checked_for:
+            self._validate(situation)
+
+    def _validate(self, situation: Situation) -> None:
+        revisions = tuple(self._plans.stored(kind).revision for kind in (Kind.MISSION, Kind.FENCE))
+        self._checked_for = (revisions, situation.home)
+        verdict = self._check(situation)
+        for message in verdict.messages:
+            self._crew.say(message)
+        self.valid = verdict.valid
+
+    def _begin(self, landed: bool) -> None:
+        """Run, or say why not."""
+        self.roi.reset()
+        self.finished = False
+        if not self.valid:
+            self._running = False
+            what = "refusing takeoff" if landed else "loitering"
+            self._say(Severity.CRITICAL, f"No valid mission available, {what}")
+            return
+        if not self._running:
+            self._say(Severity.INFO, "Executing Mission")
+        self._running = True
+        self._work = _Work.ITEM
+        self._plans.reached = -1
+
+    def _climb_first(self, situation: Situation) -> None:
+        """Find out whether the vehicle must climb before it sets out."""
+        self._climb_down = NAN
+        following = jumps.next_places(self._plans, self._plans.current, 1)
+        if self._running and following:
+            down = self._place(following[0], situation)[2]
+            if situation.position[2] - down > self._value("NAV_MC_ALT_RAD"):
+                self._climb_down = down
+
+    def _speed_before(self, index: int) -> float:
+        """Return the speed that the items before an index have set; NaN = none."""
+        speeds = [
+            item.params[1]
+            for item in self._plans.mission[:index]
+            if item.command == _N.DO_CHANGE_SPEED
+        ]
+        return speeds[-1] if speeds and speeds[-1] > 0.0 else NAN
+
+    def _advance(self, situation: Situation) -> None:
+        """Go on to the next item, or end the mission."""
+        if self._work is _Work.ITEM:
+            following = jumps.go_to(self._plans, self._plans.current + 1)
+            if following is None:
+                how = "landed" if situation.landed else "loitering"
+                self._say(Severity.INFO, f"Mission finished, {how}")
+                if self._plans.current + 1 == len(self._plans.mission):
+                    self._plans.jumps_done.clear()
+                self._end(situation)
+                return
+            self._plans.current = following
+        self._take_item(situation)
+
+    def _end(self, situation: Situation) -> None:
+        """Stay where the mission ended."""
+        self._running = False
+        self.finished = True
+        triplet = self.triplet
+        if situation.landed:
+            self.triplet = Triplet(TripletKind.IDLE, situation.position)
+            return
+        target = triplet.target if triplet.kind is TripletKind.LOITER else situation.position
+        self.triplet = Triplet(
+            TripletKind.LOITER, target, yaw=triplet.yaw, acceptance_m=triplet.acceptance_m
+        )
+
+    # --- one item
+
+    def _take_item(self, situation: Situation) -> None:
+        """Work out what to fly for the present item."""
+        if not self._running:
+            self._end(situation)
+            return
+        plans = self._plans
+        item = plans.mission[plans.current]
+        flown = self._flown = as_flown(item, self._place(item, situation))
+        following = jumps.next_places(plans, plans.current + 1, 2)
+        places = [self._place(place, situation) for place in following]
+        work, old = _Work.ITEM, self.triplet
+        if item.has_position:
+            work, first = self._prepare(item, situation)
+            if first is not None:
+                places = [first]
+            self._set_triplet(flown, situation, places)
+        elif item.command == _N.CONDITION_GATE and places:
+            target = Triplet(
+                TripletKind.POSITION, places[0], next=places[1] if len(places) > 1 else None
+            )
+            self.triplet = target._replace(
+                acceptance_m=self._arrival.acceptance_m(flown), cruise_m_s=self.cruise_m_s
+            )
+        if self._work is not _Work.MOVE_TO_LAND and not self.triplet.same_target(old):
+            came_from = old.target if old.kind is not TripletKind.IDLE else None
+            self.triplet = self.triplet._replace(previous=came_from)
+        elif self._work is not _Work.MOVE_TO_LAND:
+            self.triplet = self.triplet._replace(previous=old.previous)
+        self._issue(item, situation)
+        self._work = work
+        self._arrival.restart()
+        self._home_altitude_m = situation.home.altitude_m
+
+    def _prepare(self, item: PlanItem, situation: Situation) -> tuple[_Work, Vec | None]:
+        """Change what is flown into what must come first; return where the item then leads."""
+        flown = self._flown
+        north, east, down = situation.position
+        if item.command in (_N.TAKEOFF, _N.LAND):
+            flown.yaw = NAN
+        if not math.isnan(self._climb_down) and self._work is _Work.ITEM:
+            above_m = -(self._climb_down - situation.local(situation.home)[2])
+            self._say(Severity.INFO, f"Climb to {above_m:.1f} meters above home")
+            then = flown.place
+            flown.command = _N.TAKEOFF if situation.landed else _N.LOITER_TO_ALT
+            flown.place = north, east, self._climb_down
+            flown.yaw, flown.stay_s, flown.autocontinue = NAN, 0.0, True
+            self._climb_down = NAN
+            return _Work.CLIMB, then
+        if item.command == _N.TAKEOFF:
+            flown.command = _N.WAYPOINT
+        away = math.hypot(flown.place[0] - north, flown.place[1] - east)
+        far = away > self._value("NAV_ACC_RAD")
+        if item.command == _N.LAND and not situation.landed and far and self._work is _Work.ITEM:
+            then = flown.place
+            level = self.triplet.target[2] if self.triplet.kind is TripletKind.POSITION else down
+            flown.command, flown.place = _N.WAYPOINT, (then[0], then[1], level)
+            flown.stay_s, flown.acceptance_m, flown.autocontinue = 0.0, 0.0, True
+            self.triplet = self.triplet._replace(previous=None)
+            return _Work.MOVE_TO_LAND, then
+        return _Work.ITEM, None
+
+    def _set_triplet(self, flown: FlownItem, situation: Situation, places: list[Vec]) -> None:
+        if flown.command in _LOITERS:
+            kind = TripletKind.LOITER
+        elif flown.command == _N.LAND:
+            kind = TripletKind.LAND
+        elif flown.command == _N.TAKEOFF and situation.landed:
+            kind = TripletKind.TAKEOFF
+        else:
+            kind = TripletKind.POSITION
+        # A vehicle that stays at the waypoint brakes before it.
+        goes_on = flown.autocontinue and flown.stay_s <= 0.0 and bool(places)
+        self.triplet = Triplet(
+            kind,
+            flown.place,
+            previous=self.triplet.previous,
+            next=places[0] if goes_on else None,
+            yaw=flown.yaw,
+            acceptance_m=self._arrival.acceptance_m(flown),
+            cruise_m_s=self.cruise_m_s,
+        )
+
+    def _place(self, item: PlanItem, situation: Situation) -> Vec:
+        if not (item.has_position or item.command == _N.CONDITION_GATE):
+            return situation.position
+        return situation.local(item.place(situation.home.altitude_m))
+
+    def _follow_home(self, situation: Situation) -> None:
+        """Shift the altitudes that count from home when home has moved."""
+        rise = situation.home.altitude_m - self._home_altitude_m
+        self._home_altitude_m = situation.home.altitude_m
+        plans = self._plans
+        if not rise or math.isnan(rise) or not self._running:
+            return
+        if plans.mission[plans.current].altitude_is_relative:
+            self._flown.place = _raised(self._flown.place, rise)
+            triplet = self.triplet
+            self.triplet = triplet._replace(
+                target=_raised(triplet.target, rise),
+                previous=None if triplet.previous is None else _raised(triplet.previous, rise),
+                next=None if triplet.next is None else _raised(triplet.next, rise),
+            )
+
+    # --- what is not flown
+
+    def _issue(self, item: PlanItem, situation: Situation) -> None:
+        """Carry out an item without a place."""
+        command, params = item.command, item.params
+        self._arrival.issued(situation.time_us)
+        if command == _N.DO_CHANGE_SPEED:
+            self.cruise_m_s = params[1] if params[1] > 0.0 else NAN
+        elif command == _N.RETURN_TO_LAUNCH:
+            self._crew.return_to_launch()
+        elif command == _N.DO_SET_HOME:
+            here = params[0] > 0.5
+            place = Geodetic(item.x, item.y, item.z)
+            if here or all(math.isfinite(value) for value in place):
+                self._crew.set_home(None if here else place)
+        else:
+            self.roi.command(item)
+
+    def _look_at_roi(self, situation: Situation) -> None:
+        """Turn towards what is to be looked at, unless a camera's mount does (MIS_MNT_YAW_CTL)."""
+        turns = self.triplet.kind in (TripletKind.POSITION, TripletKind.LOITER)
+        if not turns or self._value("MIS_MNT_YAW_CTL") > 0.0:
+            return
+        yaw = self.roi.heading(
+            situation.position, self.triplet.target, situation.local, self._value("NAV_ACC_RAD")
+        )
+        if yaw is not None:
+            self._flown.yaw = yaw
+            self.triplet = self.triplet._replace(yaw=yaw)
+
+    def _say(self, severity: Severity, text: str) -> None:
+        self._crew.say(Message(severity, text))
+
+
+def _raised(place: Vec, rise_m: float) -> Vec:
+    return place[0], place[1], place[2] - rise_m

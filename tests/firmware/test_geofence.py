@@ -1,0 +1,211 @@
+"""The geofence: its geometry against an independent method, and what a breach is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from airl_mav.core.frames import Geodetic
+from firmware_sim.autopilot.autopilot_state import Message, Mode
+from firmware_sim.autopilot.navigation.fence import Circle, Polygon, all_allow, areas
+from firmware_sim.autopilot.navigation.fence_monitor import PERIOD_US, FenceMonitor
+from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
+from firmware_sim.autopilot.navigation.rally import destination
+from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
+
+N = NavCommand
+SQUARE = [(-30.0, -30.0), (30.0, -30.0), (30.0, 30.0), (-30.0, 30.0)]
+
+
+def polygon(corners: Sequence[tuple[float, float]], *, inclusion: bool = True) -> list[PlanItem]:
+    command = N.FENCE_POLYGON_VERTEX_INCLUSION if inclusion else N.FENCE_POLYGON_VERTEX_EXCLUSION
+    return [at(north, east, 0, command, len(corners)) for north, east in corners]
+
+
+def circle(north: float, east: float, radius: float, *, inclusion: bool = True) -> PlanItem:
+    command = N.FENCE_CIRCLE_INCLUSION if inclusion else N.FENCE_CIRCLE_EXCLUSION
+    return at(north, east, 0, command, radius)
+
+
+def winding(corners: Sequence[tuple[float, float]], point: tuple[float, float]) -> float:
+    """Return how often a polygon goes round a point: the sum of angles, in turns."""
+    angles = [math.atan2(y - point[1], x - point[0]) for x, y in corners]
+    turns = np.diff([*angles, angles[0]])
+    return float(np.sum((turns + math.pi) % (2.0 * math.pi) - math.pi) / (2.0 * math.pi))
+
+
+def edge_distance(
+    corners: Sequence[tuple[float, float]], point: tuple[float, float]
+) -> list[float]:
+    """Return the distance of a point to each edge."""
+    found = []
+    for (ax, ay), (bx, by) in zip(corners, [*corners[1:], corners[0]], strict=True):
+        dx, dy = bx - ax, by - ay
+        share = ((point[0] - ax) * dx + (point[1] - ay) * dy) / (dx * dx + dy * dy)
+        share = min(1.0, max(0.0, share))
+        found.append(math.hypot(point[0] - ax - share * dx, point[1] - ay - share * dy))
+    return found
+
+
+@given(
+    radii=st.lists(st.floats(0.2, 1.0), min_size=3, max_size=12),
+    point=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+)
+def test_polygons_hold_what_they_go_round(radii: list[float], point: tuple[float, float]) -> None:
+    """Star-shaped polygons, against the winding number."""
+    angles = [2.0 * math.pi * i / len(radii) for i in range(len(radii))]
+    corners = [(r * math.cos(a), r * math.sin(a)) for r, a in zip(radii, angles, strict=True)]
+    assume(min(edge_distance(corners, point)) > 1e-6)
+    turns = abs(winding(corners, point))
+    assert Polygon(tuple(corners), inclusion=True).contains(*point) == (turns > 0.5)
+
+
+@given(bearing=st.floats(0.0, 2.0 * math.pi), radius=st.floats(1.0, 5000.0))
+def test_circles_hold_what_is_nearer_than_their_radius(bearing: float, radius: float) -> None:
+    round_ = Circle((ORIGIN.latitude_deg, ORIGIN.longitude_deg), radius, inclusion=True)
+    for share, inside in ((0.99, True), (1.01, False)):
+        north, east = share * radius * math.cos(bearing), share * radius * math.sin(bearing)
+        where = place(north, east)
+        assert round_.contains(where.latitude_deg, where.longitude_deg) is inside
+
+
+def test_a_stored_fence() -> None:
+    items = [
+        *polygon(SQUARE),
+        at(0, 0, 0, N.FENCE_RETURN_POINT),
+        *polygon([(5, 5), (15, 5), (10, 15)], inclusion=False),
+        circle(0, 0, 40),
+        circle(-20, 0, 5, inclusion=False),
+        at(0, 0, 0, N.WAYPOINT),
+    ]
+    fence = list(areas(items))
+    assert [type(area).__name__ for area in fence] == ["Polygon", "Polygon", "Circle", "Circle"]
+    allowed = {(0, 0): True, (29, 0): True, (31, 0): False, (10, 8): False, (-20, 3): False}
+    assert {p: all_allow(fence, place(*p)) for p in allowed} == allowed
+    # In the square, but beyond the circle.
+    assert not all_allow(fence, place(29, 29))
+
+
+class Watch:
+    """A monitor and a vehicle that is moved by hand."""
+
+    def __init__(self, *items: PlanItem, landed: bool = False, **parameters: float) -> None:
+        self.values = {**DEFAULTS, **parameters}
+        self.plans, self.texts = Plans(), list[str]()
+        self.monitor = FenceMonitor(self.plans, self.values.__getitem__, self._say)
+        self.now = Situation(0, (0.0, 0.0, -10.0), 0.0, landed, ORIGIN, ORIGIN)
+        if items:
+            self.plans.store(Kind.FENCE, items, 1)
+
+    def _say(self, message: Message) -> None:
+        self.texts.append(message.text)
+
+    def at(
+        self, north: float, east: float, up: float = 10.0, mode: Mode = Mode.OFFBOARD
+    ) -> tuple[bool, bool, bool]:
+        self.now = self.now._replace(time_us=self.now.time_us + PERIOD_US)
+        self.monitor.step(self.now, mode, lambda: place(north, east, up))
+        return self.monitor.status.breached
+
+
+def test_each_limit_is_told_apart() -> None:
+    watch = Watch(*polygon(SQUARE), GF_MAX_HOR_DIST=25.0, GF_MAX_VER_DIST=20.0, GF_ACTION=1)
+    assert watch.at(0, 0) == (False, False, False)
+    assert watch.at(26, 0) == (True, False, False)
+    assert watch.at(31, 0) == (True, False, True)
+    assert watch.at(0, 0, 21) == (False, True, False)
+    assert watch.at(0, 0) == (False, False, False)
+    assert watch.monitor.status.breaches == 1
+
+
+def test_it_is_checked_every_fifth_of_a_second() -> None:
+    watch = Watch(*polygon(SQUARE), GF_ACTION=1)
+    watch.at(0, 0)
+    asked = []
+    for step in range(1, 11):
+        now = watch.now._replace(time_us=watch.now.time_us + step * 50_000)
+        watch.monitor.step(now, Mode.OFFBOARD, lambda: asked.append(1) or place(0, 0))  # type: ignore[func-returns-value]
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("action", [0, 1])
+def test_without_action_nothing_is_a_breach(action: int) -> None:
+    watch = Watch(*polygon(SQUARE), GF_ACTION=action)
+    watch.at(0, 0)
+    assert any(watch.at(50, 0)) is bool(action)
+
+
+def test_a_breach_that_made_it_hold_lasts_as_long_as_it_holds() -> None:
+    watch = Watch(*polygon(SQUARE), GF_ACTION=2)
+    watch.at(0, 0)
+    assert any(watch.at(31, 0))
+    for _ in range(3):
+        assert any(watch.at(29, 0, mode=Mode.HOLD))
+    assert not any(watch.at(29, 0, mode=Mode.OFFBOARD))
+    assert not any(watch.at(29, 0, mode=Mode.OFFBOARD))
+
+
+def test_areas_that_home_or_the_flying_vehicle_violates_are_left_out() -> None:
+    watch = Watch(circle(100, 0, 20), circle(0, 0, 30), GF_ACTION=2)
+    watch.at(0, 0)
+    assert watch.texts == ["Geofence invalid, doesn't contain Home position"]
+    assert not any(watch.at(29, 0))
+    assert any(watch.at(31, 0))
+    watch = Watch(circle(0, 0, 30), GF_ACTION=2)
+    watch.at(40, 0)
+    assert watch.texts == ["Geofence invalid, doesn't contain current vehicle position"]
+    assert not any(watch.at(45, 0))
+    assert not Watch(circle(0, 0, 30), GF_ACTION=2, landed=True).texts
+
+
+def test_missions_are_checked_against_it() -> None:
+    watch = Watch(*polygon(SQUARE), GF_MAX_VER_DIST=20.0)
+    watch.at(0, 0)
+    allowed = [
+        watch.monitor.inside(place(*p), ORIGIN) for p in ((0, 0, 10), (31, 0, 10), (0, 0, 25))
+    ]
+    assert allowed == [True, False, False]
+
+
+# --- rally points
+
+LAND = at(0, 90, 0, N.LAND)
+
+
+@pytest.mark.parametrize(
+    ("kind", "here", "expected"),
+    [
+        (0, (10, 0), (0, 0)),
+        (0, (60, 0), (100, 0)),
+        (0, (49.5, 0), (0, 0)),  # not nearer by 2 m
+        (1, (30, 0), (100, 0)),
+        (1, (0, 80), (0, 90)),
+        (2, (90, 0), (0, 90)),
+        (3, (0, 80), (0, 90)),
+        (3, (0, 10), (0, 0)),
+        (0, (0, 80), (0, 0)),  # the mission's landing is not asked for
+    ],
+)
+def test_return_goes_to_the_nearest_place(
+    kind: int, here: tuple[float, float], expected: tuple[float, float]
+) -> None:
+    plans = Plans()
+    plans.store(Kind.MISSION, (at(20, 0, 10), LAND), 1)
+    rally = (at(4, 0, 0, N.RALLY_POINT), at(100, 0, 3, N.RALLY_POINT))  # the first is home's
+    plans.store(Kind.RALLY, rally, 1)
+    found = destination(plans, ORIGIN, place(*here, 20.0), kind)
+    wanted = place(*expected)
+    assert found[:2] == pytest.approx(wanted[:2], abs=1e-9)
+    ground = ORIGIN.altitude_m + (3.0 if expected == (100, 0) else 0.0)
+    assert found.altitude_m == pytest.approx(ground)
+
+
+def test_return_goes_home_where_there_is_nothing_else() -> None:
+    for kind in (0, 1, 2, 3, 9):
+        assert destination(Plans(), ORIGIN, Geodetic(47.0, 8.0, 500.0), kind) == ORIGIN
