@@ -1,0 +1,67 @@
+"""Twenty clients at 50 Hz with parameter downloads: everybody is answered, nobody is forgotten."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+
+from pymavlink.dialects.v20 import common as dialect
+
+from airl_mav.core.constants import TICK_US, US_PER_S
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
+from tests.support.kinematic_autopilot import KinematicAutopilot
+from tests.support.memory_hub import MemoryHub
+
+CLIENTS = 20
+SECONDS = 3
+EVERY = 5
+"""Ticks between two commands of a client: 50 Hz."""
+
+ACK, PARAM, ATTITUDE = (
+    number.to_bytes(3, "little")
+    for number in (
+        dialect.MAVLINK_MSG_ID_COMMAND_ACK,
+        dialect.MAVLINK_MSG_ID_PARAM_VALUE,
+        dialect.MAVLINK_MSG_ID_ATTITUDE,
+    )
+)
+
+
+def test_twenty_clients_at_50_hz_with_parameter_downloads() -> None:
+    hub, autopilot = MemoryHub(), KinematicAutopilot()
+    server = MavlinkServer(
+        [onboard_link(MemoryEndpoint()), gcs_link(hub)], autopilot, boot_unix_us=0
+    )
+    # Each is a system of its own, so that an answer names who asked.
+    clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]
+    ticks = SECONDS * US_PER_S // TICK_US
+    sent = 0
+    for tick in range(ticks):
+        for n, client in enumerate(clients):
+            if tick % EVERY == n % EVERY:
+                client.command(512, dialect.MAVLINK_MSG_ID_MESSAGE_INTERVAL, 30)
+                sent += 1
+            if tick == 10 + n:
+                client.send(dialect.MAVLink_param_request_list_message(1, 1))
+        server.receive(autopilot.time_us)
+        autopilot.step()
+        server.send(autopilot.time_us)
+    size = len(autopilot.parameters)
+    answered = 0
+    for n, client in enumerate(clients):
+        # By the bytes: pymavlink would take longer to read them all than the vehicle to send.
+        frames = [frame for frame in client.endpoint.take() if frame[5:7] == b"\1\1"]
+        count = Counter(frame[7:10] for frame in frames)
+        assert count[PARAM] == size + 1  # with the hash
+        assert count[ATTITUDE] >= 50 * SECONDS - 5
+        assert all((b[4] - a[4]) % 256 == 1 for a, b in pairwise(frames))  # nothing is lost
+        for frame in frames:
+            if frame[7:10] == ACK:
+                (ack,) = client.mav.parse_buffer(frame)
+                assert (ack.target_system, ack.result) == (100 + n, 0)
+                answered += 1
+    counters = server.counters()["gcs"]
+    assert answered == sent == CLIENTS * ticks // EVERY
+    assert (counters.dropped, counters.malformed, counters.send_errors) == (0, 0, 0)
