@@ -68,7 +68,7 @@ class Signing:
         if key is not None and len(key) != KEY_BYTES:
             raise ValueError(f"a key of {len(key)} bytes: must have {KEY_BYTES}")
         self.key = key
-        self.timestamp = min(timestamp, _LAST - 1)
+        self.timestamp = min(timestamp, _LAST)
         self._streams.clear()
         if key is not None:
             self._began = hashlib.sha256(key).copy
@@ -78,7 +78,7 @@ class Signing:
         """Return an unsigned MAVLink 2 frame with a signature; as it is where there is no key."""
         if self.key is None or frame[0] != _MARKER or frame[2] & _SIGNED:
             return frame
-        self.timestamp = max(self.timestamp + 1, self._now())
+        self.timestamp = min(max(self.timestamp + 1, self._now()), _LAST)
         length = frame[1]
         crc = int.from_bytes(frame[-_CHECKSUM:], "little") ^ _flag_in_checksum(length)
         covered = b"".join(
@@ -131,7 +131,7 @@ class Signing:
         return digest.digest()[:6]
 
     def _now(self) -> int:
-        return min(max(0, (self._calendar_us() - EPOCH_UNIX_US) // UNIT_US), _LAST - 1)
+        return min(max(0, (self._calendar_us() - EPOCH_UNIX_US) // UNIT_US), _LAST)
 
 
 @functools.cache

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from fuzz_mavlink import fly
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
@@ -172,3 +173,9 @@ def test_the_same_bytes_twice_give_the_same_answers() -> None:
 
     run: Callable[[], list[bytes]] = answers
     assert run() == run()
+
+
+def test_hostile_frames_of_all_services_in_flight() -> None:
+    """`scripts/fuzz_mavlink.py --frames 10000000` is the long one."""
+    frames = 16_000
+    assert fly(seed=1, frames=frames) > frames // 3  # they do reach the services

@@ -138,6 +138,14 @@ def test_time_stamps_only_rise_and_follow_the_newest_heard() -> None:
     assert int.from_bytes(frame[-12:-6], "little") == NOW + 501
 
 
+def test_the_last_time_stamp_breaks_nothing() -> None:
+    ours, plain = signing(), dialect.MAVLink(None, 1, 1)
+    for stamp in (2**48 - 2, 2**48 - 1, 2**64 - 1):
+        ours.change(KEY, stamp)
+        frames = [ours.sign(messages()[0].pack(plain), 0) for _ in range(4)]
+        assert frames[-1][-12:-6] == b"\xff" * 6
+
+
 def test_senders_are_bounded() -> None:
     ours = signing()
     accepted = 0

@@ -110,7 +110,12 @@ _SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
 
 
 def send_stream(name: str, context: Context) -> Result:
-    """Send one of the streamed messages now; DENIED when it has nothing to say."""
+    """Send one of the streamed messages now; DENIED when it has nothing to say.
+
+    UNSUPPORTED for a message that there is not.
+    """
+    if name not in context.link.builders:
+        return Result.UNSUPPORTED
     sent = context.link.send_stream(name, context.port.state())
     return Result.ACCEPTED if sent else Result.DENIED
 
