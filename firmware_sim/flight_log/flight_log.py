@@ -8,8 +8,9 @@ from pathlib import Path
 from airl_mav.core.constants import TICK_US
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import ParameterStore
-from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
+from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS
 from firmware_sim.flight_log.ulog import UlogWriter, Values
+from firmware_sim.flight_log.values import Moment, sensor_combined
 from firmware_sim.interfaces import SensorSample, Truth
 
 GRID_US = 5 * TICK_US

@@ -20,8 +20,9 @@ from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.flight_log.flight_log import GRID_US
-from firmware_sim.flight_log.topics import NAVIGATION_STATES, TOPICS
+from firmware_sim.flight_log.topics import TOPICS
 from firmware_sim.flight_log.ulog import Topic, UlogWriter
+from firmware_sim.flight_log.values import NAVIGATION_STATES
 
 ANSWER = Topic("answer", ("float[3] xyz", "int16_t number", "bool right", "double exact"))
 

@@ -1,0 +1,242 @@
+"""The values of what is logged, by the fields of `topics`."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.frames import local_to_geodetic, quat_yaw
+from airl_mav.vehicle import atmosphere
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
+from firmware_sim.flight_log.ulog import Values
+from firmware_sim.interfaces import SensorSample, Truth
+
+NAVIGATION_STATES: dict[Mode, int] = {
+    Mode.POSITION: 2,
+    Mode.MISSION: 3,
+    Mode.HOLD: 4,
+    Mode.RETURN: 5,
+    Mode.OFFBOARD: 14,
+    Mode.TAKEOFF: 17,
+    Mode.LAND: 18,
+}
+"""VehicleStatus.nav_state (NAVIGATION_STATE_*) of each mode."""
+
+_DISARMED, _ARMED = 1, 2
+"""VehicleStatus.arming_state."""
+
+_ROTARY_WING = 1
+"""VehicleStatus.vehicle_type."""
+
+MOTORS = 12
+"""ActuatorMotors.NUM_CONTROLS: those that do not exist are NaN."""
+
+_UNUSED_MOTORS = (math.nan,) * (MOTORS - 4)
+_NO_VECTOR = (math.nan, math.nan, math.nan)
+_UNKNOWN = math.nan
+
+
+class Moment(NamedTuple):
+    """What a vehicle and its simulator know after a tick."""
+
+    state: AutopilotState
+    truth: Truth
+    unix_us: int
+    """Calendar time [µs since 1970]."""
+
+
+def sensor_combined(sample: SensorSample) -> Values:
+    """Return the newest IMU sample, raw: FRD [rad/s], [m/s²]."""
+    offset_us, clipping = 0, (0, 0)
+    return (*sample.gyro.tolist(), TICK_US, offset_us, *sample.accel.tolist(), TICK_US, *clipping)
+
+
+def angular_velocity(moment: Moment) -> Values:
+    """Return the estimated body rates FRD [rad/s]."""
+    estimate = moment.state.estimate
+    return estimate.time_us, *estimate.angular_velocity.tolist()
+
+
+def rates_setpoint(moment: Moment) -> Values:
+    """Return the wanted body rates FRD [rad/s] and thrust, body -1..0."""
+    state = moment.state
+    return *state.rate_setpoint.tolist(), 0.0, 0.0, -state.thrust_setpoint
+
+
+def attitude(moment: Moment) -> Values:
+    """Return the estimated attitude, body -> NED."""
+    estimate = moment.state.estimate
+    return estimate.time_us, *estimate.quaternion.tolist()
+
+
+def true_attitude(moment: Moment) -> Values:
+    """Return the true attitude, body -> NED."""
+    return moment.truth.time_us, *moment.truth.quaternion.tolist()
+
+
+def attitude_setpoint(moment: Moment) -> Values:
+    """Return the wanted yaw rate [rad/s], attitude and thrust."""
+    state = moment.state
+    yaw_rate = state.setpoint.yaw_rate
+    moved = 0.0 if math.isnan(yaw_rate) else yaw_rate
+    return moved, *state.attitude_setpoint.tolist(), 0.0, 0.0, -state.thrust_setpoint
+
+
+def acceleration(moment: Moment) -> Values:
+    """Return the specific force without its estimated bias, FRD [m/s²]."""
+    state = moment.state
+    return state.time_us, *(state.accel - state.estimate.accel_bias).tolist()
+
+
+def local_position(moment: Moment) -> Values:
+    """Return the estimated position [m] and velocity [m/s], NED, and how sure they are."""
+    state = moment.state
+    estimate, origin = state.estimate, state.origin
+    sigma = estimate.sigma.tolist()
+    known = origin is not None
+    reference = (math.nan, math.nan, math.nan) if origin is None else origin
+    velocity, healthy = estimate.velocity.tolist(), bool(estimate.healthy)
+    return (
+        estimate.time_us,
+        *reference[:2],
+        *estimate.position.tolist(),
+        *velocity,
+        velocity[2],
+        *estimate.acceleration.tolist(),
+        quat_yaw(estimate.quaternion),
+        reference[2],
+        math.hypot(*sigma[0:2]),
+        sigma[2],
+        math.hypot(*sigma[3:5]),
+        sigma[5],
+        *(healthy,) * 4,
+        *(known and healthy,) * 2,
+    )
+
+
+def true_local_position(moment: Moment) -> Values:
+    """Return the true position [m] and velocity [m/s], NED."""
+    truth = moment.truth
+    velocity = truth.velocity.tolist()
+    heading = quat_yaw(truth.quaternion)
+    return truth.time_us, *truth.position.tolist(), *velocity, velocity[2], heading, *(True,) * 4
+
+
+def local_position_setpoint(moment: Moment) -> Values:
+    """Return what the controller tracks, NED."""
+    setpoint = moment.state.setpoint
+    position, velocity = setpoint.position.tolist(), setpoint.velocity.tolist()
+    return (*position, *velocity, *_NO_VECTOR, *_NO_VECTOR, setpoint.yaw, setpoint.yaw_rate)
+
+
+def motors(moment: Moment) -> Values:
+    """Return the motor commands 0..1; NaN while disarmed."""
+    state = moment.state
+    armed = state.status.arming is Arming.ARMED
+    motors = state.motors if armed else (math.nan,) * 4
+    return state.time_us, *motors, *_UNUSED_MOTORS, 0
+
+
+def gps(moment: Moment) -> Values | None:
+    """Return the newest GPS fix."""
+    fix = moment.state.gps
+    if fix is None:
+        return None
+    latitude, longitude, altitude = fix.position
+    north, east, down = fix.velocity_ned.tolist()
+    return (
+        moment.state.time_us,
+        latitude,
+        longitude,
+        altitude,
+        altitude,
+        moment.unix_us,
+        fix.eph_m,
+        fix.epv_m,
+        math.hypot(north, east, down),
+        north,
+        east,
+        down,
+        math.atan2(east, north),
+        fix.fix_type,
+        True,
+        fix.satellites,
+    )
+
+
+def global_position(moment: Moment) -> Values | None:
+    """Return the estimated position on the globe."""
+    state = moment.state
+    estimate, origin = state.estimate, state.origin
+    if origin is None or not estimate.healthy:
+        return None
+    latitude, longitude, altitude = local_to_geodetic(estimate.position, origin)
+    sigma = estimate.sigma.tolist()
+    accuracy = math.hypot(*sigma[0:2]), sigma[2]
+    return estimate.time_us, latitude, longitude, altitude, altitude, *accuracy, True, True
+
+
+def air_data(moment: Moment) -> Values | None:
+    """Return the pressure [Pa] and the altitude that it means [m]."""
+    state = moment.state
+    if not math.isfinite(state.pressure_hpa):
+        return None
+    altitude = atmosphere.altitude_m(state.pressure_hpa)
+    pa_per_hpa = 100.0
+    return state.time_us, altitude, state.temperature_c, pa_per_hpa * state.pressure_hpa
+
+
+def magnetometer(moment: Moment) -> Values:
+    """Return the newest magnetic field FRD [gauss]."""
+    return moment.state.time_us, *moment.state.mag.tolist()
+
+
+def battery(moment: Moment) -> Values:
+    """Return the battery as its power module tells it."""
+    voltage, current, consumed, remaining = moment.state.battery
+    connected, number = True, 1
+    return voltage, current, consumed, remaining, 1.0, _UNKNOWN, connected, number
+
+
+def estimator_status(moment: Moment) -> Values:
+    """Return accuracies [m] and innovation test ratios."""
+    estimate = moment.state.estimate
+    sigma, ratio = estimate.sigma.tolist(), estimate.innovation_ratio.tolist()
+    horizontal, height, heading, vertical = ratio
+    accuracy = math.hypot(*sigma[0:2]), sigma[2]
+    # PX4's EKF leaves the last two at 0, too.
+    health, timeouts = 0, 0
+    tests = heading, max(horizontal, vertical), horizontal, height
+    return estimate.time_us, *accuracy, *tests, health, timeouts
+
+
+def status(moment: Moment) -> Values:
+    """Return the arming state and the flight mode."""
+    status = moment.state.status
+    return (
+        _ARMED if status.arming is Arming.ARMED else _DISARMED,
+        NAVIGATION_STATES[status.intended_mode],
+        NAVIGATION_STATES[status.mode],
+        _ROTARY_WING,
+        status.failsafe,
+        status.arming is not Arming.BOOT,
+    )
+
+
+def armed(moment: Moment) -> Values:
+    """Return whether the vehicle is armed, and may be."""
+    arming = moment.state.status.arming
+    return arming is Arming.ARMED, arming is not Arming.BOOT
+
+
+def land_detected(moment: Moment) -> Values:
+    """Return whether the vehicle stands on the ground."""
+    landed = moment.state.status.landed is Landed.ON_GROUND
+    return landed, landed, landed
+
+
+def home(moment: Moment) -> Values | None:
+    """Return the home position."""
+    home = moment.state.home
+    return None if home is None else (*home, True, True)
