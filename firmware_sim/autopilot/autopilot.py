@@ -11,7 +11,7 @@ from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
-from airl_mav.core.constants import TICK_HZ, TICK_S
+from airl_mav.core.constants import TICK_HZ, TICK_S, US_PER_S
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
@@ -46,6 +46,9 @@ _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 
+REFUSAL_US = 2 * US_PER_S
+"""A setpoint that was refused within this time explains the loss of offboard [µs]."""
+
 
 class BuiltinAutopilot:
     """Implements `FlightController` towards the plant and `port.AutopilotPort` to MAVLink."""
@@ -73,6 +76,8 @@ class BuiltinAutopilot:
         """The commander's state."""
         self._status = _status(self.flight)
         self._messages: list[Message] = []
+        self._refusal = ("", 0)
+        """Why a setpoint was refused last, and when [µs]."""
         self._demand: AnyDemand | None = None
         """What is being flown; None = the motors are stopped."""
         self._motors = _STILL
@@ -192,6 +197,8 @@ class BuiltinAutopilot:
         self._snapshot = None
         if step.text is not None:
             self._say(step.text)
+        if step.flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
+            self._explain_loss()
         if self.sample is None:
             return step.result
         asked_for_more = request is not None and step.result is Result.ACCEPTED
@@ -216,6 +223,12 @@ class BuiltinAutopilot:
             self._armed_us = now_us
         if phase is _AIR and self._takeoff_us == 0:
             self._takeoff_us = now_us
+
+    def _explain_loss(self) -> None:
+        """Say which setpoints were refused lately, if any."""
+        reason, refused_us = self._refusal
+        if reason and self._now_us - refused_us <= REFUSAL_US:
+            self._say(Message(Severity.WARNING, f"Offboard setpoints refused: {reason}"))
 
     def _say(self, message: Message) -> None:
         self._messages.append(message)
@@ -365,6 +378,15 @@ class BuiltinAutopilot:
         self._failsafe.setpoint(time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint, time_us)
+
+    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
+        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
+        self._guidance.context.setpoint = demand
+        self._failsafe.setpoint(time_us)
+
+    def refuse_setpoint(self, reason: str, time_us: int) -> None:
+        """Note why an offboard setpoint was refused: the failsafe that follows names it."""
+        self._refusal = reason, time_us
 
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""

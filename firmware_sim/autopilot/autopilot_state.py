@@ -106,6 +106,7 @@ class Setpoint(NamedTuple):
     wire: tuple[float, float, float, float] = (math.nan, math.nan, math.nan, math.nan)
     """Velocity and yaw rate (or yaw, where no rate is commanded) exactly as received: what latency
     analysis recognises a message by."""
+    acceleration: Vector = np.full(3, math.nan)  # (3,) NED [m/s²]
 
 
 class Estimate(NamedTuple):

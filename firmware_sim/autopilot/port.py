@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import Geodetic
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
@@ -179,6 +180,14 @@ class AutopilotPort(Protocol):
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
+        ...
+
+    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
+        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
+        ...
+
+    def refuse_setpoint(self, reason: str, time_us: int) -> None:
+        """Note why an offboard setpoint was refused: the failsafe that follows names it."""
         ...
 
     def gcs_heartbeat(self, time_us: int) -> None:

@@ -119,14 +119,13 @@ def test_home_can_be_moved_to_where_the_vehicle_is() -> None:
         assert away(rig, *home[:2]) < 0.8
 
 
-def test_nan_is_no_velocity_on_that_axis() -> None:
+def test_a_setpoint_that_leaves_an_axis_open_hovers() -> None:
     with flight(0) as rig:
         rig.take_off(3.0, settle_s=1.0)
         rig.go_offboard(velocity_setpoint(NAN, 1.0, 0.0))
         rig.run(3.0)
         assert rig.mode is Mode.OFFBOARD
-        assert abs(rig.truth.velocity[0]) < 0.1
-        assert rig.truth.velocity[1] == pytest.approx(1.0, abs=0.1)
+        assert np.abs(rig.truth.velocity).max() < 0.15
 
 
 def test_heading_is_held_when_none_is_commanded() -> None:

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
 from firmware_sim.autopilot.autopilot_state import (
@@ -111,6 +112,8 @@ class KinematicAutopilot:
         self.commands: list[str] = []
         self.looked_at: Geodetic | None = None
         self.requests: list[Request | None] = []
+        self.attitudes: list[tuple[AttitudeDemand | RateDemand, int]] = []
+        self.refusals: list[tuple[str, int]] = []
         self.messages: list[Message] = []
         self.offboard_loss_us = US_PER_S
         self.frozen = False
@@ -183,6 +186,12 @@ class KinematicAutopilot:
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         self.setpoints.append((setpoint, time_us))
+
+    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
+        self.attitudes.append((demand, time_us))
+
+    def refuse_setpoint(self, reason: str, time_us: int) -> None:
+        self.refusals.append((reason, time_us))
 
     def gcs_heartbeat(self, time_us: int) -> None:
         self.gcs_heartbeats.append(time_us)

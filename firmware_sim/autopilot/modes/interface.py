@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from airl_mav.control.demand import AnyDemand, Demand
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint
@@ -42,7 +42,7 @@ class FlightContext:
     """Altitude of home above mean sea level [m]."""
     travel: Travel = field(init=False)
     """How the automatic modes move."""
-    setpoint: Setpoint | None = None
+    setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
     """The newest offboard setpoint."""
     return_place: Callable[[], Place] | None = None
     """Chooses where Return goes; None = home."""

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.control.demand import AnyDemand, Demand
+from airl_mav.control.demand import (
+    AnyDemand,
+    AttitudeDemand,
+    Demand,
+    RateDemand,
+    TrajectoryDemand,
+)
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Setpoint
+from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.modes.hold import Hold
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
+from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode, triple
 from firmware_sim.autopilot.requests import Request
 
 CLIMBS_M_S = 0.1
@@ -17,6 +25,9 @@ CLIMBS_M_S = 0.1
 ABOVE_HOME_M = 0.3
 """So does one that lies this much above home [m]."""
 
+HOVER = Demand(FREE, (0.0, 0.0, 0.0), NAN, NAN)
+"""What PX4 flies when a setpoint leaves an axis open (PositionControl::inputValid)."""
+
 
 class Offboard(FlightMode):
     """Flies the newest setpoint; holds as long as there was none."""
@@ -24,16 +35,20 @@ class Offboard(FlightMode):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._waiting = Hold(context)
-        self._setpoint: Setpoint | None = None
-        self._flown: Demand | None = None
+        self._setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
+        self._flown: AnyDemand | None = None
 
     @property
     def lifts(self) -> bool:
-        """Whether the setpoint lies above the ground or goes up."""
+        """Whether the setpoint lies above the ground or goes up, or commands a thrust."""
         demand = self._newest()
         if demand is None:
             return False
+        if isinstance(demand, AttitudeDemand | RateDemand):
+            return True
         above = self._context.home[2] - ABOVE_HOME_M
+        if isinstance(demand, TrajectoryDemand) and demand.acceleration[2] < -CLIMBS_M_S:
+            return True
         return demand.velocity[2] < -CLIMBS_M_S or demand.position[2] < above
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
@@ -42,20 +57,46 @@ class Offboard(FlightMode):
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what the companion commands."""
-        return self._newest() or self._waiting.demand(state, time_us)
+        demand = self._newest()
+        if demand is None:
+            return self._waiting.demand(state, time_us)
+        if isinstance(demand, RateDemand) and math.isnan(demand.rates[2]):
+            # No yaw rate is commanded: it stays what it is.
+            roll, pitch, _ = demand.rates
+            return RateDemand((roll, pitch, state.item(RATES + 2)), demand.thrust)
+        return demand
 
-    def _newest(self) -> Demand | None:
+    def _newest(self) -> AnyDemand | None:
         """Return the newest setpoint as a demand, made once."""
         setpoint = self._context.setpoint
         if setpoint is not None and setpoint is not self._setpoint:
             self._setpoint = setpoint
-            north, east, down = triple(setpoint.velocity, 0)
-            # An axis that is not commanded gets zero velocity.
-            velocity = _or_zero(north), _or_zero(east), _or_zero(down)
-            self._flown = Demand(
-                triple(setpoint.position, 0), velocity, setpoint.yaw, setpoint.yaw_rate
-            )
+            self._flown = demand_of(setpoint) if isinstance(setpoint, Setpoint) else setpoint
         return self._flown
+
+
+def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
+    """Return what a setpoint of position and motion asks the cascade for; NaN = not commanded.
+
+    Each axis needs a position, a velocity or an acceleration, and north and east come in pairs;
+    otherwise the vehicle hovers. Source: PX4 1.16, PositionControl::inputValid.
+    """
+    position, velocity = triple(setpoint.position, 0), triple(setpoint.velocity, 0)
+    acceleration = triple(setpoint.acceleration, 0)
+    if not _is_valid(position, velocity, acceleration):
+        return HOVER._replace(yaw=setpoint.yaw, yaw_rate=setpoint.yaw_rate)
+    if all(map(math.isnan, acceleration)):
+        # A velocity that is not commanded adds nothing to a position.
+        north, east, down = velocity
+        known = _or_zero(north), _or_zero(east), _or_zero(down)
+        return Demand(position, known, setpoint.yaw, setpoint.yaw_rate)
+    return TrajectoryDemand(position, velocity, acceleration, setpoint.yaw, setpoint.yaw_rate)
+
+
+def _is_valid(position: Vec, velocity: Vec, acceleration: Vec) -> bool:
+    kinds = (position, velocity, acceleration)
+    paired = all(math.isnan(kind[0]) == math.isnan(kind[1]) for kind in kinds)
+    return paired and all(any(not math.isnan(kind[axis]) for kind in kinds) for axis in range(3))
 
 
 def _or_zero(value: float) -> float:

@@ -53,6 +53,8 @@ class Context:
     """The part of a log that is still to be sent."""
     log_stream: LogStream | None = None
     """The log that is sent while it is written."""
+    refusals: set[str] = field(default_factory=set)
+    """Why setpoints have been refused since the last one that was accepted."""
 
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:

@@ -1,8 +1,8 @@
-"""SET_POSITION_TARGET_LOCAL_NED: offboard setpoints, read as PX4 reads them.
+"""Offboard setpoints, read as PX4 reads them: of position and motion, local or global, of attitude.
 
-Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, checked against a
-running PX4 1.16. Acceleration setpoints are not supported, as the controller lacks them: a message
-that commands only an acceleration is invalid here.
+Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, _global_int and
+_set_attitude_target, checked against a running PX4 1.16. PX4 says for every message that it is
+refused; here the same refusal is told once, until a setpoint is accepted again.
 """
 
 from __future__ import annotations
@@ -11,38 +11,149 @@ import math
 
 import numpy as np
 
-from airl_mav.core.frames import heading_to_ned, quat_yaw
+from airl_mav.control.demand import AttitudeDemand, RateDemand
+from airl_mav.core.frames import Geodetic, geodetic_to_local, heading_to_ned, quat_yaw
+from airl_mav.vehicle.rotation import rotate
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 
-_NAME = "SET_POSITION_TARGET_LOCAL_NED"
-_POSITION_SHIFT, _VELOCITY_SHIFT = 0, 3
+_POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
 """First bit of each vector's three ignore bits (POSITION_TARGET_TYPEMASK)."""
 
+_NOTHING = np.full(3, math.nan)
 
-def handle_setpoint(message: WireMessage, context: Context) -> bool:
-    """Pass a valid setpoint to the autopilot; report what is wrong with an invalid one."""
-    mask: int = message.type_mask
-    position = _masked((message.x, message.y, message.z), mask >> _POSITION_SHIFT)
+_THRUST_BODY_SET = 32
+"""ATTITUDE_TARGET_TYPEMASK: `thrust_body` replaces `thrust`."""
+
+_LEAST_QUATERNION = 1e-6
+"""A quaternion whose norm is smaller is no attitude."""
+
+
+def handle_local(message: WireMessage, context: Context) -> bool:
+    """SET_POSITION_TARGET_LOCAL_NED."""
+    mask, frame = message.type_mask, message.coordinate_frame
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
-    frame: int = message.coordinate_frame
-    if frame == dialect.MAV_FRAME_BODY_NED:
-        position = np.full(3, math.nan)
-        velocity = _heading_frame_velocity(velocity, mask, context)
-    elif frame != dialect.MAV_FRAME_LOCAL_NED:
-        return _reject(context, f"{_NAME} coordinate frame {frame} unsupported")
-    if not (np.isfinite(position).any() or np.isfinite(velocity).any()):
-        return _reject(context, f"{_NAME} invalid")
+    acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
+    if frame == dialect.MAV_FRAME_LOCAL_NED:
+        position = _masked((message.x, message.y, message.z), mask >> _POSITION_SHIFT)
+    elif frame == dialect.MAV_FRAME_BODY_NED:
+        position = _NOTHING
+        q = context.port.state().estimate.quaternion
+        # All or nothing, as in PX4; a velocity turns with the heading alone.
+        velocity = _NOTHING if mask >> _VELOCITY_SHIFT & 0b111 else _turned(velocity, q)
+        if mask >> _ACCELERATION_SHIFT & 0b111:
+            acceleration = _NOTHING
+        else:
+            w, x, y, z = q.tolist()
+            forward, right, down = acceleration.tolist()
+            acceleration = np.array(rotate((w, x, y, z), (forward, right, down)))
+    else:
+        return _reject(context, f"{message.get_type()} coordinate frame {frame} unsupported")
+    if not _commands_something(position, velocity, acceleration):
+        return _reject(context, f"{message.get_type()} invalid")
+    return _offer(message, position, velocity, acceleration, context)
+
+
+def handle_global(message: WireMessage, context: Context) -> bool:
+    """SET_POSITION_TARGET_GLOBAL_INT: the velocity and acceleration are local NED."""
+    mask = message.type_mask
+    velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
+    acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
+    position: Vector | None = _NOTHING
+    if not mask >> _POSITION_SHIFT & 0b111:
+        frame = message.coordinate_frame
+        if frame not in _FRAMES_ABOVE:
+            text = f"{message.get_type()} invalid coordinate frame {frame}"
+            return _reject(context, text)
+        position = _from_globe(message, _FRAMES_ABOVE[frame], context)
+    if position is None or not _commands_something(position, velocity, acceleration):
+        return False  # PX4 says nothing
+    return _offer(message, position, velocity, acceleration, context)
+
+
+def handle_attitude(message: WireMessage, context: Context) -> bool:
+    """SET_ATTITUDE_TARGET: an attitude, or else body rates, and a thrust."""
+    mask: int = message.type_mask
+    thrust = _thrust(message)
+    demand: AttitudeDemand | RateDemand
+    if not mask & dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
+        q = np.array(message.q, np.float64)
+        norm = float(np.linalg.norm(q))
+        if not norm > _LEAST_QUATERNION or not math.isfinite(norm):
+            return False
+        w, x, y, z = (q / norm).tolist()
+        ignored = mask & dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+        yaw_rate = 0.0 if ignored else _or_zero(message.body_yaw_rate)
+        demand = AttitudeDemand((w, x, y, z), yaw_rate, thrust)
+    elif not mask & (
+        dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+        | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+    ):
+        ignored = mask & dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+        yaw_rate = math.nan if ignored else _finite(message.body_yaw_rate)
+        rates = _or_zero(message.body_roll_rate), _or_zero(message.body_pitch_rate), yaw_rate
+        demand = RateDemand(rates, thrust)
+    else:
+        return False  # PX4 says nothing
+    context.port.offer_attitude(demand, context.now_us)
+    context.refusals.clear()
+    return True
+
+
+def _offer(
+    message: WireMessage,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    context: Context,
+) -> bool:
+    mask: int = message.type_mask
+    forced = mask & dialect.POSITION_TARGET_TYPEMASK_FORCE_SET
+    if forced and np.isfinite(acceleration).any():
+        return _reject(context, f"{message.get_type()} force not supported")
     yaw = math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE else message.yaw
     yaw_rate = (
         math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else message.yaw_rate
     )
     wire_yaw = message.yaw if math.isnan(yaw_rate) else yaw_rate
     wire = (message.vx, message.vy, message.vz, wire_yaw)
-    setpoint = Setpoint(position, velocity, _finite(yaw), _finite(yaw_rate), wire)
-    context.port.offer_setpoint(setpoint, context.now_us)
+    context.port.offer_setpoint(
+        Setpoint(position, velocity, _finite(yaw), _finite(yaw_rate), wire, acceleration),
+        context.now_us,
+    )
+    context.refusals.clear()
     return True
+
+
+_ABOVE_SEA, _ABOVE_HOME, _ABOVE_TERRAIN = range(3)
+_FRAMES_ABOVE = {
+    dialect.MAV_FRAME_GLOBAL_INT: _ABOVE_SEA,
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: _ABOVE_HOME,
+    dialect.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: _ABOVE_TERRAIN,
+}
+
+
+def _from_globe(message: WireMessage, above: int, context: Context) -> Vector | None:
+    """Return the local position NED (3,) [m]; None where it is unknown: nothing is terrain."""
+    state = context.port.state()
+    origin, home = state.origin, state.home
+    if origin is None or home is None or above == _ABOVE_TERRAIN:
+        return None
+    altitude = message.alt + (home.altitude_m if above == _ABOVE_HOME else 0.0)
+    place = Geodetic(message.lat_int / 1e7, message.lon_int / 1e7, altitude)
+    return geodetic_to_local(place, origin)
+
+
+def _thrust(message: WireMessage) -> float:
+    """Return the collective 0..1; none commanded is none."""
+    mask: int = message.type_mask
+    thrust = message.thrust
+    if mask & _THRUST_BODY_SET:
+        thrust = -message.thrust_body[2]
+    elif mask & dialect.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
+        thrust = 0.0
+    return min(1.0, max(0.0, _or_zero(thrust)))
 
 
 def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
@@ -52,17 +163,26 @@ def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
     )
 
 
-def _heading_frame_velocity(velocity: Vector, mask: int, context: Context) -> Vector:
-    """Turn a BODY_NED velocity (3,) by the present heading; all or nothing, as in PX4."""
-    if mask >> _VELOCITY_SHIFT & 0b111:
-        return np.full(3, math.nan)
-    return heading_to_ned(velocity, quat_yaw(context.port.state().estimate.quaternion))
+def _turned(velocity: Vector, quaternion: Vector) -> Vector:
+    """Turn a velocity (3,) by the heading."""
+    return heading_to_ned(velocity, quat_yaw(quaternion))
+
+
+def _commands_something(*vectors: Vector) -> bool:
+    return any(bool(np.isfinite(vector).any()) for vector in vectors)
 
 
 def _finite(value: float) -> float:
     return value if math.isfinite(value) else math.nan
 
 
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
 def _reject(context: Context, text: str) -> bool:
-    context.announce(Message(Severity.CRITICAL, text))
+    context.port.refuse_setpoint(text, context.now_us)
+    if text not in context.refusals:
+        context.refusals.add(text)
+        context.announce(Message(Severity.CRITICAL, text))
     return False

@@ -15,6 +15,7 @@ CAPABILITIES: int = (
     dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | dialect.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
     | dialect.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_LOCAL_NED
     | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
@@ -23,8 +24,7 @@ CAPABILITIES: int = (
     | dialect.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
     | dialect.MAV_PROTOCOL_CAPABILITY_FTP
 )
-"""Of a real PX4's 0xE8FF only what is true here: no attitude setpoints or flight
-termination."""
+"""Of a real PX4's 0xE8FF only what is true here: no flight termination."""
 
 _FIRMWARE_VERSION = 1 << 24 | 16 << 16 | 0 << 8 | 255
 """The PX4 release whose behaviour is emulated: 1.16.0, FIRMWARE_VERSION_TYPE_OFFICIAL."""
