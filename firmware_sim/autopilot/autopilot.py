@@ -14,6 +14,7 @@ from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ, TICK_S, US_PER_S
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import (
+    WITH_STICKS,
     Arming,
     AutopilotState,
     CommanderStatus,
@@ -31,6 +32,7 @@ from firmware_sim.autopilot.failsafe import FailsafeTimers
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
+from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.modes.interface import here
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.navigator import Navigator
@@ -38,7 +40,7 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import Place, Request
+from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -68,6 +70,7 @@ class BuiltinAutopilot:
         self._guidance = Guidance(value, self._say)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
+        self._manual_control = ManualControl(value)
         self._failsafe = FailsafeTimers(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
@@ -127,6 +130,8 @@ class BuiltinAutopilot:
                 self._handle(due)
         if time_us >= self._navigator.due_us:
             self._navigate()
+        if self._manual_control.was_heard:
+            self._guidance.context.sticks = self._manual_control.sticks(time_us)
         self._demand = self._guidance.demand(self._state, self.flight.phase, time_us)
         if self._demand is not None:
             self._motors = self._controller.fly(self._state, self._demand)
@@ -313,6 +318,8 @@ class BuiltinAutopilot:
             return self.takeoff(None)
         if mode is Mode.MISSION:
             return self._handle(Ask(mode, self._navigator.mission_is_valid(self._situation())))
+        if mode in WITH_STICKS:
+            return self._handle(Ask(mode, self._manual_control.sticks(self._now_us) is not None))
         return self._handle(Ask(mode), request)
 
     def change_speed(self, speed_m_s: float) -> None:
@@ -388,6 +395,20 @@ class BuiltinAutopilot:
         """Note why an offboard setpoint was refused: the failsafe that follows names it."""
         self._refusal = reason, time_us
 
+    def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
+        """Hand over the pilot's sticks, received at `time_us` of simulated time."""
+        moved = self._manual_control.offer(sticks, source, time_us)
+        flown, override = self.flight.mode, int(self.parameters["COM_RC_OVERRIDE"])
+        bit = 2 if flown is Mode.OFFBOARD else 1
+        takes_over = moved and override & bit and flown not in WITH_STICKS
+        if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
+            self._handle(Ask(Mode.POSITION))
+            self._say(Message(Severity.INFO, "Pilot took over using sticks"))
+
+    def follow(self, target: FollowedTarget) -> None:
+        """Hand over where the target is that Follow follows."""
+        self._guidance.context.target = target
+
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""
         self._failsafe.gcs_heartbeat(time_us)
@@ -424,6 +445,7 @@ class BuiltinAutopilot:
             gps=self._gps,
             home=self._home,
             origin=self.estimator.origin,
+            orbit=self._guidance.context.orbit if self.flight.mode is Mode.ORBIT else None,
             armed_us=self._armed_us,
             takeoff_us=self._takeoff_us,
             mission=progress(self.plans),

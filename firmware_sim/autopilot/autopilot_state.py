@@ -37,9 +37,16 @@ class Mode(IntEnum):
     LAND = 3
     RETURN = 4
     POSITION = 5
-    """Position Control: only as the offboard-loss fallback. Without a pilot's input PX4 was
-    measured to brake and to descend to the ground."""
+    """Needs a pilot's input, as the other modes with sticks. Without it PX4 was measured to brake
+    and to descend to the ground: the offboard-loss fallback."""
     MISSION = 6
+    MANUAL = 7
+    """As Stabilized, for a multicopter."""
+    STABILIZED = 8
+    ACRO = 9
+    ALTITUDE = 10
+    ORBIT = 11
+    FOLLOW = 12
 
 
 MODE_NAMES = {
@@ -50,8 +57,18 @@ MODE_NAMES = {
     Mode.RETURN: "Return",
     Mode.POSITION: "Position",
     Mode.MISSION: "Mission",
+    Mode.MANUAL: "Manual",
+    Mode.STABILIZED: "Stabilized",
+    Mode.ACRO: "Acro",
+    Mode.ALTITUDE: "Altitude",
+    Mode.ORBIT: "Orbit",
+    Mode.FOLLOW: "Follow Target",
 }
 """As PX4's texts name them."""
+
+
+WITH_STICKS = frozenset({Mode.POSITION, Mode.MANUAL, Mode.STABILIZED, Mode.ACRO, Mode.ALTITUDE})
+"""Modes that need a pilot's input."""
 
 
 class Landed(IntEnum):
@@ -180,6 +197,15 @@ class FenceStatus(NamedTuple):
 NO_BREACH = FenceStatus()
 
 
+class OrbitStatus(NamedTuple):
+    """The circle that Orbit mode flies."""
+
+    radius_m: float
+    """Positive clockwise."""
+    centre: tuple[float, float, float]
+    """Local NED [m]."""
+
+
 class AutopilotState(NamedTuple):
     """One consistent snapshot after a tick."""
 
@@ -213,3 +239,5 @@ class AutopilotState(NamedTuple):
     """When it left the ground [µs], 0 before."""
     mission: MissionProgress = NO_MISSION
     fence: FenceStatus = NO_BREACH
+    orbit: OrbitStatus | None = None
+    """In Orbit mode."""

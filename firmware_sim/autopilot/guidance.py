@@ -38,7 +38,7 @@ class Guidance:
             request = self._flown.remainder(state)
         new = self._modes[mode]
         if new is not self._flown:
-            self.context.travel.speed_m_s = NAN
+            self.context.travel.speed_m_s, self.context.orbit = NAN, None
         self._flown = new
         self._flown.enter(state, request)
 

@@ -11,8 +11,9 @@ from airl_mav.core.frames import Geodetic
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import FollowedTarget, Request
 from firmware_sim.interfaces import SensorSample
 
 
@@ -188,6 +189,14 @@ class AutopilotPort(Protocol):
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         """Note why an offboard setpoint was refused: the failsafe that follows names it."""
+        ...
+
+    def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
+        """Hand over the pilot's sticks, received at `time_us` of simulated time."""
+        ...
+
+    def follow(self, target: FollowedTarget) -> None:
+        """Hand over where the target is that Follow follows."""
         ...
 
     def gcs_heartbeat(self, time_us: int) -> None:

@@ -38,3 +38,27 @@ class Reposition(Request):
     place: Place
     speed_m_s: float = NAN
     """NaN = as fast as before."""
+
+
+@dataclass(frozen=True, slots=True)
+class OrbitRequest(Request):
+    """Orbit: the circle (MAV_CMD_DO_ORBIT). NaN = as it is."""
+
+    centre: Vec = (NAN, NAN, NAN)
+    """Local NED [m]."""
+    radius_m: float = NAN
+    """Positive clockwise, negative counter-clockwise."""
+    speed_m_s: float = NAN
+    facing: int | None = None
+    """ORBIT_YAW_BEHAVIOUR; None = as it is."""
+
+
+class FollowedTarget(NamedTuple):
+    """What Follow follows."""
+
+    position: Vec
+    """Local NED [m]."""
+    velocity: Vec
+    """NED [m/s]."""
+    time_us: int
+    """When it was heard, in simulated time."""

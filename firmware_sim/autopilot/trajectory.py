@@ -152,6 +152,8 @@ class Leg(NamedTuple):
     """The waypoint after the target; None = the vehicle comes to rest at the target."""
     vertical_m_s: float = math.nan
     """NED: a vertical speed that is flown whatever the target's height; NaN = to that height."""
+    velocity: Vec = (0.0, 0.0, 0.0)
+    """Of a target that moves, NED [m/s]."""
 
 
 class Trajectory:
@@ -223,9 +225,11 @@ class Trajectory:
         way = tuple(a - h for a, h in zip(aim, here, strict=True))
         length = math.sqrt(sum(w * w for w in way))
         if length < _TINY:
-            return 0.0, 0.0, 0.0
+            return leg.velocity
         total = math.hypot(speed, vertical) / length
-        return _clamped((way[0] * total, way[1] * total, way[2] * total), speed, vertical)
+        velocity = (way[0] * total, way[1] * total, way[2] * total)
+        (vx, vy, vz), (mx, my, mz) = _clamped(velocity, speed, vertical), leg.velocity
+        return vx + mx, vy + my, vz + mz
 
     def _is_turning(self, target: Vec, acceptance_m: float) -> bool:
         (x, y, _), (vx, vy, _) = self.position, self.velocity

@@ -6,10 +6,11 @@ src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import Arming, CommanderStatus, Mode
+from firmware_sim.autopilot.autopilot_state import WITH_STICKS, Arming, CommanderStatus, Mode
 from firmware_sim.mavlink.codec import dialect
 
 MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL = 4, 6, 3
+_MAIN_ACRO = 5
 
 _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.HOLD: (MAIN_AUTO, 3),
@@ -19,6 +20,12 @@ _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.OFFBOARD: (MAIN_OFFBOARD, 0),
     Mode.POSITION: (MAIN_POSCTL, 0),
     Mode.MISSION: (MAIN_AUTO, 4),
+    Mode.ORBIT: (MAIN_POSCTL, 1),
+    Mode.FOLLOW: (MAIN_AUTO, 8),
+    Mode.MANUAL: (1, 0),
+    Mode.ALTITUDE: (2, 0),
+    Mode.ACRO: (_MAIN_ACRO, 0),
+    Mode.STABILIZED: (7, 0),
 }
 
 
@@ -26,20 +33,18 @@ def _unavailable(name: str) -> str:
     return f"Switching to {name} is currently not available"
 
 
-# What can be asked for, by main mode, and in AUTO by sub mode. The texts: modes of a real PX4 that
-# need a pilot's input, known by name, never available.
+# What can be asked for, by main mode, in AUTO and POSCTL by sub mode. The texts: modes of a real
+# PX4 that are known by name and never available.
 _MAIN_MODES: dict[int, Mode | str] = {
-    MAIN_OFFBOARD: Mode.OFFBOARD,
-    MAIN_POSCTL: Mode.POSITION,
-    1: _unavailable("Manual"),
-    2: _unavailable("Altitude"),
-    5: _unavailable("Acro"),
-    7: _unavailable("Stabilized"),
+    main: mode for mode, (main, sub) in _MAIN_SUB.items() if main != MAIN_AUTO and sub == 0
+}
+_POSITION_MODES: dict[int, Mode | str] = {
+    **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_POSCTL},
+    2: _unavailable("Position Slow"),
 }
 _AUTO_MODES: dict[int, Mode | str] = {
     **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO},
     0: Mode.MISSION,
-    8: _unavailable("Follow Target"),
     9: _unavailable("Precision Landing"),
     **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},
 }
@@ -53,10 +58,12 @@ def custom_mode(mode: Mode) -> int:
 
 def base_mode(status: CommanderStatus) -> int:
     """Return the MAV_MODE_FLAG bits of HEARTBEAT."""
-    bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+    bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+    if status.mode is not Mode.ACRO:
+        bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
     if _MAIN_SUB[status.mode][0] == MAIN_AUTO:
         bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
-    if status.mode is Mode.POSITION:
+    if status.mode in WITH_STICKS:
         bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
     if status.arming is Arming.ARMED:
         bits |= dialect.MAV_MODE_FLAG_SAFETY_ARMED
@@ -81,6 +88,8 @@ def requested_mode(base: int, main: int, sub: int) -> Mode | str | None:
         return _from_base_mode(base)
     if main == MAIN_AUTO:
         return _AUTO_MODES.get(sub, "Unsupported auto mode")
+    if main == MAIN_POSCTL:
+        return _POSITION_MODES.get(sub, Mode.POSITION)
     return _MAIN_MODES.get(main)
 
 

@@ -39,6 +39,7 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "HOME_POSITION": 0.5,
         "VIBRATION": 0.5,
         "CURRENT_MODE": 0.5,
+        "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 10.0,
         "ESC_STATUS": 10.0,
     }
@@ -68,6 +69,7 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "PING": 0.1,
         "VIBRATION": 0.1,
         "CURRENT_MODE": 0.5,
+        "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 1.0,
         "ESC_STATUS": 1.0,
     }

@@ -26,10 +26,11 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
     Vector,
 )
+from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
-from firmware_sim.autopilot.requests import Request
+from firmware_sim.autopilot.requests import FollowedTarget, Request
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -112,6 +113,8 @@ class KinematicAutopilot:
         self.commands: list[str] = []
         self.looked_at: Geodetic | None = None
         self.requests: list[Request | None] = []
+        self.sticks: list[tuple[Sticks, Source, int]] = []
+        self.followed: list[FollowedTarget] = []
         self.attitudes: list[tuple[AttitudeDemand | RateDemand, int]] = []
         self.refusals: list[tuple[str, int]] = []
         self.messages: list[Message] = []
@@ -192,6 +195,12 @@ class KinematicAutopilot:
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         self.refusals.append((reason, time_us))
+
+    def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
+        self.sticks.append((sticks, source, time_us))
+
+    def follow(self, target: FollowedTarget) -> None:
+        self.followed.append(target)
 
     def gcs_heartbeat(self, time_us: int) -> None:
         self.gcs_heartbeats.append(time_us)

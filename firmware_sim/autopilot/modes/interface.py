@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, Setpoint
+from firmware_sim.autopilot.autopilot_state import Message, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
-from firmware_sim.autopilot.requests import Place, Request
+from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
 from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
@@ -52,6 +54,12 @@ class FlightContext:
     """Whether the mission has come to its end."""
     standing: bool = True
     """Whether the vehicle stands on the ground."""
+    sticks: Sticks | None = None
+    """The pilot's sticks; None = there are none, or they are lost."""
+    target: FollowedTarget | None = None
+    """What Follow follows."""
+    orbit: OrbitStatus | None = None
+    """The circle that was flown last."""
 
     def __post_init__(self) -> None:
         self.travel = Travel(self.value)
@@ -75,13 +83,13 @@ class FlightMode(Protocol):
         """Whether an armed vehicle that stands on the ground takes off in this mode."""
         return False
 
-    def enter(self, state: Vector, request: Request | None, /) -> None:
+    def enter(self, _state: Vector, _request: Request | None, /) -> None:
         """Begin at the present state.
 
-        `request`: the user's, or what the mode before leaves to this one (its `remainder`). A mode
-        ignores those that are not for it.
+        The request is the user's, or what the mode before leaves to this one (its `remainder`). A
+        mode ignores those that are not for it.
         """
-        ...
+        return
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what to fly at a time [µs] that rises from call to call."""
@@ -94,6 +102,21 @@ class FlightMode(Protocol):
     def is_done(self, _state: Vector, /) -> bool:
         """Return whether the mode has reached its end, and another one should follow."""
         return False
+
+
+FALLBACK_DESCENT_M_S = 0.75
+"""Descent of modes that need a pilot's input and have none (measured on PX4 1.16). The vehicle
+stays level: drag alone slows it, from 1.0 to 0.3 m/s in 7 s (FlightTaskDescend)."""
+
+
+def descend(yaw: float) -> Demand:
+    """Return the demand of a mode without the pilot's input that it needs."""
+    return Demand(FREE, (NAN, NAN, FALLBACK_DESCENT_M_S), yaw, NAN)
+
+
+def since(before_us: int | None, now_us: int) -> float:
+    """Return the time since the last tick [s]; 0 at the first."""
+    return 0.0 if before_us is None else (now_us - before_us) / US_PER_S
 
 
 def triple(state: Vector, start: int) -> Vec:

@@ -15,6 +15,7 @@ from firmware_sim.mavlink.services import (
     missions,
     params,
     peers,
+    pilot,
     setpoints,
     signing,
 )
@@ -43,6 +44,9 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "SET_POSITION_TARGET_LOCAL_NED": (for_vehicle_or_all, setpoints.handle_local),
         "SET_POSITION_TARGET_GLOBAL_INT": (for_vehicle_or_all, setpoints.handle_global),
         "SET_ATTITUDE_TARGET": (for_vehicle_or_all, setpoints.handle_attitude),
+        "MANUAL_CONTROL": (pilot.is_for_pilot, pilot.handle_manual_control),
+        "RC_CHANNELS_OVERRIDE": (pilot.is_for_radio, pilot.handle_channels),
+        "FOLLOW_TARGET": (_for_anyone, pilot.handle_follow_target),
         "HEARTBEAT": (_for_anyone, peers.handle_heartbeat),
         "SETUP_SIGNING": (for_vehicle_or_all, signing.handle_setup),
         "PING": (_for_anyone, peers.handle_ping),

@@ -18,6 +18,7 @@ from firmware_sim.mavlink.services import (
     logs,
     message_requests,
     mission_commands,
+    navigation_commands,
     standard_modes,
     without_effect,
 )
@@ -28,15 +29,12 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     sender,
 )
+from firmware_sim.mavlink.services.navigation_commands import ABOVE_HOME
 from firmware_sim.mavlink.services.standard_modes import change_mode
+from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
-
-_RELATIVE_FRAMES = (
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-)
 
 
 def _arm_disarm(command: Command, context: Context) -> Result | None:
@@ -55,7 +53,7 @@ def _takeoff(command: Command, context: Context) -> Result:
     altitude = command.params[6]
     if not math.isfinite(altitude):
         return context.port.takeoff(None)
-    if command.frame in _RELATIVE_FRAMES:
+    if command.frame in ABOVE_HOME:
         return context.port.takeoff(altitude)
     home = context.port.state().home
     if home is None:
@@ -88,6 +86,7 @@ ACTIONS: dict[int, Action] = {
     **message_requests.ACTIONS,
     **calibration.ACTIONS,
     **mission_commands.ACTIONS,
+    **navigation_commands.ACTIONS,
     **standard_modes.ACTIONS,
     **without_effect.ACTIONS,
 }
@@ -103,7 +102,9 @@ def handle_command_long(message: WireMessage, context: Context) -> bool:
 def handle_command_int(message: WireMessage, context: Context) -> bool:
     """Carry out and acknowledge a COMMAND_INT."""
     four = (message.param1, message.param2, message.param3, message.param4)
-    params = (*four, message.x / 1e7, message.y / 1e7, message.z)
+    given = (message.x, message.y) != (INT32_MAX, INT32_MAX)  # otherwise: to be ignored
+    place = (message.x / 1e7, message.y / 1e7) if given else (math.nan, math.nan)
+    params = (*four, *place, message.z)
     return _handle(Command(message.command, params, sender(message), message.frame), context)
 
 

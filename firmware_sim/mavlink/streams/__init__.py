@@ -50,6 +50,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "HOME_POSITION": pose.home_position,
         "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
+        "ORBIT_EXECUTION_STATUS": pose.orbit_execution_status,
         "CURRENT_MODE": flight_modes.current_mode,
         "ESC_INFO": actuators.esc_info,
         "ESC_STATUS": actuators.esc_status,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba.extending import register_jitable
 
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
@@ -142,6 +143,22 @@ def position_target_local_ned(state: AutopilotState) -> Values:
         *_NO_ACCELERATION,
         setpoint.yaw,
         setpoint.yaw_rate,
+    )
+
+
+def orbit_execution_status(state: AutopilotState) -> Values | None:
+    """The circle that is flown: its centre on the globe; nothing in other modes."""
+    orbit, origin = state.orbit, state.origin
+    if orbit is None or origin is None:
+        return None
+    centre = local_to_geodetic(np.array(orbit.centre), origin)
+    return (
+        state.time_us,
+        orbit.radius_m,
+        dialect.MAV_FRAME_GLOBAL,
+        units.deg_e7(centre.latitude_deg),
+        units.deg_e7(centre.longitude_deg),
+        centre.altitude_m,
     )
 
 

@@ -1,0 +1,153 @@
+"""Orbit: around a place, at a radius and a speed.
+
+Source: PX4 1.16, FlightTaskOrbit.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+from airl_mav.control.demand import AnyDemand, TrajectoryDemand
+from airl_mav.core.constants import DEG
+from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.autopilot_state import Message, OrbitStatus, Severity
+from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.modes.interface import (
+    NAN,
+    FlightContext,
+    FlightMode,
+    since,
+    triple,
+)
+from firmware_sim.autopilot.requests import OrbitRequest, Request
+from firmware_sim.autopilot.trajectory import Leg
+
+LEAST_RADIUS_M = 1.0
+FASTEST_M_S = 10.0
+MOST_M_S2 = 2.0
+"""Of the acceleration towards the centre: it limits the speed."""
+
+ON_CIRCLE_M = 2.0
+"""A vehicle that is this close to its circle begins to go round [m]."""
+
+
+class Facing(IntEnum):
+    """ORBIT_YAW_BEHAVIOUR."""
+
+    CENTRE = 0
+    INITIAL_HEADING = 1
+    UNCONTROLLED = 2
+    TANGENT = 3
+    PILOT = 4
+    UNCHANGED = 5
+
+
+class Orbit(FlightMode):
+    """Flies to the circle, and round."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._centre: Vec = (0.0, 0.0, 0.0)
+        self._radius = LEAST_RADIUS_M
+        self._speed = 1.0
+        """Positive clockwise [m/s]."""
+        self._facing = Facing.CENTRE
+        self._initial_yaw = 0.0
+        self._yaw = 0.0
+        self._going_round = False
+        self._present = 0.0
+        """Speed so far: it rises with MPC_ACC_HOR."""
+        self._time_us: int | None = None
+
+    def enter(self, state: Vector, request: Request | None, /) -> None:
+        """Begin, or change the orbit that is flown."""
+        if self._context.orbit is None:  # otherwise, the orbit that is flown is changed
+            self._centre, self._radius, self._speed = triple(state, P), LEAST_RADIUS_M, 1.0
+        self._time_us = None
+        self._initial_yaw = self._yaw = quat_yaw(state[Q:RATES])
+        self._going_round, self._present = False, 0.0
+        self._facing = Facing(int(self._context.value("MC_ORBIT_YAW_MOD")))
+        if isinstance(request, OrbitRequest):
+            self._apply(request)
+
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Fly to the circle first, straight; then round."""
+        dt, self._time_us = since(self._time_us, time_us), time_us
+        position = triple(state, P)
+        north, east = position[0] - self._centre[0], position[1] - self._centre[1]
+        distance = math.hypot(north, east)
+        near = abs(position[2] - self._centre[2]) < self._context.value("NAV_MC_ALT_RAD")
+        if not self._going_round and near and abs(distance - self._radius) < ON_CIRCLE_M:
+            self._going_round = True
+        self._report()
+        outward = (north / distance, east / distance) if distance > 1e-6 else (1.0, 0.0)
+        if not self._going_round:
+            on_circle = (
+                self._centre[0] + outward[0] * self._radius,
+                self._centre[1] + outward[1] * self._radius,
+                self._centre[2],
+            )
+            inward = math.atan2(-outward[1], -outward[0])
+            return self._context.travel.fly(state, time_us, Leg(on_circle), yaw=inward)
+        return self._round(outward, distance, quat_yaw(state[Q:RATES]), dt)
+
+    def _round(
+        self, outward: tuple[float, float], distance: float, now: float, dt: float
+    ) -> TrajectoryDemand:
+        step = self._context.value("MPC_ACC_HOR") * dt
+        self._present += min(step, max(-step, self._speed - self._present))
+        correction = self._radius - distance
+        velocity = (
+            -outward[1] * self._present + outward[0] * correction,
+            outward[0] * self._present + outward[1] * correction,
+            NAN,
+        )
+        inward = self._present * self._present / self._radius
+        acceleration = (-outward[0] * inward, -outward[1] * inward, NAN)
+        yaw, rate = self._heading(outward, now, dt)
+        return TrajectoryDemand((NAN, NAN, self._centre[2]), velocity, acceleration, yaw, rate)
+
+    def _heading(self, outward: tuple[float, float], now: float, dt: float) -> tuple[float, float]:
+        """Return heading [rad] and yaw rate [rad/s]; the heading turns with MPC_YAWRAUTO_MAX."""
+        rate = self._speed / self._radius
+        side = math.copysign(1.0, self._speed)
+        if self._facing is Facing.UNCONTROLLED:
+            self._yaw = now
+            return NAN, NAN
+        if self._facing is Facing.INITIAL_HEADING:
+            wanted, rate = self._initial_yaw, NAN
+        elif self._facing is Facing.TANGENT:
+            wanted = math.atan2(side * outward[0], -side * outward[1])
+        elif self._facing is Facing.PILOT:
+            wanted, rate = self._yaw, NAN
+        else:
+            wanted = math.atan2(-outward[1], -outward[0])
+        most = self._context.value("MPC_YAWRAUTO_MAX") * DEG * dt
+        self._yaw = wrap_pi(self._yaw + min(most, max(-most, wrap_pi(wanted - self._yaw))))
+        return self._yaw, rate
+
+    def _apply(self, request: OrbitRequest) -> None:
+        """Take what a request gives; NaN leaves things as they are."""
+        radius, clockwise = self._radius, self._speed > 0.0
+        if not math.isnan(request.radius_m):
+            radius, clockwise = abs(request.radius_m), request.radius_m > 0.0
+        speed = abs(self._speed) if math.isnan(request.speed_m_s) else request.speed_m_s
+        if not LEAST_RADIUS_M <= radius <= self._context.value("MC_ORBIT_RAD_MAX"):
+            self._context.say(Message(Severity.CRITICAL, "Orbit radius limit exceeded"))
+            return
+        fastest = min(FASTEST_M_S, math.sqrt(MOST_M_S2 * radius))
+        speed = min(fastest, max(-fastest, speed))
+        self._radius, self._speed = radius, speed if clockwise else -speed
+        if request.facing in list(Facing) and request.facing != Facing.UNCHANGED:
+            self._facing = Facing(request.facing)
+        north, east, down = request.centre
+        if not (math.isnan(north) or math.isnan(east)):
+            self._centre = north, east, self._centre[2]
+        if not math.isnan(down):
+            self._centre = self._centre[0], self._centre[1], down
+
+    def _report(self) -> None:
+        radius = math.copysign(self._radius, self._speed)
+        self._context.orbit = OrbitStatus(radius, self._centre)
