@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from firmware_sim.autopilot.autopilot_state import Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode, Result, Severity
 from firmware_sim.autopilot.commander import (
     READINESS,
     TABLE,
@@ -63,7 +63,7 @@ def forced(phase: Phase, mode: Mode, text: tuple[Severity, str] = FAILSAFE) -> E
 
 
 def unavailable(mode: Mode) -> tuple[Severity, str]:
-    return (Severity.CRITICAL, f"Switching to {mode.name.title()} is currently not available")
+    return (Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available")
 
 
 EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {

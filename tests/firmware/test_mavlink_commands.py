@@ -7,8 +7,9 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.autopilot.autopilot_state import Arming, Result
+from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result
 from firmware_sim.autopilot.navigation.plan import Kind
+from firmware_sim.mavlink.px4_custom_mode import custom_mode
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
 from tests.support.mission_kit import at
@@ -108,6 +109,27 @@ def test_mode_commands(rig: Rig, number: int, params: tuple[float, ...], expecte
     assert rig.autopilot.commands == [expected]
 
 
+@pytest.mark.parametrize(
+    ("params", "mode"),
+    [
+        ((1, 1, 0), Mode.MANUAL),
+        ((1, 2, 0), Mode.ALTITUDE),
+        ((1, 3, 1), Mode.ORBIT),
+        ((1, 4, 8), Mode.FOLLOW),
+        ((1, 5, 0), Mode.ACRO),
+        ((1, 7, 0), Mode.STABILIZED),
+        ((64, 0, 0), Mode.MANUAL),
+        ((80, 0, 0), Mode.STABILIZED),
+    ],
+)
+def test_modes_for_a_pilot_and_round_a_target(
+    rig: Rig, params: tuple[float, ...], mode: Mode
+) -> None:
+    assert rig.command(176, *params)[0] == ACCEPTED
+    assert rig.autopilot.mode is mode
+    assert custom_mode(mode) >> 16 & 0xFF == params[1] or params[1] == 0
+
+
 def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:
     assert rig.command(176, 1, 99, 0)[0] == ACCEPTED
     assert rig.autopilot.commands == []
@@ -118,14 +140,12 @@ def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("params", "text"),
     [
-        ((1, 1, 0), "Switching to Manual is currently not available"),
-        ((1, 7, 0), "Switching to Stabilized is currently not available"),
+        ((1, 3, 2), "Switching to Position Slow is currently not available"),
+        ((1, 4, 9), "Switching to Precision Landing is currently not available"),
         ((1, 4, 99), "Unsupported auto mode"),
-        ((64, 0, 0), "Switching to Manual is currently not available"),
-        ((80, 0, 0), "Switching to Stabilized is currently not available"),
     ],
 )
-def test_modes_that_need_a_pilot(rig: Rig, params: tuple[float, ...], text: str) -> None:
+def test_modes_that_are_not_there(rig: Rig, params: tuple[float, ...], text: str) -> None:
     result, messages = rig.command(176, *params)
     assert result == REJECTED
     assert text_of(messages) == [(2, text)]
