@@ -120,6 +120,12 @@ def test_px4_asks_for_floats_first_and_learns(rig: Rig) -> None:
     (request,) = replies(rig.exchange(unsupported))
     assert request.get_type() == "MISSION_REQUEST_INT"
     assert request.seq == 0
+    rig.exchange(item_int(0))
+    # Another client may know floats alone.
+    other = RawClient(rig.bench.memory, STRANGER)
+    other.send(dialect.MAVLink_mission_count_message(1, 1, 1, 0))
+    rig.bench.tick()
+    assert [m.get_type() for m in replies(rig.client.received())] == ["MISSION_REQUEST"]
 
 
 def test_mavwp_of_pymavlink_up_and_down(rig: Rig) -> None:
@@ -244,6 +250,20 @@ def test_the_last_item_again_is_acknowledged_again(rig: Rig) -> None:
     assert (ack.get_type(), ack.type) == ("MISSION_ACK", 0)
     answers = rig.exchange(MIXED[0])
     assert text_of(answers) == [(2, "IGN MISSION_ITEM: No transfer")]
+
+
+def test_a_download_that_is_never_acknowledged_blocks_nothing(rig: Rig) -> None:
+    """As dronekit's."""
+    upload(rig, MIXED[:1])
+    for follow, answer in (
+        (dialect.MAVLink_mission_set_current_message(1, 1, 0), "MISSION_CURRENT"),
+        (dialect.MAVLink_mission_count_message(1, 1, 1, 0), "MISSION_REQUEST_INT"),
+        (dialect.MAVLink_mission_clear_all_message(1, 1, 0), "MISSION_ACK"),
+    ):
+        rig.exchange(dialect.MAVLink_mission_request_list_message(1, 1, 0))
+        rig.exchange(dialect.MAVLink_mission_request_int_message(1, 1, 0, 0))
+        assert answer in {m.get_type() for m in replies(rig.exchange(follow))}
+        rig.exchange(MIXED[0])
 
 
 def test_a_request_out_of_turn_ends_the_download(rig: Rig) -> None:

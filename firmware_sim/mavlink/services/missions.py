@@ -13,7 +13,12 @@ from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
 from firmware_sim.mavlink.services.context import ANY, Context, sender
-from firmware_sim.mavlink.services.mission_transfer import RETRY_US, TIMEOUT_US, Activity
+from firmware_sim.mavlink.services.mission_transfer import (
+    RETRY_US,
+    TIMEOUT_US,
+    Activity,
+    MissionTransfer,
+)
 
 _IDLE, _SENDING, _RECEIVING = Activity.IDLE, Activity.SENDING, Activity.RECEIVING
 _PLANNERS = (COMPONENT_ID, ANY, dialect.MAV_COMP_ID_MISSIONPLANNER)
@@ -41,9 +46,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
     """MISSION_REQUEST_LIST: begin a download with the number of items."""
     transfer = context.transfer
     partner = sender(message)
-    if transfer.activity is _SENDING and transfer.index == transfer.count:
-        # All items were sent: a client that came back need not have acknowledged them.
-        transfer.activity = _IDLE
+    _settle(transfer)
     again = (
         transfer.activity is _SENDING
         and transfer.kind == message.mission_type
@@ -114,6 +117,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 def handle_count(message: WireMessage, context: Context) -> bool:
     """MISSION_COUNT: begin an upload; a count of 0 clears the list."""
     transfer, partner = context.transfer, sender(message)
+    _settle(transfer)
     if transfer.activity is _SENDING:
         _complain(context, "WPM: IGN MISSION_COUNT: Busy")
         _acknowledge(context, partner, _ERROR)
@@ -136,6 +140,9 @@ def _begin_upload(message: WireMessage, context: Context) -> bool:
     if plans.receiving:
         _acknowledge(context, partner, _ERROR)
         return True
+    if partner != transfer.partner:
+        # Another client may know floats alone (dronekit): it is asked for them first.
+        transfer.integer = False
     transfer.partner, transfer.kind, transfer.checksum = partner, message.mission_type, 0
     known = transfer.kind in MOST_ITEMS
     if message.count > (MOST_ITEMS[Kind(transfer.kind)] if known else 0):
@@ -216,6 +223,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
 def handle_clear(message: WireMessage, context: Context) -> bool:
     """MISSION_CLEAR_ALL: forget one list, or all."""
     transfer, kind = context.transfer, message.mission_type
+    _settle(transfer)
     if transfer.activity is not _IDLE:
         _complain(context, "WPM: IGN CLEAR CMD: Busy")
         return True
@@ -230,6 +238,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
 def handle_set_current(message: WireMessage, context: Context) -> bool:
     """MISSION_SET_CURRENT: choose the item to go on with; the mode does not change."""
     plans = context.port.plans
+    _settle(context.transfer)
     if context.transfer.activity is not _IDLE:
         _complain(context, "WPM: IGN WP CURR CMD: Busy")
     elif message.seq >= len(plans.mission):
@@ -276,6 +285,15 @@ def _tell_reached(context: Context) -> None:
         transfer.repeated_us = context.now_us
         transfer.repeats += 1
         context.link.send(dialect.MAVLink_mission_item_reached_message(transfer.told_reached))
+
+
+def _settle(transfer: MissionTransfer) -> None:
+    """End a download whose items were all sent: some clients (dronekit) never acknowledge it.
+
+    PX4 does so where a new download begins, and else waits for its timeout.
+    """
+    if transfer.activity is _SENDING and transfer.index == transfer.count:
+        transfer.activity = _IDLE
 
 
 def _items(context: Context, kind: int) -> tuple[object, ...]:
