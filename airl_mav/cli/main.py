@@ -24,6 +24,7 @@ SUBCOMMANDS: dict[str, str] = {
     "gap": "the hardware gap: what a policy loses on an onboard computer, without and with"
     " mitigation",
     "degrade": "the same policy at growing latencies: where it breaks down",
+    "faults": "every fault in every phase of a flight, and how it ended: the fault matrix",
     "roofline": "safe velocity against reaction time: which computer, and what binds it",
     "ladder": "the same policy and seeds at several levels of the fidelity ladder",
     "profile": "measure how long this computer takes for a policy's decisions",

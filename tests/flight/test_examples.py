@@ -53,6 +53,13 @@ def test_rehearse(tmp_path: Path) -> None:
     assert (tmp_path / page[1]).is_file()
 
 
+def test_faults_are_told(tmp_path: Path) -> None:
+    text = output_of("faults.py", tmp_path)
+    assert "healthy: success" in text
+    assert "  camera stuck at offboard+0.5s for 0.5s: 0.50 s" in text
+    assert "  uplink loss 0.3 at offboard" in text
+
+
 def test_own_policy(tmp_path: Path) -> None:
     text = output_of("own_policy.py", tmp_path)
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2

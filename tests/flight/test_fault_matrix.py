@@ -1,0 +1,94 @@
+"""The fault matrix: a handful of its flights, what is made of them, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from airl_mav.cli import faults
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
+from airl_mav.experiments.fault_matrix import Cell, cell_text, fly_matrix, markdown
+from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES
+from airl_mav.faults.model import Fault
+from tests.support.flight_rig import quad
+
+
+def test_the_catalogue_holds_faults_without_a_time() -> None:
+    for case in CASES:
+        fault = Fault.model_validate(case.fault)
+        assert (fault.phase, fault.at_s) == (None, 0.0)
+        assert str(fault) == case.fault or Fault.model_validate(str(fault)) == fault
+
+
+def test_what_a_quadrotor_survives_and_what_not() -> None:
+    gust = fly_fault(quad(), "wind gust 6,0,0m/s for 4s", "hold", 1)
+    assert gust.end == "landed"
+    assert gust.touchdown_m_s is not None
+    assert gust.touchdown_m_s < 1.5
+    assert gust == fly_fault(quad(), "wind gust 6,0,0m/s for 4s", "hold", 1)
+    motor = fly_fault(quad(), "motor1 off", "hold", 1)
+    assert motor.end == "crashed"
+    assert motor.end in FALLS
+    assert motor.touchdown_m_s is not None
+    assert motor.touchdown_m_s > 2.0
+
+
+def flight(end: str, touchdown_m_s: float | None = None) -> FaultFlight:
+    told = ("baro off", "hold", 1, end, touchdown_m_s, 5.0, "LAND", ())
+    return FaultFlight(*told)  # type: ignore[arg-type]
+
+
+def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
+    good = Cell("baro off", "hold", (flight("landed", 0.7), flight("landed", 0.9)))
+    assert cell_text(good) == "2 landed (0.9 m/s)"
+    bad = Cell("baro off", "climb", (flight("landed", 0.7), flight("broken")))
+    assert cell_text(bad) == "1 landed (0.7 m/s), 1 broken !"
+    assert markdown([good, bad]).splitlines() == [
+        "| fault | hold | climb |",
+        "|---|---|---|",
+        "| `baro off` | 2 landed (0.9 m/s) | 1 landed (0.7 m/s), 1 broken ! |",
+    ]
+    # On the ground a fault may also keep the vehicle from arming.
+    assert not Cell("baro off", "ground", (flight("not armed"),)).unexpected
+    assert Cell("baro off", "hold", (flight("not armed"),)).unexpected
+
+
+def test_workers_change_no_result() -> None:
+    asked = (quad(), ("baro off",), ("landing",), (1, 2))
+    assert fly_matrix(*asked, workers=2) == fly_matrix(*asked)  # type: ignore[arg-type]
+
+
+def test_the_command_flies_shows_and_saves(tmp_path: Path) -> None:
+    options = faults.OPTIONS.model_validate(
+        {"faults": ["mag off"], "phases": ["hold"], "episodes": 1, "workers": 1, "out": tmp_path}
+    )
+    console = Console(record=True, width=120)
+    assert faults.run(options, console) == 0
+    assert "1 landed" in console.export_text()
+    assert "| `mag off` | 1 landed" in (tmp_path / "faults.md").read_text()
+    flights = json.loads((tmp_path / "faults.json").read_text())["flights"]
+    assert [(f["fault"], f["phase"], f["seed"]) for f in flights] == [("mag off", "hold", 1)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "line"),
+    [
+        ({"phases": ["dinner"]}, "phases 'dinner': accepted: ground, climb"),
+        ({"faults": ["gps off at 3s"]}, "without a time"),
+        ({"faults": ["link cut"]}, "nobody is at the link here"),
+    ],
+)
+def test_what_cannot_be_flown_gets_one_line(fields: dict[str, object], line: str) -> None:
+    with pytest.raises(FieldError, match=line):
+        faults.run(faults.OPTIONS.model_validate(fields))
+
+
+def test_every_phase_of_the_matrix_sets_its_faults_off() -> None:
+    """A fault that never began would pass for one that was survived."""
+    for phase in MATRIX_PHASES:
+        flown = fly_fault(quad(), "battery off", phase, 1)
+        assert any("battery" in text.lower() for text in flown.said), phase
