@@ -14,7 +14,8 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.parameter_store import Keeper
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
@@ -24,6 +25,9 @@ from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
+
+AUTOSAVE_US = 300_000
+"""Changed parameters are saved this long after the first change, as by PX4 [µs]."""
 
 IDLE_S = 0.02
 """How often requests are checked while no episode is loaded [s]."""
@@ -109,27 +113,55 @@ class FlightStack(Protocol):
 class BuiltinFlightStack:
     """The built-in autopilot behind our own MAVLink server. Implements `FlightStack`."""
 
-    def __init__(self, server: MavlinkServer) -> None:
+    def __init__(self, server: MavlinkServer, keeper: Keeper | None = None) -> None:
+        """Take the links; `keeper` keeps the parameters that users set, None = nobody does."""
         self._server = server
+        self._keeper = keeper
         self._autopilot: BuiltinAutopilot | None = None
+        self._now_us = 0
+        self._save_us: int | None = None
+        """When changed parameters are saved; None = there is nothing to save."""
         self.filenos = server.filenos
         self.receive = server.receive
-        self.send = server.send
+        self.send = server.send if keeper is None else self._send_and_save
         self.log_to = server.log_to
         self.counters = server.counters
         self.strangers = server.strangers
-        self.close = server.close
 
     def boot(self, setup: EpisodeSetup) -> BuiltinAutopilot:
         """Boot the autopilot of an episode. Raises UsageError for a wrong parameter."""
-        self._autopilot = builtin_autopilot(setup)
-        return self._autopilot
+        self._autopilot = autopilot = builtin_autopilot(setup, self._keeper)
+        if self._keeper is not None:
+            autopilot.parameters.on_change(self._changed)
+        return autopilot
 
     def connect(self, tick: Callable[[], int]) -> None:
         """Attach the autopilot to the MAVLink server."""
         del tick
         if self._autopilot is not None:
             self._server.attach(self._autopilot)
+
+    def close(self) -> None:
+        """Save parameters that are not saved yet, and close the links."""
+        self._save()
+        self._server.close()
+
+    def _send_and_save(self, now_us: int) -> None:
+        self._server.send(now_us)
+        self._now_us = now_us
+        if self._save_us is not None and now_us >= self._save_us:
+            self._save()
+
+    def _changed(self) -> None:
+        if self._save_us is None:
+            self._save_us = self._now_us + AUTOSAVE_US
+
+    def _save(self) -> None:
+        if self._save_us is None or self._autopilot is None:
+            return
+        self._save_us = None
+        if not self._autopilot.parameters.save():
+            self._autopilot.report(Message(Severity.CRITICAL, "Parameters could not be saved"))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.spread import draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.autopilot.parameter_store import Keeper, Parameters
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.injection import ClientFaults
@@ -47,12 +47,16 @@ class EpisodeSetup:
     """What the onboard computer draws from the pack [W]."""
 
 
-def builtin_autopilot(setup: EpisodeSetup) -> BuiltinAutopilot:
-    """Boot the built-in autopilot. Raises UsageError for a wrong parameter of the vehicle's."""
+def builtin_autopilot(setup: EpisodeSetup, keeper: Keeper | None = None) -> BuiltinAutopilot:
+    """Boot the built-in autopilot.
+
+    `keeper` keeps the parameters that users set. Raises UsageError for a wrong parameter of the
+    vehicle's, or when what is kept cannot be read.
+    """
     overrides = dict(setup.vehicle.autopilot_parameters())
     if instance := setup.aircraft.real.instance:
         overrides["MAV_SYS_ID"] = instance + 1  # as PX4 SITL's rcS sets it
-    parameters = Parameters(overrides)
+    parameters = Parameters(overrides, keeper)
     if setup.aircraft.estimator == "kernel":
         return BuiltinAutopilot(parameters)
     # The library's filter, equal to rounding. Imported late: it brings scipy's statistics along.

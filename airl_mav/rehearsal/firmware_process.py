@@ -41,6 +41,7 @@ from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
+from firmware_sim.kept_parameters import KeptParameters
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
@@ -62,6 +63,7 @@ def build_firmware(
     insecure: bool = False,
     log: Path | None = None,
     recording: bool = True,
+    parameters_file: Path | None = None,
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
@@ -74,6 +76,8 @@ def build_firmware(
         gcs_host: IPv4 address of the ground station.
         insecure: Whether addresses are allowed that other machines can reach.
         log: What real firmware prints goes here; None: to a file in its folder.
+        parameters_file: Where the built-in autopilot keeps the parameters that users set; None: it
+            forgets them.
         recording: Whether episodes are recorded, to be saved; without, they may last for ever.
 
     Raises:
@@ -100,7 +104,8 @@ def build_firmware(
         if link_fails(aircraft.faults):
             failing = FailingEndpoint(links.api, pacing.clock)
         server = udp_server(links, unix_us(), pacing.clock, signing, onboard=failing)
-        flight_stack = BuiltinFlightStack(server)
+        keeper = None if parameters_file is None else KeptParameters(parameters_file)
+        flight_stack = BuiltinFlightStack(server, keeper)
     else:
         flight_stack = real_firmware(Wanted(aircraft, vehicle, log, ends))
     try:

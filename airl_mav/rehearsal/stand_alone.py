@@ -64,6 +64,7 @@ def fly_vehicle(
         log=asked.firmware_log,
         # It may fly for days, and nobody collects what would be recorded.
         recording=False,
+        parameters_file=asked.parameters_file,
     )
     with closing(firmware):
         firmware.on_message = listener.text

@@ -118,6 +118,11 @@ class StandAloneVehicle(Aircraft):
         default=TIME_LIMIT_S,
         description="with a goal radius: longest flight from the start of navigation",
     )
+    parameters_file: Path | None = Field(
+        default=None,
+        description="keep the parameters that clients set in this file: read at the start, written"
+        " after every change; QGroundControl loads it, too",
+    )
     tlog: Path | None = Field(
         default=None,
         description="write the MAVLink log of the onboard link to this file, and the vehicle's log"
@@ -212,6 +217,13 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
             "without bind, companion_host and gcs_host; its links are its own, on this machine",
         )
     _check_folder("tlog", asked.tlog)
+    if asked.parameters_file is not None:
+        if asked.lockstep:
+            raise FieldError("parameters_file", asked.parameters_file, "without lockstep")
+        if asked.firmware != "builtin":
+            problem = "real firmware keeps its own parameters"
+            raise FieldError("parameters_file", asked.parameters_file, problem=problem)
+        _check_folder("parameters_file", asked.parameters_file)
 
 
 def check_companion(asked: StandAloneCompanion) -> None:

@@ -278,6 +278,10 @@ class BuiltinAutopilot:
     def close(self) -> None:
         """Do nothing: it holds nothing."""
 
+    def report(self, message: Message) -> None:
+        """Say something to the operator that does not come from flying."""
+        self._say(message)
+
     def take_messages(self) -> list[Message]:
         """Return texts for the operator since the last call."""
         taken, self._messages = self._messages, []

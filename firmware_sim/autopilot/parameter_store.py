@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
+from airl_mav.core.errors import UsageError
 from airl_mav.profiles.parameters import SPEC_BY_NAME, SPECS, flown_values, parameter_values
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.port import ParameterValue
@@ -14,6 +16,18 @@ FLOAT32_RELATIVE = 1e-6
 """Values that differ by no more than this share are the same as MAVLink carries them."""
 
 _INT32_LOW, _INT32_HIGH = -(2**31), 2**31 - 1
+
+
+class Keeper(Protocol):
+    """Where parameters are kept that outlive the flight controller."""
+
+    def read(self) -> Mapping[str, int | float]:
+        """Return what is kept. Raises UsageError when it cannot be read."""
+        ...
+
+    def write(self, values: Mapping[str, int | float]) -> None:
+        """Keep these instead. Raises OSError when they cannot be written."""
+        ...
 
 
 class Parameters:
@@ -26,18 +40,18 @@ class Parameters:
     def __init__(
         self,
         overrides: Mapping[str, int | float] | None = None,
-        stored: Mapping[str, int | float] | None = None,
+        keeper: Keeper | None = None,
     ) -> None:
         """Start from the defaults.
 
         Args:
             overrides: Those of a vehicle profile, checked; see `parameter_values`. They are this
                 vehicle's defaults.
-            stored: Values that users have set before, as they were given. Unknown names, and what
-                does not fit a parameter's type, are left out.
+            keeper: Has what users have set before, and keeps what they set; None: nobody does.
+                Unknown names, and what does not fit a parameter's type, are left out.
 
         Raises:
-            UsageError: An override is unknown or out of range.
+            UsageError: An override is unknown or out of range, or what is kept cannot be read.
         """
         values = parameter_values(overrides or {})
         self._defaults = dict(values)
@@ -50,8 +64,10 @@ class Parameters:
         self._bounded: set[str] = {name for name in values if self._is_bounded(name)}
         """Parameters whose stored value is flown bounded, and said to be."""
         self._texts: list[Message] = [self._bounded_text(name) for name in sorted(self._bounded)]
-        for name, value in (stored or {}).items():
-            self._store(name, value)
+        self._keeper = keeper
+        if keeper is not None:
+            for name, value in keeper.read().items():
+                self._store(name, value)
 
     def on_change(self, listener: Callable[[], None]) -> None:
         """Call `listener` after every change."""
@@ -98,6 +114,33 @@ class Parameters:
         for name, value in self._defaults.items():
             self._store(name, value)
         self._changed()
+
+    def load(self) -> bool:
+        """Return to what is kept, to the defaults where nothing is; return whether that went well.
+
+        Without a keeper there is nothing to return to: nothing changes.
+        """
+        if self._keeper is not None:
+            try:
+                kept = self._keeper.read()
+            except UsageError:
+                return False
+            for name, value in {**self._defaults, **kept}.items():
+                self._store(name, value)
+            self._changed()
+        return True
+
+    def save(self) -> bool:
+        """Keep what differs from the defaults; return whether that went well.
+
+        Without a keeper there is nothing to do, and so nothing that could fail.
+        """
+        if self._keeper is not None:
+            try:
+                self._keeper.write(self.changed())
+            except OSError:
+                return False
+        return True
 
     def changed(self) -> dict[str, int | float]:
         """Return the parameters that differ from the vehicle's defaults."""

@@ -46,6 +46,18 @@ class ParameterStore(Protocol):
         """Store a value as given, and return what is stored now."""
         ...
 
+    def reset(self) -> None:
+        """Return to the defaults."""
+        ...
+
+    def load(self) -> bool:
+        """Return to what is kept, where something is kept; return whether that went well."""
+        ...
+
+    def save(self) -> bool:
+        """Keep what differs from the defaults; return whether that went well."""
+        ...
+
 
 class Failures(Protocol):
     """Makes parts of the simulated vehicle fail at a client's word."""

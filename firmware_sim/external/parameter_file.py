@@ -25,6 +25,8 @@ def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
     """
     head = "# Vehicle-Id Component-Id Name Value Type\n"
     return head + "".join(
-        f"1\t1\t{name}\t{value:.9g}\t{_INT32 if isinstance(value, int) else _REAL32}\n"
+        f"1\t1\t{name}\t{value}\t{_INT32}\n"
+        if isinstance(value, int)
+        else f"1\t1\t{name}\t{value:.9g}\t{_REAL32}\n"
         for name, value in settings.items()
     )

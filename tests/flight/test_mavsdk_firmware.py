@@ -36,6 +36,7 @@ class Client:
     """MAVSDK connected to a firmware process."""
 
     def __init__(self, companion: Companion, firmware: Running) -> None:
+        self.companion = companion
         self.firmware = firmware
         self.telemetry: Telemetry = companion.plugin(Telemetry)
         self.action: Action = companion.plugin(Action)

@@ -81,6 +81,15 @@ class Parameters:
         self.values[name] = type(self.values[name])(value)
         return self.by_name(name)
 
+    def reset(self) -> None:
+        self.values = dict(sorted(DEFAULT_PARAMETERS.items()))
+
+    def load(self) -> bool:
+        return True
+
+    def save(self) -> bool:
+        return True
+
 
 class KinematicAutopilot:
     """Velocity follows the setpoint with a first-order lag; attitude is level."""

@@ -8,7 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -422,8 +422,15 @@ def test_reset_returns_to_the_vehicles_values() -> None:
 
 
 def test_stored_values_are_taken_over_as_given_and_the_rest_is_left_out() -> None:
-    stored = {"MPC_XY_P": 99.0, "NO_SUCH": 1, "SDLOG_MODE": 2**31, "MPC_Z_P": math.nan}
-    store = Parameters({"MPC_XY_P": 1.5}, stored)
+    class Kept:
+        def read(self) -> Mapping[str, int | float]:
+            return {"MPC_XY_P": 99.0, "NO_SUCH": 1, "SDLOG_MODE": 2**31, "MPC_Z_P": math.nan}
+
+        def write(self, values: Mapping[str, int | float]) -> None:
+            raise OSError("a full disk")
+
+    store = Parameters({"MPC_XY_P": 1.5}, Kept())
+    assert not store.save()
     assert store.changed() == {"MPC_XY_P": 99.0}
     assert store["MPC_XY_P"] == 2.0
 

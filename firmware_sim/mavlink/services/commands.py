@@ -19,6 +19,7 @@ from firmware_sim.mavlink.services import (
     message_requests,
     mission_commands,
     navigation_commands,
+    parameter_storage,
     standard_modes,
     without_effect,
 )
@@ -87,6 +88,7 @@ ACTIONS: dict[int, Action] = {
     **calibration.ACTIONS,
     **mission_commands.ACTIONS,
     **navigation_commands.ACTIONS,
+    **parameter_storage.ACTIONS,
     **standard_modes.ACTIONS,
     **without_effect.ACTIONS,
 }

@@ -1,0 +1,67 @@
+"""One call and what PX4 answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from tests.support.px4_walk.vehicle import Vehicle
+
+OK = "ok"
+"""The call succeeds."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A call, with the outcome that a real PX4 has."""
+
+    area: str
+    call: str
+    make: Callable[[Vehicle], Any]
+    """Makes the call and returns what it returns; raises what MAVSDK raises."""
+    expected: tuple[str, ...] = (OK,)
+    """Outcomes that agree: `OK`, or names of MAVSDK's results. The first is PX4's."""
+    check: Callable[[Any], bool] | None = None
+    """What the returned value must be like."""
+    slow: bool = False
+    """Whether the call takes seconds of wall time, on a real PX4 too: MAVSDK waits."""
+
+    @property
+    def name(self) -> str:
+        """Area and call."""
+        return f"{self.area}: {self.call}"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a vehicle answered to a row."""
+
+    row: Row
+    outcome: str
+    value: Any = None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether it is what PX4 answers."""
+        if self.outcome not in self.row.expected:
+            return False
+        return self.outcome != OK or self.row.check is None or self.row.check(self.value)
+
+
+def answered(row: Row, vehicle: Vehicle) -> Answer:
+    """Make a row's call."""
+    try:
+        return Answer(row, OK, row.make(vehicle))
+    except Refused as refused:
+        return Answer(row, refused.outcome)
+    except Exception as error:  # MAVSDK's errors have one class for each plugin
+        return Answer(row, str(error).split(";")[0].strip() or type(error).__name__)
+
+
+class Refused(Exception):  # noqa: N818 - an outcome, not a fault of the program
+    """A call that is not one of MAVSDK's was refused."""
+
+    def __init__(self, outcome: str) -> None:
+        super().__init__(outcome)
+        self.outcome = outcome
