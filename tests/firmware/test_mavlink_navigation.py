@@ -35,8 +35,10 @@ def command_int(
     return rig.acknowledged(number)[0]
 
 
-@pytest.mark.parametrize(("frame", "altitude"), [(0, ORIGIN.altitude_m + 7.0), (3, 7.0), (6, 7.0)])
-def test_reposition(rig: Rig, frame: int, altitude: float) -> None:
+@pytest.mark.parametrize("frame", [0, 3, 5, 6])
+def test_reposition_in_whichever_frame(rig: Rig, frame: int) -> None:
+    """PX4 takes every altitude as above sea level; MAVSDK's do_orbit relies on it."""
+    altitude = ORIGIN.altitude_m + 7.0
     four = (3.0, 1.0, 0.0, 1.5)
     assert command_int(rig, REPOSITION, frame, four, *PLACE, altitude) == Result.ACCEPTED
     (request,) = rig.autopilot.requests

@@ -30,12 +30,16 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     sender,
 )
-from firmware_sim.mavlink.services.navigation_commands import ABOVE_HOME
 from firmware_sim.mavlink.services.standard_modes import change_mode
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
+
+_RELATIVE_FRAMES = (
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+)
 
 
 def _arm_disarm(command: Command, context: Context) -> Result | None:
@@ -54,7 +58,7 @@ def _takeoff(command: Command, context: Context) -> Result:
     altitude = command.params[6]
     if not math.isfinite(altitude):
         return context.port.takeoff(None)
-    if command.frame in ABOVE_HOME:
+    if command.frame in _RELATIVE_FRAMES:
         return context.port.takeoff(altitude)
     home = context.port.state().home
     if home is None:

@@ -1,7 +1,8 @@
 """Commands that send the vehicle somewhere: to a place, round a place, at a speed.
 
-Source: PX4 1.16, Commander.cpp and Navigator, checked against a running one. PX4 takes every
-altitude as above mean sea level; a frame above home is understood here, as MAVLink defines it.
+Source: PX4 1.16, Commander.cpp and Navigator, checked against a running one. PX4 does not look
+at the frame: every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
+an altitude in a frame above home.
 """
 
 from __future__ import annotations
@@ -18,12 +19,6 @@ from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import Context
 
 NAN = math.nan
-
-ABOVE_HOME = (
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-)
-"""Frames whose altitude counts from home."""
 
 _CHANGE_MODE: int = dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 _GROUND_SPEED: int = dialect.SPEED_TYPE_GROUNDSPEED
@@ -71,11 +66,9 @@ def _local(command: Command, context: Context) -> Vec:
     """Return parameters 5..7 in local NED [m]; NaN where nothing is given or known."""
     latitude, longitude, altitude = command.params[4:]
     state = context.port.state()
-    origin, home = state.origin, state.home
-    if origin is None or home is None:
+    origin = state.origin
+    if origin is None:
         return NAN, NAN, NAN
-    if command.frame in ABOVE_HOME:
-        altitude += home.altitude_m
     down = origin.altitude_m - altitude if math.isfinite(altitude) else NAN
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         return NAN, NAN, down
