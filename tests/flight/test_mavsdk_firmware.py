@@ -11,9 +11,15 @@ from typing import Any
 import pytest
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.exceptions import MavsdkError
-from mavsdk.plugins.action import Action
+from mavsdk.plugins.action import Action, OrbitYawBehavior
+from mavsdk.plugins.follow_me import FollowMe, TargetLocation
+from mavsdk.plugins.manual_control import ManualControl
 from mavsdk.plugins.offboard import (
+    AccelerationNed,
+    Attitude,
+    AttitudeRate,
     Offboard,
+    PositionGlobalYaw,
     PositionNedYaw,
     VelocityBodyYawspeed,
     VelocityNedYaw,
@@ -41,6 +47,7 @@ class Client:
         self.telemetry: Telemetry = companion.plugin(Telemetry)
         self.action: Action = companion.plugin(Action)
         self.offboard: Offboard = companion.plugin(Offboard)
+        self.plugin = companion.plugin
         self.param: Param = companion.plugin(Param)
 
     def until(self, condition: Callable[[], Any], what: str) -> Any:
@@ -182,6 +189,80 @@ def test_offboard_flight(tmp_path: Path) -> None:
         c.until(lambda: telemetry.flight_mode() == FlightMode.LAND, "landing")
         c.wait_landed()
         assert math.dist(c.gps(), (10.0, -3.0)) < 1.5
+
+
+def test_going_places_with_every_plugin(tmp_path: Path) -> None:
+    """The part of the long walk over a real PX4 that goes places: same calls, same outcomes."""
+    with client(tmp_path) as c:
+        telemetry, action, offboard = c.telemetry, c.action, c.offboard
+        telemetry.set_rate_position_velocity_ned(30.0)
+        c.take_off(6.0)
+        home = telemetry.home()
+        north = 180.0 / math.pi / EARTH_RADIUS_M
+        east = north / math.cos(math.radians(home.latitude_deg))
+
+        def at(n: float, e: float) -> tuple[float, float]:
+            return home.latitude_deg + n * north, home.longitude_deg + e * east
+
+        def mode(wanted: FlightMode) -> None:
+            c.until(lambda: telemetry.flight_mode() == wanted, str(wanted))
+
+        def near(n: float, e: float, d: float) -> None:
+            c.until(lambda: math.dist(c.position(), (n, e, d)) < 0.8, f"{n} {e} {d}")
+
+        altitude = home.absolute_altitude_m + 8.0
+        action.goto_location(*at(8.0, 4.0), altitude, 90.0)
+        near(8.0, 4.0, -8.0)
+        c.until(lambda: abs(c.yaw() - 90.0) < 5.0, "the heading")
+        action.set_current_speed(2.0)
+        action.do_orbit(
+            6.0, 2.0, OrbitYawBehavior.HOLD_FRONT_TO_CIRCLE_CENTER, *at(8.0, 4.0), altitude
+        )
+        c.until(lambda: abs(math.hypot(*c.velocity()[:2]) - 2.0) < 0.4, "going round")
+        assert math.dist(c.position()[:2], (8.0, 4.0)) < 7.5
+        action.hold()
+        mode(FlightMode.HOLD)
+
+        offboard.set_position_global(
+            PositionGlobalYaw(*at(0.0, 0.0), 7.0, 0.0, PositionGlobalYaw.AltitudeType.REL_HOME)
+        )
+        offboard.start()
+        near(0.0, 0.0, -7.0)
+        offboard.set_acceleration_ned(AccelerationNed(1.0, 0.0, 0.0))
+        c.until(lambda: c.velocity()[0] > 0.7, "moving by its acceleration")
+        offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
+        c.until(lambda: math.hypot(*c.velocity()) < 0.3, "a stand")
+        offboard.set_attitude(Attitude(0.0, -10.0, 0.0, 0.5))
+        c.until(lambda: telemetry.attitude_euler().pitch_deg < -7.0, "nose down")
+        offboard.set_attitude_rate(AttitudeRate(0.0, 0.0, 40.0, 0.5))
+        c.until(lambda: c.yaw() > 15.0, "turning")
+        assert telemetry.flight_mode() == FlightMode.OFFBOARD
+        offboard.set_velocity_ned(VelocityNedYaw(0.0, 0.0, 0.0, 0.0))
+        c.until(lambda: math.hypot(*c.velocity()) < 0.3, "a stand")
+        offboard.stop()
+
+        sticks: ManualControl = c.plugin(ManualControl)
+        sticks.set_manual_control_input(0.0, 0.0, 0.5, 0.0)
+        sticks.start_position_control()
+        mode(FlightMode.POSCTL)
+
+        def pulled() -> bool:
+            sticks.set_manual_control_input(-0.6, 0.0, 0.5, 0.0)
+            return c.velocity()[0] < -0.5
+
+        c.until(pulled, "backwards")
+        action.hold()
+        mode(FlightMode.HOLD)
+
+        follow: FollowMe = c.plugin(FollowMe)
+        target = TargetLocation(*at(14.0, 0.0), home.absolute_altitude_m, 0.0, 0.0, 0.0)
+        assert failure(lambda: follow.set_target_location(target)) == "NOT_ACTIVE"
+        follow.start()
+        mode(FlightMode.FOLLOW_ME)
+        follow.stop()
+        mode(FlightMode.HOLD)
+        action.return_to_launch()
+        mode(FlightMode.RETURN_TO_LAUNCH)
 
 
 def test_refusals_in_the_air_and_hold(tmp_path: Path) -> None:
