@@ -250,6 +250,14 @@ def test_altitudes_above_sea_and_home_that_moves() -> None:
     assert target(flight) == (20.0, 0.0, -12.0)
 
 
+@pytest.mark.parametrize("up", [NAN, math.inf])
+def test_an_altitude_that_is_no_number_is_the_present_one(up: float) -> None:
+    flight = flying(at(20, 0, up, N.WAYPOINT, math.inf, math.inf), at(40, 0, 10))
+    assert target(flight) == (20.0, 0.0, -10.0)
+    flight.arrive()
+    assert flight.plans.current == 1
+
+
 @pytest.mark.parametrize("mount_turns", [0.0, 1.0])
 def test_region_of_interest(mount_turns: float) -> None:
     looked_at = place(0.0, 50.0)

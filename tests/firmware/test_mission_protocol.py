@@ -183,6 +183,16 @@ def test_invalid_items_end_the_upload(rig: Rig, fields: dict[str, Any], result: 
     assert upload(rig, MIXED[:2]) == 0
 
 
+@pytest.mark.parametrize(("x", "y", "result"), [("nan", "8.5", 10), ("47.4", "inf", 11)])
+def test_a_place_must_be_numbers(rig: Rig, x: str, y: str, result: int) -> None:
+    rig.exchange(dialect.MAVLink_mission_count_message(1, 1, 1, 0))
+    item = dialect.MAVLink_mission_item_message(
+        1, 1, 0, 3, 16, 1, 1, 0, 0, 0, 0, float(x), float(y), 10, 0
+    )
+    answers = rig.exchange(item)
+    assert [m.type for m in answers if m.get_type() == "MISSION_ACK"] == [result]
+
+
 @pytest.mark.parametrize(
     ("kind", "fields"), [(0, {"command": 5100}), (0, {"command": 5001}), (1, {"command": 5001})]
 )

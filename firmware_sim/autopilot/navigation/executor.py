@@ -325,7 +325,9 @@ class MissionExecutor:
     def _place(self, item: PlanItem, situation: Situation) -> Vec:
         if not (item.has_position or item.command == _N.CONDITION_GATE):
             return situation.position
-        return situation.local(item.place(situation.home.altitude_m))
+        north, east, down = situation.local(item.place(situation.home.altitude_m))
+        # An altitude that is not given is the present one.
+        return north, east, down if math.isfinite(down) else situation.position[2]
 
     def _follow_home(self, situation: Situation) -> None:
         """Shift the altitudes that count from home when home has moved."""

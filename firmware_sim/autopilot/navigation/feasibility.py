@@ -150,6 +150,6 @@ def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) 
     if first is None or most_m <= 0.0:
         return []
     away = distance_m((first.x, first.y), (home.latitude_deg, home.longitude_deg))
-    if away < most_m:
+    if not away >= most_m:
         return []
     return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"]

@@ -144,6 +144,10 @@ def parse(message: WireMessage) -> PlanItem | int:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
         if roi and _whole(message.param1) not in (_ROI_NONE, _ROI_LOCATION):
             return int(dialect.MAV_MISSION_INVALID_PARAM1)
+        if not (math.isfinite(x) and math.isfinite(y)):
+            # PX4 stores such a place, and does not know what to fly.
+            wrong_y = dialect.MAV_MISSION_INVALID_PARAM6_Y
+            return int(wrong_y if math.isfinite(x) else dialect.MAV_MISSION_INVALID_PARAM5_X)
         if integer:
             x, y = x * 1e-7, y * 1e-7
     elif frame == Frame.MISSION:
