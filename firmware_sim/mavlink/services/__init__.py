@@ -17,6 +17,7 @@ from firmware_sim.mavlink.services import (
     peers,
     pilot,
     setpoints,
+    shell,
     signing,
 )
 from firmware_sim.mavlink.services.context import Context, for_vehicle, for_vehicle_or_all
@@ -51,6 +52,7 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
         "SETUP_SIGNING": (for_vehicle_or_all, signing.handle_setup),
         "PING": (_for_anyone, peers.handle_ping),
         "TIMESYNC": (_for_anyone, peers.handle_timesync),
+        "SERIAL_CONTROL": (_for_anyone, shell.handle_input),
         "FILE_TRANSFER_PROTOCOL": (for_vehicle_or_all, ftp.handle_request),
         "LOG_REQUEST_LIST": (for_vehicle_or_all, logs.handle_list),
         "LOG_REQUEST_DATA": (for_vehicle_or_all, logs.handle_data),
@@ -83,6 +85,7 @@ PENDING: tuple[Callable[[Context], None], ...] = (
     missions.send_pending,
     ftp.send_pending,
     calibration.send_pending,
+    shell.send_pending,
     logs.send_pending,
 )
 """Send the next part of what a client is getting piece by piece; once a tick and client."""

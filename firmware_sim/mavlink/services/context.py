@@ -14,6 +14,7 @@ from firmware_sim.mavlink.services.ftp_session import FtpClient
 from firmware_sim.mavlink.services.log_transfer import LogDownload, LogStream
 from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
+from firmware_sim.mavlink.services.shell_session import Shell
 from firmware_sim.storage import Storage
 
 ANY = 0
@@ -45,6 +46,8 @@ class Context:
     """The vehicle's files, the same for all clients."""
     ftp: FtpClient = field(default_factory=FtpClient)
     """The client's part in MAVLink FTP."""
+    shell: Shell = field(default_factory=Shell)
+    """The client's part in the shell."""
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
     """The vehicle's, the same for all clients."""
     log_listing: range = range(0)
