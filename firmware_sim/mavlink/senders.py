@@ -13,6 +13,13 @@ COMMANDS = frozenset(
         "COMMAND_INT",
         "SET_MODE",
         "SET_POSITION_TARGET_LOCAL_NED",
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        "SET_ATTITUDE_TARGET",
+        "MANUAL_CONTROL",
+        "RC_CHANNELS_OVERRIDE",
+        "MISSION_COUNT",
+        "MISSION_CLEAR_ALL",
+        "MISSION_SET_CURRENT",
         "PARAM_SET",
         "SETUP_SIGNING",
     )

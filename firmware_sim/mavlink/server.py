@@ -25,6 +25,7 @@ from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
+from firmware_sim.mavlink.traffic_log import TrafficLog
 from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 4
@@ -88,6 +89,7 @@ class MavlinkServer:
             "TIMESYNC": peers.timesync_request,
         }
         self._forwarder = Forwarder(self._all)
+        self._traffic = TrafficLog(lambda: self._now_us)
         self._links = [self._open(config, link_id) for link_id, config in enumerate(links)]
         if port is not None:
             self.attach(port)
@@ -173,16 +175,16 @@ class MavlinkServer:
                 self._stored.save_due()
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
-        """Write both directions of a link to a tlog from now on; None ends it.
+        """Write both directions of a link's preset remote to a tlog from now on; None ends it.
 
-        The caller closes the writer. Raises ValueError if there is no such link.
+        Every other client that speaks, on any link, has a log of its own beside it. The caller
+        closes the writer. Raises ValueError if there is no such link.
         """
         (clients,) = (clients for clients in self._links if clients.name == link)
-        preset = clients.preset()
-        if preset is not None:
-            preset.link.tap = (
-                None if tlog is None else lambda frame: tlog.write(self._now_us, frame)
-            )
+        if tlog is None:
+            self._traffic.end()
+        else:
+            self._traffic.begin(tlog, clients.preset())
 
     def counters(self) -> dict[str, LinkCounters]:
         """Return the traffic per link name, all its clients together."""
@@ -258,6 +260,7 @@ class MavlinkServer:
             return False
         client.context.now_us = self._now_us
         client.hear(message)
+        self._traffic.heard(client, bytes(message.get_msgbuf()))
         effective = handle(message, client.context)
         if effective:
             self._senders.note(message)

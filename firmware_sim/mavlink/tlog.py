@@ -26,6 +26,14 @@ class TlogWriter(LogFile):
         super().__init__(path)
         self._start_unix_us = start_unix_us
 
+    def beside(self, name: str) -> TlogWriter:
+        """Open another log of the same times: flight-001.NAME.tlog beside flight-001.tlog.
+
+        Raises OSError.
+        """
+        path = self.path.with_name(f"{self.path.stem}.{name}{self.path.suffix}")
+        return TlogWriter(path, self._start_unix_us)
+
     def write(self, time_us: int, frame: bytes) -> None:
         """Add one frame, sent or received at simulated `time_us` [µs]."""
         self.add(time_us, _TIME.pack(self._start_unix_us + time_us & ~_LINK_BITS), frame)

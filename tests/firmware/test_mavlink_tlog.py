@@ -12,8 +12,12 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
+from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
+from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
+from tests.support.memory_hub import MemoryHub
 
 
 def read(path: Path) -> list[Any]:
@@ -41,7 +45,7 @@ def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) ->
     with closing(TlogWriter(path, BOOT_UNIX_US)) as tlog:
         bench.server.log_to(tlog)
         client.send(dialect.MAVLink_ping_message(1, 77, 0, 0))
-        station.send(dialect.MAVLink_ping_message(1, 99, 0, 0))
+        station.send(dialect.MAVLink_ping_message(1, 99, 1, 1))
         bench.run(2.0)
         bench.server.log_to(None)
         assert not path.exists()
@@ -61,6 +65,49 @@ def test_both_directions_of_the_onboard_link_with_their_times(tmp_path: Path) ->
         if message.get_type() == "ATTITUDE":
             expected_s = BOOT_UNIX_US / 1e6 + message.time_boot_ms / 1e3
             assert message._timestamp == pytest.approx(expected_s, abs=4e-6)
+
+
+def test_every_other_client_that_speaks_has_a_log_beside_it(tmp_path: Path) -> None:
+    hub, ground, autopilot = MemoryHub(), MemoryHub(), KinematicAutopilot()
+    server = MavlinkServer(
+        [onboard_link(hub), gcs_link(ground)], autopilot, boot_unix_us=BOOT_UNIX_US
+    )
+
+    def run(ticks: int) -> None:
+        for _ in range(ticks):
+            server.receive(autopilot.time_us)
+            autopilot.step()
+            server.send(autopilot.time_us)
+
+    run(50)
+    with closing(TlogWriter(tmp_path / "flight-001.tlog", BOOT_UNIX_US)) as tlog:
+        server.log_to(tlog)
+        run(10)
+        station, second, third = ground.client(None), hub.client(7), ground.client(8)
+        for number, client in enumerate((station, second, third)):
+            client.endpoint.take()
+            client.send(dialect.MAVLink_ping_message(1, number, 1, 1))
+        run(50)
+        server.log_to(None)
+    run(50)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {
+        "flight-001.tlog",
+        "flight-001.gcs.tlog",
+        "flight-001.gcs-2.tlog",
+        "flight-001.onboard-2.tlog",
+    }
+    said = {
+        name: [m.seq for m in read(tmp_path / name) if m.get_srcSystem() == 245] for name in names
+    }
+    assert said == {
+        "flight-001.tlog": [],
+        "flight-001.gcs.tlog": [0],
+        "flight-001.onboard-2.tlog": [1],
+        "flight-001.gcs-2.tlog": [2],
+    }
+    heard = [m for m in read(tmp_path / "flight-001.gcs.tlog") if m.get_type() == "ATTITUDE"]
+    assert len(heard) == 10  # both directions
 
 
 def test_unknown_link() -> None:
