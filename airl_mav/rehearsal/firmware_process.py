@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.kept_parameters import KeptParameters
+from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
@@ -64,6 +65,7 @@ def build_firmware(
     log: Path | None = None,
     recording: bool = True,
     parameters_file: Path | None = None,
+    devices: Sequence[LinkConfig] = (),
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
@@ -79,6 +81,7 @@ def build_firmware(
         parameters_file: Where the built-in autopilot keeps the parameters that users set; None: it
             forgets them.
         recording: Whether episodes are recorded, to be saved; without, they may last for ever.
+        devices: More links of the built-in flight controller.
 
     Raises:
         UsageError: A port is taken, an address unusable, or real firmware is not there.
@@ -103,7 +106,9 @@ def build_firmware(
         links = ends()
         if link_fails(aircraft.faults):
             failing = FailingEndpoint(links.api, pacing.clock)
-        server = udp_server(links, unix_us(), pacing.clock, signing, onboard=failing)
+        server = udp_server(
+            links, unix_us(), pacing.clock, signing, onboard=failing, devices=devices
+        )
         keeper = None if parameters_file is None else KeptParameters(parameters_file)
         flight_stack = BuiltinFlightStack(server, keeper)
     else:

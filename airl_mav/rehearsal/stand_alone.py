@@ -16,6 +16,8 @@ from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.external.programs import how_to_start
+from firmware_sim.mavlink.link import LinkConfig
+from firmware_sim.mavlink.udp_links import bind_device_links
 from firmware_sim.pacing import Unpaced, WallPacing
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.stand_alone import fly
@@ -53,6 +55,16 @@ def fly_vehicle(
     listener = listener or Listener()
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
+    devices: list[LinkConfig] = []
+    if asked.firmware == "builtin":
+        insecure = asked.insecure or asked.signing_key is not None
+        devices = bind_device_links(
+            asked.bind,
+            asked.companion_host,
+            asked.real.instance,
+            insecure=insecure,
+            say=listener.say,
+        )
     firmware = build_firmware(
         asked,
         vehicle,
@@ -65,6 +77,7 @@ def fly_vehicle(
         # It may fly for days, and nobody collects what would be recorded.
         recording=False,
         parameters_file=asked.parameters_file,
+        devices=devices,
     )
     with closing(firmware):
         firmware.on_message = listener.text

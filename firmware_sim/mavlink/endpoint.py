@@ -26,6 +26,10 @@ MAX_DATAGRAMS_PER_CALL = 256
 _MARKERS = (0xFD, 0xFE)
 
 
+class PortTakenError(UsageError):
+    """A port that another program has bound."""
+
+
 class Endpoint(Protocol):
     """One end of a MAVLink link. Nothing blocks and nothing raises while flying."""
 
@@ -210,7 +214,8 @@ class UdpEndpoint:
             if error.errno == errno.EADDRINUSE:
                 problem = "is taken (another simulator?)"
             where = f"UDP port {local[1]} on {local[0]}"
-            raise UsageError(f"{where} {problem}: choose another with {local_option}") from error
+            kind = PortTakenError if error.errno == errno.EADDRINUSE else UsageError
+            raise kind(f"{where} {problem}: choose another with {local_option}") from error
         self.local: Address = self._socket.getsockname()
 
     def receive(self) -> list[bytes]:

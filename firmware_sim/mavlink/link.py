@@ -18,7 +18,7 @@ from firmware_sim.mavlink.codec import (
     layout,
 )
 from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
-from firmware_sim.mavlink.rates import GCS_HZ, ONBOARD_HZ, interval_us
+from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
 
@@ -49,6 +49,16 @@ def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) ->
 def gcs_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
     """Return the link for a ground station (PX4: 18570 -> 14550)."""
     return LinkConfig("gcs", endpoint, GCS_HZ, separate_replies)
+
+
+def payload_link(endpoint: SharedEndpoint) -> LinkConfig:
+    """Return the link for a camera or another payload (PX4: 14280 -> 14030)."""
+    return LinkConfig("payload", endpoint, PAYLOAD_HZ)
+
+
+def gimbal_link(endpoint: SharedEndpoint) -> LinkConfig:
+    """Return the link for a gimbal (PX4: 13030 -> 13280)."""
+    return LinkConfig("gimbal", endpoint, GIMBAL_HZ)
 
 
 @dataclass(frozen=True, slots=True)

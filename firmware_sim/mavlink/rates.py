@@ -1,4 +1,4 @@
-"""Default stream rates of the two links, as measured on a real PX4 1.16 SITL.
+"""Default stream rates of the links, as measured on a real PX4 1.16 SITL.
 
 Messages that PX4 sends and we do not are left out: TIME_ESTIMATE_TO_TARGET, CURRENT_EVENT_SEQUENCE,
 LINK_NODE_STATUS, OPEN_DRONE_ID_*, DISTANCE_SENSOR (the vehicle has no such device). The tables'
@@ -75,6 +75,23 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
     }
 )
 """Ground station link, 18570 -> 14550 [Hz]."""
+
+
+PAYLOAD_RATE = 0.1432
+"""PX4 gives the payload link 4,000 bytes a second, and slows its streams down to fit. Measured."""
+
+PAYLOAD_HZ: Mapping[str, float] = MappingProxyType(
+    {
+        name: hz if name in ("HEARTBEAT", "PING", "MISSION_CURRENT", "GPS_RAW_INT") else slowed
+        for name, hz, slowed in ((name, hz, hz * PAYLOAD_RATE) for name, hz in ONBOARD_HZ.items())
+    }
+)
+"""Payload link, 14280 -> 14030 [Hz]: PX4's onboard mode, slower."""
+
+GIMBAL_HZ: Mapping[str, float] = MappingProxyType(
+    {"HEARTBEAT": 1.0, "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": 20.0, "MISSION_CURRENT": 1.0}
+)
+"""Gimbal link, 13030 -> 13280 [Hz]."""
 
 
 def interval_us(rate_hz: float) -> int:

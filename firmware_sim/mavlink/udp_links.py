@@ -1,13 +1,26 @@
-"""The two UDP links of PX4 SITL: onboard API and ground station."""
+"""The UDP links of PX4 SITL: onboard API, ground station, payload and gimbal."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.signing_key import StoredSigning
-from firmware_sim.mavlink.endpoint import Address, Endpoint, SharedEndpoint, UdpEndpoint
-from firmware_sim.mavlink.link import gcs_link, onboard_link
+from firmware_sim.mavlink.endpoint import (
+    Address,
+    Endpoint,
+    PortTakenError,
+    SharedEndpoint,
+    UdpEndpoint,
+)
+from firmware_sim.mavlink.link import (
+    LinkConfig,
+    gcs_link,
+    gimbal_link,
+    onboard_link,
+    payload_link,
+)
 from firmware_sim.mavlink.server import MavlinkServer
 
 
@@ -58,6 +71,40 @@ def bind_udp_links(
     return UdpLinks(api, gcs)
 
 
+DEVICE_PORTS = {payload_link: (14280, 14030), gimbal_link: (13030, 13280)}
+"""Local and remote port of PX4 SITL's links for devices aboard, of instance 0."""
+
+
+def bind_device_links(
+    bind: str, remote_host: str, instance: int, *, insecure: bool, say: Callable[[str], None]
+) -> list[LinkConfig]:
+    """Bind the vehicle's ports of the payload's and the gimbal's link.
+
+    A port that is taken is left out, and told: few vehicles have either, and two vehicles may share
+    a host on ports of the user's choice.
+
+    Raises:
+        UsageError: An address can be reached from other machines without `insecure`.
+    """
+    links: list[LinkConfig] = []
+    for link, ports in DEVICE_PORTS.items():
+        local, remote = (port + instance for port in ports)
+        try:
+            end = UdpEndpoint(
+                (bind, local),
+                (remote_host, remote),
+                local_option="--instance",
+                remote_option="--instance",
+                insecure=insecure,
+            )
+        except PortTakenError:
+            say(f"UDP port {local} is taken: no {link.__name__.replace('_', ' ')}")
+            continue
+        links.append(link(end))
+        say(f"{links[-1].name:<17} UDP port {remote} (from {local})")
+    return links
+
+
 def udp_server(
     ends: UdpLinks,
     boot_unix_us: int,
@@ -65,10 +112,11 @@ def udp_server(
     signing: StoredSigning | None = None,
     *,
     onboard: SharedEndpoint | None = None,
+    devices: Sequence[LinkConfig] = (),
 ) -> MavlinkServer:
-    """Return the server of both links, still without an autopilot; see `MavlinkServer`.
+    """Return the server of all links, still without an autopilot; see `MavlinkServer`.
 
     `onboard` stands in for the end of the onboard link, which it wraps; None: the end itself.
     """
-    links = [onboard_link(onboard or ends.api), gcs_link(ends.gcs)]
+    links = [onboard_link(onboard or ends.api), gcs_link(ends.gcs), *devices]
     return MavlinkServer(links, boot_unix_us=boot_unix_us, clock=clock, signing=signing)

@@ -14,6 +14,7 @@ from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import (
     actuators,
     flight_modes,
+    gimbal,
     information,
     pose,
     sensors,
@@ -51,6 +52,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
         "ORBIT_EXECUTION_STATUS": pose.orbit_execution_status,
+        "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": gimbal.autopilot_state_for_gimbal_device,
         "CURRENT_MODE": flight_modes.current_mode,
         "ESC_INFO": actuators.esc_info,
         "ESC_STATUS": actuators.esc_status,
