@@ -62,7 +62,7 @@ def test_two_instances_fly_side_by_side() -> None:
                 if step % 5 == 0:
                     for client in (ground, *(c for _, _, c in flights)):
                         while (message := client.recv_msg()) is not None:
-                            if client is ground:
+                            if client is ground and message.get_type() == "HEARTBEAT":
                                 systems.add(message.get_srcSystem())
 
         fly(8)
