@@ -31,6 +31,7 @@ class EvaluateOptions(Gate, ExperimentOptions):
         airl evaluate static-obstacles --episodes 1000
         airl evaluate static-obstacles dense-obstacles --arena static-obstacles crowded
         airl evaluate static-obstacles --level lockstep --computer ras-pi-4 --workload template-5x32
+        airl evaluate static-obstacles --level lockstep --each-fault --fault 'gps off at hold'
         airl evaluate runs/train-mine/policy --on-card
     """
 
@@ -43,6 +44,11 @@ class EvaluateOptions(Gate, ExperimentOptions):
         " the policies were trained in, or static-obstacles",
     )
     episodes: int = episodes("number of episodes in each arena", 100)
+    each_fault: bool = Field(
+        default=False,
+        description="fly every policy healthy and with each fault alone, a row each, instead of"
+        " with all of them at once",
+    )
     on_card: bool = Field(
         default=False,
         description="write the results onto the policies' cards, in place of earlier ones of the"
@@ -67,11 +73,12 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """
     console = console or Console()
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
-    cells = evaluation_cells(scenario, options.policies, options.arena)
+    each_fault = options.each_fault
+    cells = evaluation_cells(scenario, options.policies, options.arena, each_fault=each_fault)
     if options.on_card:
         check_plain(cells)
     if len(cells) > 1:
-        experiment = matrix(scenario, options.policies, options.arena)
+        experiment = matrix(scenario, options.policies, options.arena, each_fault=each_fault)
         code, flown = fly_and_show(experiment, options.out, console, options)
         for run in flown.cells if options.on_card else ():
             if run.complete:

@@ -8,7 +8,14 @@ from pathlib import Path
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import Experiment, ExperimentResult, make_cell, run_and_compare
+from airl_mav.experiments.experiment import (
+    Experiment,
+    ExperimentResult,
+    file_name,
+    make_cell,
+    run_and_compare,
+)
+from airl_mav.faults.model import Fault
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import MeasuredResult, add_result
@@ -32,6 +39,7 @@ NOT_THE_POLICYS_OWN = (
     "compensate",
     "time_limit_s",
     "watchdog",
+    "faults",
 )
 """Fields whose results are not written onto a policy's card when they are given."""
 
@@ -61,17 +69,31 @@ def evaluate(
     return run_and_compare(matrix(scenario, policies, arenas), out, progress=progress)
 
 
-def matrix(scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = ()) -> Experiment:
-    """Declare a table of policies x arenas. Raises UsageError as `evaluate`."""
-    cells = evaluation_cells(scenario, policies, arenas)
+def matrix(
+    scenario: Scenario,
+    policies: Sequence[str],
+    arenas: Sequence[str] = (),
+    *,
+    each_fault: bool = False,
+) -> Experiment:
+    """Declare a table of policies x arenas. Raises UsageError as `evaluate`.
+
+    With `each_fault` every policy is flown healthy and with each of the scenario's faults alone,
+    each a row of its own.
+    """
+    cells = evaluation_cells(scenario, policies, arenas, each_fault=each_fault)
     facts = {field: getattr(scenario, field) for field in SHARED}
     return Experiment("matrix", f"{len(policies)}-policies", facts, cells)
 
 
 def evaluation_cells(
-    scenario: Scenario, policies: Sequence[str], arenas: Sequence[str] = ()
+    scenario: Scenario,
+    policies: Sequence[str],
+    arenas: Sequence[str] = (),
+    *,
+    each_fault: bool = False,
 ) -> tuple[Cell, ...]:
-    """Return an evaluation for each policy in each arena.
+    """Return an evaluation for each policy in each arena, with `each_fault` for each fault, too.
 
     Raises:
         UsageError: A policy or an arena cannot be flown, or two would share a row or a column.
@@ -84,15 +106,22 @@ def evaluation_cells(
         arenas = list(dict.fromkeys(training_arena(policy) for policy in found))
     else:
         _check_names("arena", [Path(arena).stem for arena in arenas])
+    ways: list[tuple[str, tuple[Fault, ...]]] = [("", scenario.faults)]
+    if each_fault:
+        if not scenario.faults:
+            raise FieldError("each_fault", True, "with one fault or more")
+        ways = [("", ()), *((f", {fault}", (fault,)) for fault in scenario.faults)]
+        _check_names("faults", [told for told, _ in ways])
     return tuple(
         make_cell(
-            f"{policy.name}-{Path(arena).stem}",
-            f"{policy.name} in {Path(arena).stem}",
-            scenario.model_copy(update={"policy": path, "arena": arena}),
-            label=policy.name,
+            file_name(f"{policy.name}-{Path(arena).stem}{told}"),
+            f"{policy.name}{told} in {Path(arena).stem}",
+            scenario.model_copy(update={"policy": path, "arena": arena, "faults": faults}),
+            label=f"{policy.name}{told}",
             group=Path(arena).stem,
         )
         for path, policy in zip(policies, found, strict=True)
+        for told, faults in ways
         for arena in arenas
     )
 

@@ -12,6 +12,9 @@ from rich.console import Console
 
 from airl_mav.cli import sitl
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import FieldError
+from airl_mav.experiments.evaluate import check_plain, matrix
+from airl_mav.faults.model import Fault
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.flight import fly
@@ -123,3 +126,31 @@ def _told(call: Callable[[], object]) -> str:
     except FailureError as error:
         return str(getattr(error.args[0], "name", error.args[0]))
     return "ok"
+
+
+def test_each_fault_has_a_row_of_its_own() -> None:
+    faults = ("camera delay 100ms", "gps off at offboard")
+    asked = Scenario(
+        level="lockstep",
+        episodes=1,
+        seed=SEED,
+        workers=1,
+        faults=tuple(_fault(text) for text in faults),
+    )
+    table = matrix(asked, ["static-obstacles"], each_fault=True)
+    assert [[str(f) for f in cell.scenario.scenario.faults] for cell in table.cells] == [
+        [],
+        ["camera delay 0.1s"],
+        ["gps off at offboard"],
+    ]
+    assert (
+        len({cell.name for cell in table.cells}) == len({cell.label for cell in table.cells}) == 3
+    )
+    with pytest.raises(FieldError, match="each_fault"):
+        matrix(Scenario(level="lockstep"), ["static-obstacles"], each_fault=True)
+    with pytest.raises(FieldError, match="faults"):
+        check_plain(table.cells[1:])
+
+
+def _fault(text: str) -> Fault:
+    return Fault.model_validate(text)
