@@ -52,7 +52,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         UsageError: The input cannot be used.
     """
     check_companion(asked)
-    policy = find_policy(asked.policy)
+    policy = find_policy(asked.policy, trust=asked.trust)
     pilot, watchdog = decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
     injection = select_latency(asked, policy, on_this_computer=not asked.lockstep)

@@ -10,12 +10,13 @@ import numpy as np
 from airl_mav.arena.bodies import Bodies, draw_bodies
 from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, inner, join
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.arena.own import generate_own
 from airl_mav.arena.passage import passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, draw_place, place_all
 from airl_mav.arena.tours import draw_tour
 from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 
 LAYOUTS = 20
 """Whole layouts drawn before a request is refused."""
@@ -73,6 +74,8 @@ def generate(
         raise UsageError(f"seed = {seed}: accepted: value >= 0")
     if not vehicle_width_m > 0.0:
         raise UsageError(f"vehicle_width_m = {vehicle_width_m:g}: accepted: value > 0 m")
+    if spec.generator != OBSTACLES:
+        return generate_own(spec, seed, name=name, vehicle_width_m=vehicle_width_m, zone=zone)
     request = _Request(
         spec=spec,
         bounds=local_bounds(spec),

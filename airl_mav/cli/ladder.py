@@ -60,7 +60,8 @@ OPTIONS = LadderOptions
 
 def run(options: LadderOptions, console: Console | None = None) -> int:
     """Fly the levels and show what differs; exit status and errors as of `fly_and_show`."""
-    arena = options.arena or training_arena(find_policy(options.policy))
+    policy = find_policy(options.policy, trust=options.trust)
+    arena = options.arena or training_arena(policy)
     experiment = declare_ladder(
         scenario_of(options, arena=arena), options.levels, sitl_episodes=options.sitl_episodes
     )

@@ -13,6 +13,7 @@ from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.rehearsal.run_folder import RUN_FILE, load
+from airl_mav.report.arenas import trust_arenas
 from airl_mav.report.comparison.model import comparison_file, kind_of
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
@@ -44,6 +45,10 @@ class ReportOptions(ProfileModel):
         description="folder of a comparison; by default runs/<UTC time>-compare. A report goes into"
         " its run's own folder",
     )
+    trust: bool = Field(
+        default=False,
+        description="run the arena generators that the runs name: code of whoever made the folder",
+    )
 
 
 OPTIONS = ReportOptions
@@ -59,6 +64,10 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")
     first = options.runs[0]
+    if options.trust:
+        for folder in options.runs:
+            if kind_of(folder) is None:
+                trust_arenas(load(folder))
     if len(options.runs) > 1 or kind_of(first) == "matrix":
         return _compare(options, console)
     for field, value in (("out", options.out), ("names", " ".join(options.names))):

@@ -44,9 +44,11 @@ class Door:
 POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
 REWARDS = Door("reward", "airl_mav.rewards", "a function, or a class whose objects can be called")
 NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
+ACTION_SETS = Door("actions", "airl_mav.action_sets", "a class with a method commands")
+GENERATORS = Door("generator", "airl_mav.generators", "a function that makes an Arena")
 MODELS = Door("model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments")
 
-DOORS = (POLICIES, REWARDS, NETWORKS, MODELS)
+DOORS = (POLICIES, REWARDS, NETWORKS, ACTION_SETS, GENERATORS, MODELS)
 
 
 def names_code(name: str) -> bool:
@@ -90,6 +92,15 @@ def part_name(door: Door, shipped: Sequence[str]) -> AfterValidator:
     return AfterValidator(check)
 
 
+_loaded: set[tuple[str, str]] = set()
+"""Kind and name of the parts that this process has loaded."""
+
+
+def is_loaded(door: Door, name: str) -> bool:
+    """Return whether this process has loaded a part by this name, as the user asked for it."""
+    return (door.group, name) in _loaded
+
+
 def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> Any:
     """Return a part by any of its names. Its file or module is run, once in a process.
 
@@ -115,6 +126,7 @@ def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> 
     part = getattr(module, attribute, None)
     if part is None or not fits(part):
         raise FieldError(door.field, name, f"{door.wanted}; {where} has none of this name")
+    _loaded.add((door.group, name))
     return part
 
 

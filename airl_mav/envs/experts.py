@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.errors import FieldError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
@@ -43,6 +44,9 @@ class Choices(NamedTuple):
 def choices(spec: ActionSpec) -> Choices:
     """Return the actions that an expert chooses from."""
     count = discrete_actions(spec)
+    if count is None and spec.set != "velocity":
+        accepted = "a discrete action set, or 'velocity', for one that is taught"
+        raise FieldError("environment.actions", spec.set, accepted)
     if count is not None:
         actions: NDArray[Any] = np.arange(count)
     else:

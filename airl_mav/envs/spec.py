@@ -211,7 +211,11 @@ class EnvironmentSpec(ProfileModel):
     in_flight: tuple[Told, ...] = Field(
         default=(), description="what else the network is told: command, latency, age"
     )
-    actions: ActionSetName = Field(default="arc-25", description="action set")
+    actions: ActionSetName = Field(
+        default="arc-25",
+        description="action set: arc-25, paper-25, velocity, or your own as MODULE:NAME or"
+        " FILE.py:NAME",
+    )
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
     reward: RewardName = Field(
         default="shaped",

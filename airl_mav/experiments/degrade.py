@@ -64,7 +64,7 @@ def declare_degradation(
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
     names = list(policies) or [scenario.policy]
     cells = []
-    found = [find_policy(name).name for name in names]
+    found = [find_policy(name, trust=scenario.trust).name for name in names]
     flown_as: list[dict[str, Any]] = [{}, {"compensate": True}] if compensated else [{}]
     for (path, name), way in product(zip(names, found, strict=True), flown_as):
         policy = f"{name}, compensated" if way else name

@@ -100,7 +100,7 @@ def evaluation_cells(
     """
     if not policies:
         raise FieldError("policies", accepted="one or more names or folders")
-    found = [find_policy(name) for name in policies]
+    found = [find_policy(name, trust=scenario.trust) for name in policies]
     _check_names("policies", [policy.name for policy in found])
     if not arenas:
         arenas = list(dict.fromkeys(training_arena(policy) for policy in found))

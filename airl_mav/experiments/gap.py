@@ -119,7 +119,8 @@ def declare_gap(
     arenas: Sequence[str] = (),
 ) -> Experiment:
     """Declare a hardware gap; see `gap`. Raises UsageError."""
-    policy, other = find_policy(scenario.policy), _mitigated(mitigated)
+    policy = find_policy(scenario.policy, trust=scenario.trust)
+    other = _mitigated(mitigated, trust=scenario.trust)
     if other is not None and other.name == policy.name:
         raise FieldError("mitigated", mitigated, f"another policy, or {NOT_MITIGATED}")
     arenas = list(arenas) or [scenario.arena]
@@ -199,12 +200,12 @@ def _ways_of_compensation(
     return (COMPENSATED, PIPELINED), ()
 
 
-def _mitigated(name: str) -> PolicyInfo | None:
+def _mitigated(name: str, *, trust: bool = False) -> PolicyInfo | None:
     """Return the mitigated policy; None: not asked for. Raises UsageError."""
     if name == NOT_MITIGATED:
         return None
     try:
-        return find_policy(name)
+        return find_policy(name, trust=trust)
     except UsageError as error:
         if name != DEFAULT_MITIGATED or "no such policy" not in f"{error}":
             raise

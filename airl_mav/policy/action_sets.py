@@ -1,22 +1,26 @@
 """Action sets: from a network's output to a velocity command, in one place.
 
 `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's text.
-`velocity`: the paper's continuous pair, forward and right speed, the nose following.
+`velocity`: the paper's continuous pair, forward and right speed, the nose following. Any other is
+the user's own: a class, made without arguments, whose objects are an `ActionSet`.
 """
 
 from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, Literal
+from typing import Annotated, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core import plugins
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.policy.actions import Action
 
-ActionSetName = Literal["arc-25", "paper-25", "velocity"]
+SHIPPED = ("arc-25", "paper-25", "velocity")
+ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
 """Fastest action of the paper [m/s]."""
@@ -47,8 +51,23 @@ class ActionSpec(ProfileModel):
     )
 
 
+class ActionSet(Protocol):
+    """An action set of the user's."""
+
+    @property
+    def discrete(self) -> int | None:
+        """Number of discrete actions; None for a continuous set, of two numbers -1..1."""
+        ...
+
+    def commands(self, actions: NDArray[Any], max_speed_m_s: float) -> NDArray[np.float64]:
+        """Return the commands (n, 3) of n actions, as the function `commands` does."""
+        ...
+
+
 def discrete_actions(spec: ActionSpec) -> int | None:
     """Return the number of discrete actions; None for a continuous set."""
+    if spec.set not in SHIPPED:
+        return _own(spec.set).discrete
     return None if spec.set == "velocity" else 25
 
 
@@ -57,12 +76,18 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
 
     Args:
         spec: The action set.
-        actions: (n,) whole numbers 0..24 of a discrete set; (n, 2) forward and right speed of the
-            continuous one, each -1..1 of the fastest; anything beyond is cut off.
+        actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
+            one: of `velocity`, forward and right speed, each -1..1 of the fastest; anything beyond
+            is cut off.
 
     Returns:
         (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive.
+
+    Raises:
+        UsageError: A set of the user's gives anything else.
     """
+    if spec.set not in SHIPPED:
+        return _checked(spec, actions)
     if spec.set != "velocity":
         chosen: NDArray[np.float64] = _table(spec.set, spec.max_speed_m_s)[np.asarray(actions)]
         return chosen
@@ -77,6 +102,33 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     return np.concatenate([wanted, turn[:, None]], axis=1)
 
 
+def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the commands of a set of the user's, if they are such. Raises UsageError."""
+    asked = np.asarray(_own(spec.set).commands(np.asarray(actions), spec.max_speed_m_s), np.float64)
+    wanted = (len(actions), 3)
+    if asked.shape != wanted or not np.isfinite(asked).all():
+        found = f"an array {asked.shape}" if asked.shape != wanted else "what is no number"
+        raise UsageError(f"actions {spec.set!r}: gives {found}; accepted: {wanted} numbers")
+    return asked
+
+
+@cache
+def _own(name: str) -> ActionSet:
+    """Return an action set of the user's. Raises FieldError."""
+    door = plugins.ACTION_SETS
+    found = plugins.load_part(door, name, lambda made: callable(getattr(made, "commands", None)))
+    try:
+        own = found() if isinstance(found, type) else found
+    except Exception as error:
+        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
+        raise FieldError(door.field, name, problem=problem) from error
+    count = getattr(own, "discrete", None)
+    if not (count is None or (type(count) is int and count > 1)):
+        problem = f"its number of actions is discrete = {count!r}; accepted: 2 or more, or None"
+        raise FieldError(door.field, name, problem=problem)
+    return cast("ActionSet", own)
+
+
 def command(spec: ActionSpec, action: NDArray[Any]) -> Action:
     """Return the command of one action, () or (2,)."""
     forward, right, turn = commands(spec, np.asarray(action)[None])[0]
@@ -84,7 +136,7 @@ def command(spec: ActionSpec, action: NDArray[Any]) -> Action:
 
 
 @cache
-def _table(name: ActionSetName, max_speed: float) -> NDArray[np.float64]:
+def _table(name: str, max_speed: float) -> NDArray[np.float64]:
     """Return the commands (25, 3) of a discrete set."""
     if name == "arc-25":
         rows = [

@@ -17,7 +17,8 @@ from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, replace_file, write_json
-from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
+from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
 from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
@@ -174,7 +175,8 @@ class PolicyFacts(ProfileModel):
 
     @model_validator(mode="after")
     def _random_actions_are_discrete(self) -> PolicyFacts:
-        if self.epsilon and discrete_actions(self.actions) is None:
+        # A set of the user's is not asked: reading a card runs no code.
+        if self.epsilon and self.actions.set == "velocity":
             raise ValueError(
                 f"epsilon = {self.epsilon:g}: accepted: 0 with the action set {self.actions.set!r}"
             )
@@ -254,20 +256,37 @@ def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
     return _read_bound(folder / TORCH_FILE, card.torch_sha256)
 
 
-def load_card(folder: Path) -> PolicyCard:
+def load_card(folder: Path, *, trust: bool = False) -> PolicyCard:
     """Read the card of a policy and hold the policy against it.
 
     Raises:
         UsageError: See `read_card`; also when the file has another digest, or other inputs and
-            outputs than the card says.
+            outputs than the card says, or the card names code and there is no trust.
     """
     card = read_card(folder)
-    open_model(folder, card)
+    open_model(folder, card, trust=trust)
     return card
 
 
-def open_model(folder: Path, card: PolicyCard, threads: int = 1) -> OnnxRuntime:
+def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
+    """Raise UsageError for a card that names code, unless its maker is trusted.
+
+    A card that comes with this package names none.
+    """
+    named = {"actions.set": card.actions.set} if card.actions.set not in SHIPPED_ACTION_SETS else {}
+    if named and not trust:
+        listed = ", ".join(f"{field} = {name!r}" for field, name in named.items())
+        raise UsageError(
+            f"{folder / CARD_FILE}: {listed} is code that would run on this machine; accepted: with"
+            " --trust, if you trust its maker"
+        )
+
+
+def open_model(
+    folder: Path, card: PolicyCard, threads: int = 1, *, trust: bool = False
+) -> OnnxRuntime:
     """Return the policy of a card, ready to infer. Raises UsageError as `load_card` does."""
+    check_trust(folder, card, trust=trust)
     model = read_model(folder, card)
     try:
         return OnnxRuntime(model, card.observation, card.actions, threads, card.state)

@@ -13,7 +13,14 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
 from airl_mav.policy.actions import Action
-from airl_mav.policy.card import TORCH_FILE, PolicyCard, open_model, read_card, read_torch_program
+from airl_mav.policy.card import (
+    TORCH_FILE,
+    PolicyCard,
+    check_trust,
+    open_model,
+    read_card,
+    read_torch_program,
+)
 from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.runtime import (
@@ -178,6 +185,7 @@ def load_learned(
             trusted.
     """
     card = card or read_card(folder)
+    check_trust(folder, card, trust=trust)
     network = open_network(folder, card, runtime, threads, trust=trust)
     policy = LearnedPolicy(card, network, rng=rng, ablate=ablate)
     blank = {k: np.zeros((1, *box.shape), box.dtype) for k, box in boxes(card.observation).items()}
@@ -203,13 +211,13 @@ def open_network(
         threads: Threads of one inference.
         trust: Whether the folder's maker may run code on this machine. `torch.export.load` falls
             back to unpickling, which runs whatever the file says. An ONNX model is data, and the
-            policies that come with this package are trusted.
+            policies that come with this package are trusted. A card may name code, too.
 
     Raises:
         UsageError: As of `load_learned`.
     """
     if runtime == "onnx":
-        return open_model(folder, card, threads)
+        return open_model(folder, card, threads, trust=trust)
     program = read_torch_program(folder, card)
     shipped = folder.resolve().is_relative_to((profiles_dir() / "policies").resolve())
     if not (trust or shipped):

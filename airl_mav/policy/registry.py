@@ -60,11 +60,16 @@ def policy_names() -> list[str]:
     return [*POLICIES, *(name for name in _shipped() if name not in POLICIES)]
 
 
-def find_policy(name: str) -> PolicyInfo:
+def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
     """Return what is known of a policy: by name, by its folder's path, or by its Python class.
 
+    Args:
+        name: Of the policy.
+        trust: Whether the maker of its folder may run code on this machine.
+
     Raises:
-        UsageError: There is no such policy (lists those that exist), or its card does not fit it.
+        UsageError: There is no such policy (lists those that exist), its card does not fit it, or
+            names code without trust.
     """
     if names_code(name):
         return PolicyInfo(name.rpartition(":")[2], _summary(name), program=name)
@@ -73,7 +78,7 @@ def find_policy(name: str) -> PolicyInfo:
     folder = _folder(name)
     if folder is None:
         return PolicyInfo(name, _summary(name), program=announced(DOOR)[name])
-    card = load_card(folder)
+    card = load_card(folder, trust=trust)
     return PolicyInfo(card.name, card.description, card, folder)
 
 
@@ -96,7 +101,7 @@ def load_policy(
         UsageError: There is no such policy (lists those that exist), its card does not fit it, or
             it cannot be run as asked.
     """
-    known = find_policy(policy) if isinstance(policy, str) else policy
+    known = find_policy(policy, trust=trust) if isinstance(policy, str) else policy
     if known.folder is not None and known.card is not None:
         return load_learned(
             known.folder,

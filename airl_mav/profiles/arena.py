@@ -5,12 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
-from pydantic import Field, GetCoreSchemaHandler, model_validator
+from pydantic import (
+    Field,
+    GetCoreSchemaHandler,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.plugins import GENERATORS, part_name
 
 ShapeName = Literal["box", "cylinder", "sphere"]
+OBSTACLES = "obstacles"
+"""The generator that is shipped: `arena.generate`."""
+GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
+Option = bool | int | float | str | list[int | float | str]
 Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
 
 SPHERE_OFFSET = 0.5
@@ -178,12 +189,28 @@ class ArenaSpec(ProfileModel):
     flight_altitude_m: float = quantity(
         "height above the floor that every sphere crosses", "m", ge=0.2, le=50, default=2.5
     )
+    generator: GeneratorName = Field(
+        default=OBSTACLES,
+        description="what makes an arena of a seed: obstacles, or a function of your own as"
+        " MODULE:NAME or FILE.py:NAME",
+    )
+    options: dict[str, Option] = Field(
+        default_factory=dict, description="knobs of a generator of your own"
+    )
     static: StaticObstacles = Field(
         default_factory=StaticObstacles, description="obstacles that stand still"
     )
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what says nothing: an arena's digest is that of before there was a choice."""
+        data: dict[str, Any] = dump(self)
+        if self.generator == OBSTACLES and not self.options:
+            del data["generator"], data["options"]
+        return data
 
     @model_validator(mode="after")
     def _fits_together(self) -> ArenaSpec:

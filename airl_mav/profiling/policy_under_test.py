@@ -66,7 +66,7 @@ def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
             layers, filters = (int(size) for size in request.network.split("x"))
             vehicle = _write_random_network(request, layers, filters, vehicles, Path(scratch))
             name = scratch
-        info = find_policy(name)
+        info = find_policy(name, trust=request.trust)
         if info.card is None or info.folder is None:
             raise FieldError("policy", name, "a learned policy; this one has no network")
         vehicle = vehicle or _vehicle_for(info.card, vehicles)

@@ -7,8 +7,9 @@ from collections.abc import Iterable
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import UsageError
+from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
@@ -28,13 +29,34 @@ def vehicle_of(info: RunInfo) -> VehicleProfile:
     return vehicle.model_copy(update={"camera": camera, "body": body})
 
 
+def check_trust(arena: str, spec: ArenaSpec) -> None:
+    """Raise UsageError for an arena whose generator is code that nobody has asked this process for.
+
+    A run folder that comes from elsewhere must not choose what runs here.
+    """
+    if spec.generator != OBSTACLES and not is_loaded(GENERATORS, spec.generator):
+        raise UsageError(
+            f"arena {arena}: its generator {spec.generator!r} is code that would run on this "
+            "machine; accepted: with --trust, if you trust its maker"
+        )
+
+
+def trust_arenas(run: LoadedRun) -> None:
+    """Load the generators that a run's arenas name. Raises UsageError."""
+    for arena in {record.arena for record in run.episodes}:
+        spec = load_profile("arenas", arena, ArenaSpec)
+        if spec.generator != OBSTACLES:
+            load_part(GENERATORS, spec.generator)
+
+
 def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:
     """Make the arenas of some flights, by episode index. Raises UsageError."""
     specs: dict[str, ArenaSpec] = {}
     arenas: dict[int, Arena] = {}
     for record in records:
         if record.arena not in specs:
-            specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
+            spec = specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
+            check_trust(record.arena, spec)
         if record.index not in arenas:
             arenas[record.index] = generate(
                 specs[record.arena],

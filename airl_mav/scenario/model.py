@@ -98,8 +98,8 @@ class Inference(ProfileModel):
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
     trust: bool = Field(
         default=False,
-        description="run policy.pt2 of a folder that is not shipped: loading it can execute code"
-        " that its author wrote",
+        description="run policy.pt2, or code that the card names, of a folder that is not shipped:"
+        " both execute what its author wrote",
     )
 
 

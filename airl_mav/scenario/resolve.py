@@ -31,7 +31,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.open_ports, any_camera=False)
-    policy = find_policy(scenario.policy)
+    policy = find_policy(scenario.policy, trust=scenario.trust)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)

@@ -52,7 +52,7 @@ def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> T
 
 def fly_best(training: TrainingFolder, config: TrainingConfig, seeds: range) -> list[EpisodeResult]:
     """Fly the exported policy of a training as `airl evaluate` would, at level gym."""
-    policy = load_learned(training.policy)
+    policy = load_learned(training.policy, trust=True)
     navigation = Navigation(nominal(config.environment), min(SLOTS, len(seeds)))
     pilots = LearnedPilots(policy, lambda seed: np.random.default_rng(seed))
     return [flown for _, flown in fly_seeds(navigation, pilots, seeds)]

@@ -12,7 +12,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
-from airl_mav.policy.action_sets import ActionSetName, ActionSpec, discrete_actions
+from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training.table import ALGORITHMS, EARLIER_NAMES, ActionKind, fitting
 
@@ -26,14 +26,13 @@ Precision = Literal["float32", "bfloat16"]
 Option = bool | int | float | str | list[int | float | str]
 
 
-def kind_of(actions: ActionSetName) -> ActionKind:
+def kind_of(actions: str) -> ActionKind:
     """Return whether an action set is discrete or continuous."""
     return "continuous" if discrete_actions(ActionSpec(set=actions)) is None else "discrete"
 
 
 ACTION_SETS = {
-    kind: [name for name in get_args(ActionSetName) if kind_of(name) == kind]
-    for kind in get_args(ActionKind)
+    kind: [name for name in SHIPPED if kind_of(name) == kind] for kind in get_args(ActionKind)
 }
 """The action sets of each kind."""
 
@@ -241,7 +240,9 @@ class TrainingConfig(ProfileModel):
 
     @model_validator(mode="after")
     def _chooses_from_the_action_set(self) -> TrainingConfig:
-        check_actions(self.algorithm.name, kind_of(self.environment.actions))
+        # A set of the user's is looked at when it is trained with: reading a file runs no code.
+        if self.environment.actions in SHIPPED:
+            check_actions(self.algorithm.name, kind_of(self.environment.actions))
         return self
 
 

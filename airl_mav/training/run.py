@@ -31,7 +31,7 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
-from airl_mav.training.config import SELECTION_SEED, TrainingConfig
+from airl_mav.training.config import SELECTION_SEED, TrainingConfig, check_actions, kind_of
 from airl_mav.training.export import export_sb3
 from airl_mav.training.recurrent import GreedyDecisions
 from airl_mav.training.store import BEST_MODEL, Evaluation, TrainingFolder, TrainingProgress
@@ -109,6 +109,7 @@ def fit(
     Raises:
         UsageError: The algorithm does not fit the environment, an arena cannot be made.
     """
+    check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment))
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)

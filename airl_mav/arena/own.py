@@ -1,0 +1,52 @@
+"""Arenas that a generator of the user's makes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core import plugins
+from airl_mav.core.errors import UsageError
+from airl_mav.profiles.arena import ArenaSpec
+
+
+def generate_own(
+    spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None
+) -> Arena:
+    """Make the arena of a seed with the user's own generator; arguments as of `generate`.
+
+    Raises:
+        UsageError: There is no such generator, it raises, or what it makes cannot be flown in.
+    """
+    make = plugins.load_part(plugins.GENERATORS, spec.generator)
+    told = f"generator {spec.generator!r}, seed {seed}"
+    try:
+        arena = make(spec, seed, name=name, vehicle_width_m=vehicle_width_m, zone=zone)
+    except Exception as error:
+        words = " ".join(f"{type(error).__name__}: {error}".split())
+        raise UsageError(f"{told}: {words}") from error
+    if not isinstance(arena, Arena):
+        raise UsageError(f"{told}: makes {type(arena).__name__}; accepted: airl_mav's Arena")
+    if (problem := _problem(arena)) is not None:
+        raise UsageError(f"{told}: {problem}")
+    return arena
+
+
+def _problem(arena: Arena) -> str | None:
+    """Return why nobody can fly in an arena; None: somebody can."""
+    obstacles, b = arena.obstacles, arena.bounds
+    n = len(obstacles)
+    shapes = {"center": (n, 3), "half_size": (n, 3), "yaw": (n,)}
+    for field, wanted in shapes.items():
+        found = np.asarray(getattr(obstacles, field))
+        if found.shape != wanted or not np.isfinite(found).all():
+            return f"obstacles.{field} {found.shape}; accepted: {wanted} numbers"
+    if len(arena.tours) > n:
+        return f"{len(arena.tours)} tours; accepted: at most one an obstacle, {n}"
+    for what, place in (("start", (0.0, 0.0)), ("goal", tuple(np.asarray(arena.goal)))):
+        inside = len(place) == 2 and (
+            b.north_min < place[0] < b.north_max and b.east_min < place[1] < b.east_max
+        )
+        if not inside:
+            return f"the {what} {place} is not between the walls"
+    return None
