@@ -9,10 +9,11 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import os
 import re
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
@@ -50,6 +51,9 @@ PREFIXED = ("payload", "sensors", "spread", "wind")
 
 SINGULAR = {"faults": "fault"}
 """Lists whose option, given once for each item, is called by one of them."""
+
+_FIELD = re.compile(r"\b[a-z0-9]+(?:_[a-z0-9]+)+\b")
+"""A word in a message that may be a field's name: one with an underscore, so no word of English."""
 
 RENAMED: dict[str, tuple[str, ...]] = {
     "--hold": ("--hold-s",),
@@ -120,11 +124,33 @@ def told(
     """Return an error about a field in one line that names the option, or the line of the file."""
     if error.field in positionals:
         return error.line(error.field.upper())
+    error = _with_options(error)
     option = option_of(error.field)
     given = any(word == option or word.startswith(f"{option}=") for word in words)
     if file is not None and not given:
         return f"{file}: {error.line(sign=' = ')}"
     return error.line(option)
+
+
+def _names(model: type[BaseModel]) -> Iterator[str]:
+    """Give the names of a model's fields, with those of tables that are no part of an option."""
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel) and name not in PREFIXED:
+            yield from _names(kind)
+        else:
+            yield name
+
+
+def _with_options(error: FieldError) -> FieldError:
+    """Return an error whose text names fields by their options: --px4-dir for px4_dir."""
+
+    def named(word: re.Match[str]) -> str:
+        return option_of(word[0]) if word[0] in names else word[0]
+
+    names = set(_names(Scenario))
+    accepted, problem = (_FIELD.sub(named, text) for text in (error.accepted, error.problem))
+    return FieldError(error.field, error.value, accepted, problem)
 
 
 def option_of(field: str) -> str:
@@ -252,7 +278,15 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
     try:
-        code = carry_out(prog, module, words)
+        try:
+            code = carry_out(prog, module, words)
+        finally:
+            # Or what is left in the buffer fails where nobody can handle it, at the very end.
+            sys.stdout.flush()
+    except BrokenPipeError:
+        # Its reader has had enough: `| head`. Nothing more is to be written there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = EXIT_BROKEN
     except UsageError as error:
         _fail(str(error))
         code = EXIT_USAGE

@@ -122,3 +122,13 @@ def test_help_loads_no_simulator_and_no_figures() -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_help_into_a_pipe_that_nobody_reads_is_quiet() -> None:
+    """`airl-firmware --help | head -1`."""
+    command = [sys.executable, "-m", "airl_mav.cli.firmware", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        assert child.stderr is not None
+        child.stdout.close()
+        assert child.stderr.read() == b""
