@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import queue
+import shutil
 import sys
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -58,6 +60,7 @@ class Child(ChildProcess):
         events: queue.Queue[tuple[str, Event | Exited]],
         *,
         keeps: Sequence[int] = (),
+        environment: Mapping[str, str] | None = None,
     ) -> None:
         """Start `python -m module`.
 
@@ -67,8 +70,15 @@ class Child(ChildProcess):
             log: Its standard error goes here.
             events: Gets (name, event); after the last one (name, Exited).
             keeps: File descriptors that it inherits and never uses: locks.
+            environment: Added to our own environment.
         """
-        super().__init__([sys.executable, "-m", module], log, capture_stdout=True, inherited=keeps)
+        super().__init__(
+            [sys.executable, "-m", module],
+            log,
+            capture_stdout=True,
+            inherited=keeps,
+            environment=environment,
+        )
         self.name = name
         self.ending = False
         """Its end is wanted: no surprise when it comes."""
@@ -109,6 +119,9 @@ class ProcessPair:
     def __init__(self) -> None:
         self._events: queue.Queue[tuple[str, Event | Exited]] = queue.Queue()
         self._children: dict[str, Child] = {}
+        self._scratch = ""
+        """Folder of the companion's temporary files. MAVSDK makes one for each system that it
+        hears, and leaves it behind when its process is killed."""
 
     def start(self, begin: Begin, logs: Path, keeps: Sequence[int]) -> None:
         """Start both processes and wait until they are ready.
@@ -122,9 +135,13 @@ class ProcessPair:
             UsageError: A process says that its input cannot be used.
             LostError: A process died or did not become ready in time.
         """
+        self._scratch = tempfile.mkdtemp(prefix="airl-companion-")
+        places = {COMPANION: {"TMPDIR": self._scratch}}
         for name, module in MODULES.items():
-            log = logs / f"{name}.log"
-            self._children[name] = child = Child(name, module, log, self._events, keeps=keeps)
+            log, place = logs / f"{name}.log", places.get(name)
+            self._children[name] = child = Child(
+                name, module, log, self._events, keeps=keeps, environment=place
+            )
             child.send(begin)
         ready: set[str] = set()
 
@@ -146,6 +163,9 @@ class ProcessPair:
             for child in self._children.values():
                 child.kill()
             raise
+        finally:
+            if self._scratch:
+                shutil.rmtree(self._scratch, ignore_errors=True)
 
     def stop_one(self, name: str) -> None:
         """End one process, if it was started; returns when it is gone."""
