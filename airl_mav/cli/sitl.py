@@ -90,8 +90,10 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
     _say(console, f"airl-sitl  {asked.vehicle} in {asked.arena}, policy {scenario.policy.name}")
     if asked.level != "sitl":
         _say(console, "lockstep   one process, one simulated clock, MAVSDK on raw bytes")
-        return
-    _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
+        if setup.level != "firmware":
+            return
+    else:
+        _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
     _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
     if setup.level == "firmware":
         _say(console, f"firmware   {setup.firmware}")

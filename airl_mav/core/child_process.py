@@ -24,6 +24,9 @@ GRACE_S = 5.0
 GUARDED_GRACE_S = 2.0
 """How long a guarded program may take to end when terminated, less than its guard [wall s]."""
 
+SIGNALLED = 128
+"""A guard's exit status is this and the signal's number when a signal killed its program."""
+
 TAIL_LINES = 12
 """Lines of a dead child's log that are shown."""
 
@@ -34,6 +37,11 @@ class Exited:
 
     code: int
     """Exit status; negative = the signal that killed it."""
+
+    @property
+    def by_signal(self) -> bool:
+        """Whether a signal killed it, or the program behind its guard."""
+        return self.code < 0 or SIGNALLED < self.code < SIGNALLED + signal.NSIG
 
     def __str__(self) -> str:
         """Return the name of the signal, as SIGKILL, or the exit status, as exit status 1."""
@@ -148,7 +156,7 @@ def main() -> None:
     threading.Thread(target=_end_with_stdin, args=(program,), daemon=True).start()
     code = program.wait()
     _signal_group(program.pid, signal.SIGKILL)
-    sys.exit(code if code >= 0 else 128 - code)
+    sys.exit(code if code >= 0 else SIGNALLED - code)
 
 
 def _end_with_stdin(program: subprocess.Popen[bytes]) -> None:

@@ -101,6 +101,26 @@ class WallClock:
         self.epoch_ns += int(step_us * NS_PER_US / self.speed)
 
 
+GREATEST_GAP_US = 2 * US_PER_S
+"""A longer time between two looks was no waiting: the process was stopped [µs of wall time]."""
+
+
+class Patience:
+    """Adds up wall time in which somebody waited; a process that is stopped does not wait."""
+
+    def __init__(self) -> None:
+        self._clock = WallClock()
+        self._seen_us = 0
+        self._waited_us = 0
+
+    def so_far_s(self) -> float:
+        """Return what has been waited [s]. To be asked more often than `GREATEST_GAP_US`."""
+        now_us = self._clock.time_us()
+        self._waited_us += min(now_us - self._seen_us, GREATEST_GAP_US)
+        self._seen_us = now_us
+        return self._waited_us / US_PER_S
+
+
 def utc_now() -> datetime:
     """Return the calendar time, for names and log headers; never for timing."""
     return datetime.now(timezone.utc)

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from airl_mav.experiments.executors import Stop
 from airl_mav.lockstep.flight import fly
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 from firmware_sim.warm_up import warm_up
 
@@ -51,11 +51,12 @@ class LockstepFlier:
         """Load everything; see `Flier`."""
         scenario = self.scenario
         warm_up(scenario.vehicle)
+        log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
 
         def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
             for episode in episodes:
                 tlog = folder.tlog_path(episode.index) if scenario.scenario.tlogs else None
                 policy = scenario.fresh_policy(episode.seed)
-                yield fly(scenario, policy, episode.index, episode.seed, tlog=tlog)
+                yield fly(scenario, policy, episode.index, episode.seed, tlog=tlog, log=log)
 
         return fly_all

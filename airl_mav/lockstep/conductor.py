@@ -7,6 +7,7 @@ and MAVSDK's repetitions of the newest setpoint. Neither the firmware nor the co
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 
 from airl_mav.core.clock import SimClock, WallClock
@@ -14,7 +15,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.inbound import Inbound
 from airl_mav.lockstep.turns import Partner, Turn
-from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged, command_of
+from firmware_sim.flight_controller import FirmwareLostError
 
 FEED_FRAMES = 256
 """So many frames of telemetry are passed on at a time, or all of them when a turn begins."""
@@ -31,23 +33,25 @@ class Conductor:
 
     def __init__(
         self,
-        endpoint: MemoryEndpoint,
+        vehicle: VehicleEnd,
         partner: Partner,
         digest: FlightDigest | None = None,
         speed: float | None = None,
+        clock: SimClock | None = None,
     ) -> None:
         """Put it between the two.
 
         Args:
-            endpoint: The vehicle's end of the companion's link.
+            vehicle: The vehicle's end of the companion's link.
             partner: The companion.
             digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
             speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
+            clock: Simulated time, which it advances; None: its own.
         """
-        self.clock = SimClock()
+        self.clock = clock or SimClock()
         self.ended = False
         """Whether the companion has ended."""
-        self._endpoint = endpoint
+        self._vehicle = vehicle
         self._partner = partner
         self._digest = digest or FlightDigest()
         self._speed = speed
@@ -57,9 +61,14 @@ class Conductor:
         self._waiting: list[bytes] = []
         """Telemetry that has not been passed on."""
         self._heard_us = 0
+        self._asked: int | None = None
+        """The command whose answer the companion waits for."""
+        self._answered = threading.Event()
 
     def begin(self, at_us: int) -> None:
         """Give the companion its first turn at simulated `at_us` [µs]."""
+        if self._vehicle.answers_later:
+            self._vehicle.take()  # What real firmware has sent while it booted is out of date.
         self._turn = Turn(at_us)
 
     @property
@@ -81,7 +90,7 @@ class Conductor:
 
         Args:
             tick_us: The next tick's time.
-            sockets: Not used: the link is in memory.
+            sockets: Not used: what the vehicle sends is taken after each tick.
             readable: Makes the vehicle carry out what has arrived, at a given time.
         """
         del sockets
@@ -111,13 +120,21 @@ class Conductor:
     def _give_turn(self, readable: Callable[[int], object]) -> None:
         now_us = self.clock.time_us()
 
-        def handle(frame: bytes) -> None:
+        def handle(frame: bytes) -> threading.Event | None:
             passed = self._inbound.take(frame, now_us)
             if passed.answer is not None:
                 self._partner.send(passed.answer)
+            waits = False
             for wanted in passed.deliver:
-                self._deliver(wanted, readable, of_the_flight=passed.of_the_flight)
+                waits = self._deliver(wanted, readable, of_the_flight=passed.of_the_flight) or waits
+            return self._answered if waits else None
 
+        if self._asked is not None and self._turn.interrupt is self._answered:
+            raise FirmwareLostError(
+                f"the flight controller did not answer command {self._asked} of the companion"
+            )
+        self._vehicle.settle()
+        self._collect_telemetry()
         self._pass_telemetry()
         self._turn = self._partner.turn(now_us, handle)
         if self._turn.wake_us is None:
@@ -130,31 +147,46 @@ class Conductor:
 
     def _deliver(
         self, frame: bytes, readable: Callable[[int], object], *, of_the_flight: bool = True
-    ) -> None:
-        """Let the vehicle carry out one frame now, and pass its answers on."""
-        now_us = self.clock.time_us()
+    ) -> bool:
+        """Let the vehicle carry out one frame now, and pass its answers on.
+
+        Returns:
+            Whether it is a command that is yet to be answered.
+        """
+        now_us, vehicle = self.clock.time_us(), self._vehicle
         if of_the_flight:
             self._digest.add("commands", now_us, frame)
-        self._endpoint.inbox.append(frame)
-        readable(now_us)
-        answers = self._endpoint.take()
+        if vehicle.answers_later and (command := command_of(frame)) is not None:
+            self._asked = command
+            self._answered.clear()
+        # While it carries out a command it may take in nothing else: that takes simulated time.
+        vehicle.deliver(frame, lambda: readable(now_us), echo=self._asked is None)
+        answers = vehicle.take()
         if answers:
-            self._partner.send(b"".join(answers))
+            self._pass_telemetry()
+            self._pass(answers)
+        return self._asked is not None
 
     # --- telemetry
 
     def _collect_telemetry(self) -> None:
         """Take what the vehicle has sent in its last tick."""
-        frames = self._endpoint.take()
+        frames = self._vehicle.take()
         if not frames:
             return
         self._heard_us = self.clock.time_us()
         self._digest.add("telemetry", self._heard_us, b"".join(frames))
         self._waiting += frames
-        if len(self._waiting) >= FEED_FRAMES:
+        if len(self._waiting) >= FEED_FRAMES or self._asked is not None:
             self._pass_telemetry()
 
     def _pass_telemetry(self) -> None:
         if self._waiting:
-            self._partner.send(b"".join(self._waiting))
+            self._pass(self._waiting)
             self._waiting.clear()
+
+    def _pass(self, frames: Sequence[bytes]) -> None:
+        self._partner.send(b"".join(frames))
+        if self._asked is not None and self._asked in map(acknowledged, frames):
+            self._asked = None
+            self._answered.set()

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
+from airl_mav.lockstep.link import real_vehicle
 from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, part_of
 from airl_mav.rehearsal.progress import Observer
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Order, Supervisor
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import MissionResult, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 
@@ -53,7 +57,8 @@ def rehearse(
         if index in done:
             continue
         policy, tlog = scenario.fresh_policy(seed), folder.tlog_path(index)
-        flown = fly(scenario, policy, index, seed, tlog=tlog, observer=observer)
+        log = folder.path / FIRMWARE_PRINTS
+        flown = fly(scenario, policy, index, seed, tlog=tlog, log=log, observer=observer)
         folder.save_episodes([flown])
         observer.finished(flown.record)
 
@@ -65,9 +70,13 @@ def fly(
     seed: int,
     *,
     tlog: Path | None = None,
+    log: Path | None = None,
     observer: Observer | None = None,
 ) -> FlownEpisode:
     """Fly one episode; the same scenario, policy and seed give the same flight, bit by bit.
+
+    With real firmware they give almost the same one. A flight that loses its firmware is flown
+    again from its seed, with another policy of the same kind and new firmware.
 
     Args:
         resolved: The scenario.
@@ -75,13 +84,30 @@ def fly(
         index: Number of the episode in its run.
         seed: Of arena, sensors, wind and latency.
         tlog: Where its MAVLink log goes; None: no log.
+        log: What real firmware prints goes here; None: to a file in its folder.
         observer: Who looks on.
 
     Raises:
-        UsageError: The policy cannot use the camera; no arena can be made of the seed.
-        LockstepError: The companion hangs, or broke.
+        UsageError: The policy cannot use the camera; no arena can be made of the seed; there is no
+            such firmware.
+        LockstepError: The companion hangs, or broke; real firmware was lost too often.
     """
-    return _Flight(resolved, policy, index, seed, observer or Observer()).fly(tlog)
+    observer = observer or Observer()
+    notes: list[str] = []
+    while True:
+        flight = _Flight(resolved, policy, index, seed, observer, notes)
+        try:
+            return flight.fly(tlog, log)
+        except FirmwareLostError as error:
+            what, *_ = str(error).splitlines()
+            notes.append(f"flown again: {what}")
+            title = f"flight {index:03d}, seed {seed}"
+            if len(notes) == MAX_ATTEMPTS:
+                raise LockstepError(
+                    f"{title}: lost {MAX_ATTEMPTS} times; at last {error}"
+                ) from None
+            observer.lost(f"{title} begins again: {error}")
+            policy = resolved.fresh_policy(seed)
 
 
 class _Flight:
@@ -94,7 +120,9 @@ class _Flight:
         index: int,
         seed: int,
         observer: Observer,
+        notes: Sequence[str],
     ) -> None:
+        self._notes = tuple(notes)
         self._resolved, self._policy, self._index, self._seed = resolved, policy, index, seed
         self._observer = observer
         self._ticks = 0
@@ -106,7 +134,7 @@ class _Flight:
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
-    def fly(self, tlog: Path | None) -> FlownEpisode:
+    def fly(self, tlog: Path | None, log: Path | None) -> FlownEpisode:
         resolved = self._resolved
         setup = EpisodeSetup(
             resolved.vehicle,
@@ -115,11 +143,14 @@ class _Flight:
             resolved.scenario,
             resolved.computer.onboard_watts,
         )
+        asked = resolved.scenario
+        vehicle = real_vehicle(asked, resolved.vehicle, log)
         with Stage(
             transport_us=TRANSPORT_US,
             digest=self._digest,
             speed=resolved.speed,
             faults=resolved.scenario.faults,
+            vehicle=vehicle,
         ) as self._stage:
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
@@ -206,8 +237,14 @@ class _Flight:
             wall_s=None,
             slipped_us=0,
             battery_remaining=battery,
-            notes=result.notes,
+            notes=(*self._notes, *result.notes),
             faults=faults_of(arrays),
-            sha256={"flight": self._digest.hexdigest(), **self._digest.lanes()},
+            sha256=self._fingerprint(),
         )
         return FlownEpisode(record, trajectory, latency)
+
+    def _fingerprint(self) -> dict[str, str] | None:
+        """Return the fingerprint; None of real firmware, whose threads the host schedules."""
+        if self._resolved.scenario.firmware != "builtin":
+            return None
+        return {"flight": self._digest.hexdigest(), **self._digest.lanes()}

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.faults.model import Fault, link_fails
-from airl_mav.lockstep.conductor import Conductor
+from airl_mav.lockstep.vehicle_end import InMemory, RealFirmwareEnd, VehicleEnd
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.external.conducted import conducted_px4
 from firmware_sim.faults.link import FailingEndpoint
-from firmware_sim.firmware import BuiltinFlightStack, Firmware, FrameServer
+from firmware_sim.firmware import BuiltinFlightStack, FlightStack
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
 from firmware_sim.mavlink.link import LinkConfig, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -20,6 +25,10 @@ BOOT_UNIX_US = 1_767_225_600 * US_PER_S
 MAVSDK_HZ = {"EXTENDED_SYS_STATE": 1.0}
 """Rates that MAVSDK asks for by itself, at a moment that the wall clock decides [Hz]: here they are
 set from the start, and its request changes nothing (`inbound`)."""
+
+
+HEARTBEAT_US = US_PER_S
+"""PX4 sends its heartbeat so often [µs]."""
 
 
 def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
@@ -33,23 +42,52 @@ def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
     return replace(link, rates_hz=rates, separate_replies=True)
 
 
-def conducted_firmware(
-    endpoint: MemoryEndpoint,
-    camera: FrameServer,
-    conductor: Conductor,
-    faults: Sequence[Fault] = (),
-) -> Firmware:
-    """Return the firmware whose companion is conducted, without an episode.
+@dataclass(frozen=True)
+class ConductedVehicle:
+    """What flies under a conductor."""
+
+    stack: FlightStack
+    end: VehicleEnd
+    """Its end of the companion's link."""
+    failing: FailingEndpoint | None = None
+    """That link, where it is to fail."""
+    heard_after_us: int = 0
+    """Longest time until its first heartbeat after an episode was loaded [µs]."""
+
+
+def builtin_vehicle(clock: Clock, faults: Sequence[Fault] = ()) -> ConductedVehicle:
+    """Return the built-in autopilot, whose link is in memory.
 
     Args:
-        endpoint: The vehicle's end of the companion's link.
-        camera: Where frames go.
-        conductor: How simulated time passes.
+        clock: The conductor's.
         faults: What will fail; those of the link need a place of their own.
     """
+    endpoint = MemoryEndpoint()
     failing = None
     if link_fails(faults):
-        failing = FailingEndpoint(endpoint, conductor.clock, conducted=True)
+        failing = FailingEndpoint(endpoint, clock, conducted=True)
     link = lockstep_link(endpoint if failing is None else failing)
     server = MavlinkServer([link], boot_unix_us=BOOT_UNIX_US)
-    return Firmware(BuiltinFlightStack(server), camera, conductor, failing=failing)
+    return ConductedVehicle(BuiltinFlightStack(server), InMemory(endpoint), failing)
+
+
+def real_vehicle(
+    aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None = None
+) -> ConductedVehicle | None:
+    """Return the real firmware that an aircraft is flown by; None: it is the built-in autopilot.
+
+    Its ports are bound, nothing is started.
+
+    Args:
+        aircraft: What was asked of it.
+        vehicle: What it flies.
+        log: What real firmware prints goes here; None: to a file in its folder.
+
+    Raises:
+        UsageError: No instance of real firmware is free, or its program is not there.
+    """
+    if aircraft.firmware == "builtin":
+        return None
+    px4 = conducted_px4(aircraft, vehicle, log)
+    end = RealFirmwareEnd(px4.link, px4.settle)
+    return ConductedVehicle(px4.stack, end, heard_after_us=HEARTBEAT_US)

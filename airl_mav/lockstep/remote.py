@@ -10,21 +10,21 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from airl_mav.core.clock import WallClock
+from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import SEEN, FlightDigest
 from airl_mav.lockstep.judging import Judge
-from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
+from airl_mav.lockstep.link import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
 from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
-from firmware_sim.firmware import FrameServer, Loaded
-from firmware_sim.mavlink.endpoint import MemoryEndpoint, UdpEndpoint
+from firmware_sim.firmware import Firmware, FrameServer, Loaded
+from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup
 from firmware_sim.warm_up import warm_up
@@ -63,9 +63,10 @@ class RemoteStage:
             broken_off=broken_off,
             phase=self._enter,
         )
-        memory = MemoryEndpoint()
-        self._conductor = Conductor(memory, self._partner, self._digest, asked.pace)
-        self.firmware = conducted_firmware(memory, camera, self._conductor, asked.faults)
+        clock = SimClock()
+        vehicle = builtin_vehicle(clock, asked.faults)
+        self._conductor = Conductor(vehicle.end, self._partner, self._digest, asked.pace, clock)
+        self.firmware = Firmware(vehicle.stack, camera, self._conductor, failing=vehicle.failing)
         self._judge = Judge(None, self._digest, order=self._partner.order)
 
     @property

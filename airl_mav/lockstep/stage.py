@@ -8,20 +8,21 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from types import TracebackType
 
+from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.faults.kinds import LINKS
 from airl_mav.faults.model import Fault
 from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
-from airl_mav.lockstep.link import BOOT_UNIX_US, conducted_firmware
+from airl_mav.lockstep.link import BOOT_UNIX_US, ConductedVehicle, builtin_vehicle
 from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.interfaces import LinkError
 from companion.mavsdk_link import RAW_TIMEOUT_S, RAW_URL, MavsdkLink
 from firmware_sim.faults.timeline import FaultTimeline
-from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.firmware import Firmware
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 HEARD_TIMEOUT_S = 10.0
@@ -41,6 +42,7 @@ class Stage:
         digest: FlightDigest | None = None,
         speed: float | None = None,
         faults: Sequence[Fault] = (),
+        vehicle: ConductedVehicle | None = None,
     ) -> None:
         """Put everything together; nothing moves yet.
 
@@ -49,18 +51,22 @@ class Stage:
             digest: Takes the fingerprint of what crosses the link; None: nobody wants it.
             speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
             faults: What the episode's aircraft has of them; only those of the link matter here.
+            vehicle: What flies, released with the stage; None: the built-in autopilot.
         """
+        clock = SimClock()
+        self._vehicle = vehicle = vehicle or builtin_vehicle(clock, faults)
         self._partner = ThreadPartner()
         self.abandon = threading.Event()
         """Makes the link break off whatever it waits for."""
-        endpoint = MemoryEndpoint()
-        self.conductor = Conductor(endpoint, self._partner, digest, speed)
+        self.conductor = Conductor(vehicle.end, self._partner, digest, speed, clock)
         self.clock = ConductedClock(self.conductor.clock, self._partner.sleep)
         """The companion's clock, and its watchdog's guard."""
         self.camera = MemoryCamera(transport_us)
         """The companion's source of frames."""
         self.camera.clock = self.clock
-        self.firmware = conducted_firmware(endpoint, self.camera, self.conductor, faults)
+        self.firmware = Firmware(
+            vehicle.stack, self.camera, self.conductor, failing=vehicle.failing
+        )
         self.unheard = ""
         """Why the companion never began: a fault has kept it from hearing the vehicle."""
         self._open = ExitStack()
@@ -127,7 +133,7 @@ class Stage:
             program()
 
         self._partner.start(connected)
-        conductor.begin(started_us + COMPANION_STARTS_US)
+        conductor.begin(started_us + self._vehicle.heard_after_us + COMPANION_STARTS_US)
         while not conductor.ended:
             firmware.step()
         self._raise_what_broke()

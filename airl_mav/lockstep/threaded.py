@@ -14,10 +14,10 @@ from contextlib import suppress
 from dataclasses import replace
 from queue import Empty, SimpleQueue
 
-from airl_mav.core.clock import WallClock
+from airl_mav.core.clock import Patience
 from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.frames import newest_heartbeat
-from airl_mav.lockstep.turns import LockstepError, Turn
+from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from companion.conducted import Abandoned
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect
@@ -31,11 +31,11 @@ PATIENCE_S = 60
 PING_AGAIN_S = 0.1
 """A barrier's PING is repeated after so long without an answer [wall s]."""
 
-GREATEST_GAP_US = 2 * US_PER_S
-"""A longer time between two looks was no waiting: the process was stopped [µs of wall time]."""
-
 HEARTBEAT_S = 1.0
 """The newest heartbeat is repeated so often in a long turn [wall s]."""
+
+LONGEST_ANSWER_US = 10 * US_PER_S
+"""Longest time that the answer to a command may take [µs of simulated time]."""
 
 _PING: int = dialect.MAVLINK_MSG_ID_PING
 
@@ -57,6 +57,10 @@ class ThreadPartner:
         self._feed: Callable[[bytes], None] = lambda _: None
         self._heartbeat = b""
         self._barriers = FIRST_BARRIER
+        self._interrupted = False
+        """Whether the companion, in the middle of its turn, waits for an answer."""
+        self._sent_before = 0
+        """Setpoints sent before its turn began."""
         self._encoder = Encoder()
         self._thread: threading.Thread | None = None
 
@@ -87,19 +91,24 @@ class ThreadPartner:
         self._heartbeat = newest_heartbeat(frames) or self._heartbeat
         self._feed(frames)
 
-    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+    def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps; see `turns.Partner`."""
-        del now_us  # its clock is the conductor's
-        self._settle(handle)
-        sent_before = self._setpoints_sent
-        self._go.release()
+        if self._interrupted:
+            self._interrupted = False  # It has its turn still, and its answer now.
+        else:
+            self._settle(handle)
+            self._sent_before = self._setpoints_sent
+            self._go.release()
         turn = self._work(handle)
+        if isinstance(turn, threading.Event):
+            self._interrupted = True
+            return Turn(now_us + LONGEST_ANSWER_US, turn, self._sent_before)
         # A command is answered before its caller goes on; a setpoint may still be under way.
-        if self._setpoints_sent != sent_before:
+        if self._setpoints_sent != self._sent_before:
             self._settle(handle)
         return replace(turn, setpoints_sent=self._setpoints_sent)
 
-    def _settle(self, handle: Callable[[bytes], None]) -> None:
+    def _settle(self, handle: Handle) -> None:
         """Wait until MAVSDK has taken in and sent out everything so far."""
         number = self._barriers
         self._barriers += 1
@@ -122,8 +131,8 @@ class ThreadPartner:
                 handle(item)
         raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
 
-    def _work(self, handle: Callable[[bytes], None]) -> Turn:
-        """Wait for the end of the companion's turn."""
+    def _work(self, handle: Handle) -> Turn | threading.Event:
+        """Wait for the end of the companion's turn, or until it waits for an answer: for what."""
         waited = Patience()
         heartbeat_s = HEARTBEAT_S
         while waited.so_far_s() < PATIENCE_S:
@@ -131,7 +140,8 @@ class ThreadPartner:
                 item = self._inbox.get(timeout=HEARTBEAT_S)
                 if not isinstance(item, bytes):
                     return item
-                handle(item)
+                if (answered := handle(item)) is not None:
+                    return answered
             if waited.so_far_s() >= heartbeat_s:
                 # MAVSDK gives a vehicle up after 3 s without a heartbeat, by the wall clock, and
                 # then finds no autopilot to connect to.
@@ -164,22 +174,6 @@ class ThreadPartner:
         except BaseException as error:  # handed to whoever conducts
             self.error = error
         self._inbox.put(Turn(None))
-
-
-class Patience:
-    """Adds up wall time in which somebody waited; a process that is stopped does not wait."""
-
-    def __init__(self) -> None:
-        self._clock = WallClock()
-        self._seen_us = 0
-        self._waited_us = 0
-
-    def so_far_s(self) -> float:
-        """Return what has been waited [s]. To be asked more often than `GREATEST_GAP_US`."""
-        now_us = self._clock.time_us()
-        self._waited_us += min(now_us - self._seen_us, GREATEST_GAP_US)
-        self._seen_us = now_us
-        return self._waited_us / US_PER_S
 
 
 def _is_ping(frame: bytes) -> bool:

@@ -17,7 +17,7 @@ from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.frames import datagrams, newest_heartbeat
-from airl_mav.lockstep.turns import LockstepError, Turn
+from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
@@ -128,7 +128,7 @@ class TokenPartner:
         if self._heard:
             self._send_frames(frames)
 
-    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+    def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps; see `turns.Partner`."""
         arrived = self._camera.arrive(now_us)
         self._unseen = self._unseen or arrived
@@ -201,7 +201,7 @@ class TokenPartner:
                 return True
         return False
 
-    def _exchange(self, given: TurnGiven, handle: Callable[[bytes], None]) -> TurnBack | None:
+    def _exchange(self, given: TurnGiven, handle: Handle) -> TurnBack | None:
         """Give the turn, again and again, until it comes back; None: broken off."""
         again = False
         # Counted in repetitions, not read off a clock: a process that was stopped has not waited.
@@ -235,7 +235,7 @@ class TokenPartner:
             self._endpoint.send(self._heartbeat)
 
     def _hear(
-        self, messages: list[WireMessage], given: TurnGiven, handle: Callable[[bytes], None]
+        self, messages: list[WireMessage], given: TurnGiven, handle: Handle
     ) -> TurnBack | None:
         """Handle what has arrived; return the turn if it is given back.
 

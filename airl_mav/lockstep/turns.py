@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from airl_mav.core.constants import US_PER_S
 
@@ -29,6 +29,12 @@ class Turn:
     """Setpoints that it has handed to MAVSDK so far."""
 
 
+Handle: TypeAlias = "Callable[[bytes], threading.Event | None]"
+"""Takes a frame of the companion's and answers by `Partner.send`. Where the answer takes simulated
+time, it returns what is set when it has come: the companion, which waits for it inside MAVSDK, is
+to be interrupted until then."""
+
+
 class Partner(Protocol):
     """The companion as the conductor sees it, in a thread or behind a socket."""
 
@@ -36,12 +42,12 @@ class Partner(Protocol):
         """Pass on telemetry; it is in the companion's hands when its next turn begins."""
         ...
 
-    def turn(self, now_us: int, handle: Callable[[bytes], None]) -> Turn:
+    def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps, while simulated time stands at `now_us` [µs].
 
         Args:
             now_us: Simulated time [µs].
-            handle: Called with every MAVLink frame that the companion sends; it answers by `send`.
+            handle: Called with every MAVLink frame that the companion sends.
 
         Raises:
             LockstepError: The turn does not come back.

@@ -20,6 +20,9 @@ DEFAULT_VEHICLE = "quad"
 
 GREATEST_PORT = 65_535
 
+GREATEST_INSTANCE = 9
+"""PX4's instances above share one API port, 14549 (px4-rc.mavlink)."""
+
 EstimatorName = Literal["kernel", "filterpy"]
 FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
 
@@ -78,10 +81,11 @@ class RealFirmware(ProfileModel):
     )
     instance: int = quantity(
         "instance number: moves all ports of the flight controller and that of the camera, as PX4's"
-        " -i and ArduPilot's -I do; the built-in one is system N + 1 then, as PX4 is",
+        " -i and ArduPilot's -I do; the built-in one is system N + 1 then, as PX4 is; with PX4 at"
+        " level lockstep the first that is tried: flights side by side take the next free ones",
         "1",
         ge=0,
-        le=9,
+        le=GREATEST_INSTANCE,
         default=0,
     )
     serial: str | None = Field(

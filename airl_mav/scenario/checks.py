@@ -92,11 +92,13 @@ def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None)
             raise FieldError("firmware", firmware, f"with {' or '.join(names)}")
     if firmware == "builtin":
         return
-    if level != "sitl":
+    if level == "gym":
+        raise FieldError("firmware", firmware, "at level lockstep or sitl: the twin has its own")
+    if level == "lockstep" and firmware != "px4":
         raise FieldError(
             "firmware",
             firmware,
-            f"at level sitl, not {level}: only the built-in autopilot shares its clock",
+            "at level sitl; at level lockstep only builtin and px4 share the companion's clock",
         )
     if firmware == "px4-hitl" and speed not in (None, 1.0):
         raise FieldError("speed", speed, "1 with firmware px4-hitl, a board's own pace")

@@ -203,7 +203,13 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
     check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
     level: LevelName = "lockstep" if asked.lockstep else "sitl"
-    check_firmware(asked, level, speed)
+    check_firmware(asked, "sitl", speed)
+    if asked.lockstep and asked.firmware != "builtin":
+        raise FieldError(
+            "firmware",
+            asked.firmware,
+            "without lockstep; PX4 is flown in lockstep by airl-sitl and from Python",
+        )
     check_faults(asked, level)
     low, high = LOCKSTEP_SPEEDS if asked.lockstep else SPEEDS
     if isinstance(speed, float) and not (low < speed <= high or low == speed > 0.0):

@@ -60,7 +60,27 @@ def real_firmware(wanted: Wanted) -> ExternalFlightStack:
 
 
 def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
-    options, instance = wanted.aircraft.real, wanted.aircraft.real.instance
+    real = wanted.aircraft.real
+    if real.px4_dir is not None:
+        # Otherwise PX4 would come up without its links, or not at all, flight after flight.
+        px4_program.check_free(real.instance)
+    return px4_parts(wanted, real.instance, Px4Bridge)
+
+
+def px4_parts(
+    wanted: Wanted, instance: int, bridge: Callable[[int], Px4Bridge]
+) -> tuple[Launcher, Endpoint]:
+    """Bind the observer's end of PX4's payload link; return it, and what starts PX4.
+
+    Args:
+        wanted: What is asked of it.
+        instance: PX4's instance number, which moves its ports.
+        bridge: Opens the simulator interface on a TCP port.
+
+    Raises:
+        UsageError: As of `real_firmware`.
+    """
+    options = wanted.aircraft.real
     airframe = px4_airframe(wanted.vehicle, SITL_OUTPUT)
     program = None if options.px4_dir is None else find_px4(options.px4_dir)
     endpoint = UdpEndpoint(
@@ -71,7 +91,7 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     )
     launcher = Launcher(
         airframe,
-        partial(Px4Bridge, px4_program.SIMULATOR_PORT + instance),
+        partial(bridge, px4_program.SIMULATOR_PORT + instance),
         options.firmware_timeout,
         reboots=False,
         program=None if program is None else partial(program.start, instance, airframe.autostart),

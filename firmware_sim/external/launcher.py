@@ -8,6 +8,7 @@ from pathlib import Path
 from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import Bridge, no_process
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
+from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 
 
 class Launcher:
@@ -50,7 +51,7 @@ class Launcher:
 
         Raises:
             UsageError: A port or device cannot be opened.
-            FirmwareMissingError: It cannot be started, or never connects.
+            FirmwareMissingError: It cannot be started, ends at once, or never connects.
             FirmwareLostError: It died while it started.
         """
         self.stop()
@@ -63,11 +64,29 @@ class Launcher:
                     self.airframe.firmware, self._program(folder), folder, self._folders.log
                 )
                 alive = self._child.check
-            bridge.wait_connected(self._timeout_s, alive)
+            self._await(bridge, alive)
         except BaseException:
             self.stop()
             raise
         return bridge
+
+    def _await(self, bridge: Bridge, alive: Callable[[], None]) -> None:
+        """Wait until it has connected.
+
+        Raises FirmwareMissingError, too, when it ends by itself before: it would do so again.
+        """
+        try:
+            bridge.wait_connected(self._timeout_s, alive)
+        except FirmwareLostError as error:
+            child = self._child
+            exited = None if child is None else child.poll()
+            if child is None or exited is None or exited.by_signal:
+                raise
+            tail = child.log_tail().splitlines()
+            raise FirmwareMissingError(
+                f"{child.name} ended at once ({exited}): {tail[-1] if tail else 'no word of it'}; "
+                f"log: {child.log}"
+            ) from error
 
     def stop(self) -> None:
         """Release the bridge and end what was started; harmless when nothing was."""

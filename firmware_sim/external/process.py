@@ -9,6 +9,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,11 +75,12 @@ class WorkingFolders:
         """Return a new, empty working folder: nothing carries over from an earlier flight."""
         if self._temporary:
             shutil.rmtree(self._path, ignore_errors=True)
-        self._flights += 1
-        while self._path.exists():
+        while True:
             self._flights += 1
-        self._path.mkdir()
-        return self._path
+            # Processes that fly side by side may keep their folders in the same place.
+            with suppress(FileExistsError):
+                self._path.mkdir()
+                return self._path
 
     def close(self) -> None:
         """Remove what is temporary; harmless when called again."""

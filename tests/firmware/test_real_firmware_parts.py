@@ -506,7 +506,8 @@ def test_the_user_is_told_what_to_start() -> None:
         return how_to_start(Aircraft(real=RealFirmware(**options)), quad())
 
     assert told(px4_connect=True, instance=2) == (
-        "PX4_SIM_MODEL=none_iris PX4_SYS_AUTOSTART=10016 build/px4_sitl_default/bin/px4 -i 2"
+        "while PX4_SIM_MODEL=none_iris PX4_SYS_AUTOSTART=10016 build/px4_sitl_default/bin/px4 -d -i"
+        " 2; do sleep 1; done"
     )
     hint = told(ardupilot_connect=True)
     assert hint is not None

@@ -25,7 +25,7 @@ from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.lockstep.stage import Stage
 from airl_mav.lockstep.threaded import ThreadPartner
-from airl_mav.lockstep.turns import LockstepError
+from airl_mav.lockstep.turns import Handle, LockstepError
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings
@@ -104,7 +104,7 @@ def test_without_the_barrier_reruns_differ(
     """The control: what the test above sees is the barrier's doing, not luck."""
 
     class Hasty(ThreadPartner):
-        def _settle(self, handle: Callable[[bytes], None]) -> None:
+        def _settle(self, handle: Handle) -> None:
             del handle
 
     monkeypatch.setattr(stage_module, "ThreadPartner", Hasty)

@@ -153,7 +153,7 @@ def test_a_px4_that_never_comes_is_waited_for_in_vain(tmp_path: Path) -> None:
     with running(words, tmp_path) as process:
         assert process.wait(100.0) == 2, process.text()
     assert f"PX4 did not connect to TCP port {4560 + instance} within 2 s" in process.text()
-    assert f"bin/px4 -i {instance}" in process.text()
+    assert f"bin/px4 -d -i {instance}; do sleep 1; done" in process.text()
     assert not (tmp_path / "run").exists()
 
 

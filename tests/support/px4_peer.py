@@ -13,6 +13,7 @@ import argparse
 import math
 import os
 import random
+import select
 import shlex
 import signal
 import socket
@@ -43,6 +44,8 @@ SILENT_SAMPLES = 22
 """HIL_SENSOR messages without an answer while it boots."""
 
 STATE_INTERVAL_US = 5_000
+ANSWER_US = 8_000
+"""A command is answered so much later."""
 RETRY_S = 0.005
 
 BATTERY = BatterySample(voltage_v=16.2, current_a=5.0, consumed_mah=0.0, remaining=1.0)
@@ -114,6 +117,8 @@ class Px4Peer:
     """Ends it, from another thread."""
     on_connect: Callable[[], None] = lambda: None
     """Called when it has connected."""
+    links: list[LateAnswers] = field(default_factory=list)
+    """Its ends of its links."""
     heard: deque[Any] = field(default_factory=lambda: deque(maxlen=2000))
     """The newest HIL messages that came."""
 
@@ -157,7 +162,9 @@ class Px4Peer:
     def _server(self) -> MavlinkServer:
         def link(ports: tuple[int, int]) -> UdpEndpoint:
             local, remote = ((LOOPBACK, port) for port in ports)
-            return UdpEndpoint(local, remote, local_option="local", remote_option="remote")
+            made = LateAnswers(local, remote, local_option="local", remote_option="remote")
+            self.links.append(made)
+            return made
 
         ports = self.ports
         links = [
@@ -169,6 +176,27 @@ class Px4Peer:
         return MavlinkServer(links, boot_unix_us=1_700_000_000_000_000)
 
 
+class LateAnswers(UdpEndpoint):
+    """A link on which commands are answered some milliseconds of simulated time later, as PX4's."""
+
+    def __init__(self, *addresses: Any, **options: Any) -> None:
+        super().__init__(*addresses, **options)
+        self.now_us = 0
+        self.held: deque[tuple[int, bytes]] = deque()
+
+    def send(self, data: bytes) -> None:
+        if int.from_bytes(data[7:10], "little") == dialect.MAVLINK_MSG_ID_COMMAND_ACK:
+            self.held.append((self.now_us + ANSWER_US, data))
+        else:
+            super().send(data)
+
+    def release(self, now_us: int) -> None:
+        """Send the answers that are due."""
+        self.now_us = now_us
+        while self.held and self.held[0][0] <= now_us:
+            super().send(self.held.popleft()[1])
+
+
 class Flying:
     """From one boot to the end of its connection."""
 
@@ -176,6 +204,10 @@ class Flying:
         self.peer, self.connection, self.server = peer, connection, server
         self.mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
         self.parser = dialect.MAVLink(None)
+        self.now_us = 0
+        self.waiter = select.poll()
+        for readable in (connection.fileno(), *server.filenos()):
+            self.waiter.register(readable, select.POLLIN)
         store = Px4Parameters(peer.vehicle, swapped="motors" in peer.faults)
         self.autopilot = BuiltinAutopilot(store)
         self.samples = 0
@@ -190,6 +222,12 @@ class Flying:
         self._send(dialect.MAVLink_command_long_message(0, 0, *ask))
         self._send(dialect.MAVLink_heartbeat_message(0, dialect.MAV_AUTOPILOT_PX4, 0, 0, 0, 3))
         while not self.peer.stop.is_set():
+            ready = [number for number, _ in self.waiter.poll(100)]
+            if self.connection.fileno() not in ready:
+                # Its MAVLink is taken in by the wall clock, while its time stands still.
+                if ready and self.samples > SILENT_SAMPLES + 1:
+                    self.server.receive(self.now_us)
+                continue
             try:
                 data = self.connection.recv(65_536)
             except TimeoutError:
@@ -234,7 +272,9 @@ class Flying:
         return now_us - self.first_us >= at_s * 1e6
 
     def _step(self, message: Any) -> None:
-        now_us = message.time_usec
+        now_us = self.now_us = message.time_usec
+        for link in self.peer.links:
+            link.release(now_us)
         sample = _sample(message, self.gps)
         self.gps = None
         if self.samples > SILENT_SAMPLES + 1:

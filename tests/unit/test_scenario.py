@@ -155,6 +155,14 @@ def test_profiles_and_card_are_read_once_and_never_in_flight(tmp_path: Path) -> 
         ({"ports": {"camera_port": 0}}, "ports.camera_port 0: accepted: 1 <= value <= 65535"),
         ({"ports": {"gcs_port": 14540}}, "ports.gcs_port 14540: accepted: another than that of"),
         ({"firmware": "px4"}, "firmware 'px4': accepted: with px4_dir or px4_connect"),
+        (
+            {"firmware": "px4", "level": "gym", "real": {"px4_dir": "px4"}},
+            "firmware 'px4': accepted: at level lockstep or sitl",
+        ),
+        (
+            {"firmware": "ardupilot", "level": "lockstep", "real": {"ardupilot_connect": True}},
+            "firmware 'ardupilot': accepted: at level sitl; at level lockstep only builtin and px4",
+        ),
         ({"real": {"serial": "x"}}, "real.serial 'x': accepted: with firmware px4-hitl"),
         ({"policy": "greedy", "ablate": "depth", "level": "gym"}, "ablate 'depth': accepted: for"),
     ],
@@ -171,7 +179,7 @@ def test_fields_that_contradict_each_other_are_named(fields: dict[str, Any], lin
     [
         (["--hold-s", "3"], "--decision-timeout-s 2: accepted: more than the hold time, 3 s"),
         (["--ablate", "depth"], "--ablate depth: accepted: at level gym or lockstep"),
-        (["--firmware", "px4"], "--firmware px4: accepted: with "),
+        (["--firmware", "px4"], "--firmware px4: accepted: with --px4-dir or --px4-connect"),
         (["--level", "gym"], "--level gym: accepted: lockstep or sitl"),
         (["--wind.gust-m-s", "99"], "--wind.gust-m-s 99: accepted: 0 <= value <= 50 m/s"),
         (["--serial", "/dev/ttyX"], "--serial /dev/ttyX: accepted: with firmware px4-hitl"),

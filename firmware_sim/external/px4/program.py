@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.process import StartCommand
 from firmware_sim.flight_controller import FirmwareMissingError
 
@@ -15,10 +17,17 @@ PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
 """Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink).
 Instances above 9 share one API port."""
 
+LOCAL_PORTS = (API_LOCAL_PORT, 18_570, PAYLOAD_LOCAL_PORT, 13_030)
+"""UDP ports that instance 0 binds itself: onboard API, ground station, payload, gimbal."""
+
 MODEL = "none_iris"
 """PX4_SIM_MODEL without which PX4's scripts would start a simulator of their own."""
 
 SCRIPT = "etc/init.d-posix/rcS"
+
+UNAWAITED_THREADS = (b"commander", b"navigator", *(b"mavlink_if%d" % i for i in range(4)))
+"""Threads that PX4 does not wait for before it answers a sample: modules with a thread of their
+own. Its controllers and estimator run in work queues, which it waits for."""
 
 LAYOUTS = (".", "build/px4_sitl_default", "usr", "opt/px4")
 """Where below a folder bin/px4 and etc/ are looked for: a build, a source tree, a package."""
@@ -67,6 +76,29 @@ def environment(airframe: int) -> dict[str, str]:
 
 
 def how_to_start(instance: int, airframe: int) -> str:
-    """Return the command with which a user starts a PX4 from its source tree."""
-    words = [f"{name}={value}" for name, value in environment(airframe).items()]
-    return " ".join([*words, "build/px4_sitl_default/bin/px4", "-i", shlex.quote(str(instance))])
+    """Return the command with which a user starts a PX4 from its source tree, flight after flight.
+
+    It is a loop because PX4 is told to shut down at the end of a flight.
+    """
+    variables = " ".join(f"{name}={value}" for name, value in environment(airframe).items())
+    program = f"build/px4_sitl_default/bin/px4 -d -i {instance}"
+    return f"while {variables} {program}; do sleep 1; done"
+
+
+def check_free(instance: int) -> None:
+    """Raise UsageError when a port is taken that PX4, or its bridge, is about to bind."""
+    simulator = (socket.SOCK_STREAM, LOOPBACK, SIMULATOR_PORT + instance)
+    # PX4 binds its own ports on all interfaces.
+    links = ((socket.SOCK_DGRAM, "", port + instance) for port in LOCAL_PORTS)
+    for kind, host, port in (simulator, *links):
+        with socket.socket(socket.AF_INET, kind) as trial:
+            if kind == socket.SOCK_STREAM:
+                trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                trial.bind((host, port))
+            except OSError as error:
+                name = "TCP" if kind == socket.SOCK_STREAM else "UDP"
+                raise UsageError(
+                    f"{name} port {port}, which PX4 of instance {instance} needs, is taken "
+                    "(another simulator, or airl-firmware?): choose another with --instance"
+                ) from error

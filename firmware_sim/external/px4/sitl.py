@@ -9,11 +9,12 @@ import math
 import sys
 from collections.abc import Callable
 
-from airl_mav.core.clock import WallClock
+from airl_mav.core.clock import Patience, WallClock
 from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
 from firmware_sim.external.bridge import no_process
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT
+from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
+from firmware_sim.external.running_program import RunningProgram, program_at
 from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
@@ -21,6 +22,10 @@ from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
 
 ANSWER_S = 5.0
 """Longest wait for an answer [wall s]."""
+
+STOPPED_S = 1.0
+"""A PX4 that has not answered for so long is looked at: is it stopped? [wall s] Sooner than its
+clients miss its heartbeats."""
 
 REST_S = 0.1
 """Longest wait for one answer of a PX4 that is disarmed [wall s]; then the next sample is sent. In
@@ -63,12 +68,27 @@ class Px4Bridge:
 
     rate_hz = TICK_HZ
 
-    def __init__(self, port: int, *, answer_s: float = ANSWER_S, start_s: float = START_S) -> None:
-        """Listen for PX4 on a TCP port: 4560 + instance, 0 = any free one.
+    def __init__(
+        self,
+        port: int,
+        *,
+        answer_s: float = ANSWER_S,
+        start_s: float = START_S,
+        least_state_us: int = 1,
+    ) -> None:
+        """Listen for PX4.
 
-        `answer_s` and `start_s` are the longest waits for an answer, and for the first one
-        [wall s]. Raises UsageError if the port is taken, or cannot be used.
+        Args:
+            port: TCP port: 4560 + instance, 0 = any free one.
+            answer_s: Longest wait for an answer [wall s].
+            start_s: Longest wait for the first one [wall s].
+            least_state_us: The true state is sent no more often than that, however often PX4 asks
+                for it [µs].
+
+        Raises:
+            UsageError: The port is taken, or cannot be used.
         """
+        self._least_state_us = least_state_us
         self.armed = False
         self.time_us = 0
         self.unanswered = 0
@@ -95,8 +115,10 @@ class Px4Bridge:
         """Wall time before which no sample is sent, until the first answer [µs]."""
         self._answer: WireMessage | None = None
         """The newest one."""
-        self._waiting_us: int | None = None
-        """Since when an answer is due [wall µs]; None: no answer is due."""
+        self._waiting: Patience | None = None
+        """Since when an answer is due; None: no answer is due."""
+        self._program: RunningProgram | None = None
+        """PX4's process, where it can be found."""
         self._garbage_bytes = 0
         """Bytes since the last message."""
 
@@ -107,6 +129,26 @@ class Px4Bridge:
             raise FirmwareMissingError(
                 f"PX4 did not connect to TCP port {self.port} within {timeout_s:g} s: is it "
                 f"running, with PX4_SIM_MODEL={MODEL} and -i {self.port - SIMULATOR_PORT}?"
+            )
+        pid = program_at(*self._tcp.peer)
+        if pid is not None:
+            self._program = RunningProgram(pid, UNAWAITED_THREADS)
+
+    def settle(self) -> None:
+        """Return once PX4 has done all that is due by its clock, as far as that can be seen.
+
+        Its controllers and its estimator have when it answers a sample. Its other threads may have
+        fallen behind, on a busy host.
+        """
+        if self._program is not None and self._answer is not None:
+            self._program.settle()
+
+    def alive(self) -> None:
+        """Raise FirmwareLostError when PX4 has ended, or was stopped."""
+        self._alive()
+        if self._program is not None and self._program.stopped:
+            raise self._lost(
+                f"is stopped (process {self._program.pid}, SIGSTOP): SIGCONT resumes it"
             )
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
@@ -134,6 +176,8 @@ class Px4Bridge:
     def close(self) -> None:
         """Close the port and the connection."""
         self._tcp.close()
+        if self._program is not None:
+            self._program.close()
 
     # --- sending
 
@@ -176,22 +220,23 @@ class Px4Bridge:
 
     def _answered(self) -> WireMessage:
         """Wait for the answer to the newest sample, and return the newest there is."""
-        asked_us = now_us = self._clock.time_us()
-        if self._waiting_us is None:
-            self._waiting_us = now_us
+        waiting = self._waiting = self._waiting or Patience()
+        asked_s = waited_s = waiting.so_far_s()
         while (answer := self._answer) is None or self.time_us != self._sent_us:
-            left_s = self._answer_s - (now_us - self._waiting_us) / US_PER_S
+            left_s = self._answer_s - waited_s
             if left_s <= 0.0:
                 raise self._lost(f"did not answer within {self._answer_s:g} s")
             if answer is not None and not self.armed:
-                rest_s = REST_S - (now_us - asked_us) / US_PER_S
+                rest_s = REST_S - (waited_s - asked_s)
                 if rest_s <= 0.0:
                     return answer
                 left_s = min(left_s, rest_s)
             if not self._receive(min(left_s, WATCH_S)):
                 self._alive()
-            now_us = self._clock.time_us()
-        self._waiting_us = None
+                if waited_s > STOPPED_S:
+                    self.alive()
+            waited_s = waiting.so_far_s()
+        self._waiting = None
         return answer
 
     def _receive(self, timeout_s: float) -> bool:
@@ -243,7 +288,8 @@ class Px4Bridge:
         ):
             return
         asked = message.param2
-        self._state_us = int(asked) if asked >= 1.0 else STATE_US
+        wanted_us = int(asked) if asked >= 1.0 else STATE_US
+        self._state_us = max(wanted_us, self._least_state_us)
         self._state_due_us = NEVER_US if asked < 0.0 else self._sent_us
 
     def _lost(self, what: str) -> FirmwareLostError:

@@ -58,6 +58,12 @@ class TcpPort:
         self._poll.register(self._connection, _READ)
         return True
 
+    @property
+    def peer(self) -> tuple[str, int]:
+        """Address of the other end."""
+        host, port = self._connected().getpeername()
+        return host, port
+
     def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
         """Send all of it; False when the connection has ended or does not accept it in time."""
         connection, left = self._connected(), data

@@ -1,0 +1,119 @@
+"""PX4 SITL for a companion that is conducted: the companion's link, and an instance of its own.
+
+Nothing here lives by the wall clock but the boot of PX4: an answer is waited for as long as it
+takes, so that a busy host slows a flight down and never ends it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.scheduling import ask_for_short_slices
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
+from firmware_sim.external.boot_sequence import ExternalFlightStack
+from firmware_sim.external.compose import Wanted, px4_parts
+from firmware_sim.external.observer import Observer
+from firmware_sim.external.px4.onboard_link import OnboardLink
+from firmware_sim.external.px4.program import check_free, find_px4
+from firmware_sim.external.px4.sitl import Px4Bridge
+from firmware_sim.mavlink.udp_links import UdpLinks
+
+ANSWER_S = 60.0
+"""Longest wait for PX4's answer to a sample [wall s, while this process runs]."""
+
+
+STATE_US = US_PER_S // 5
+"""The true state is sent no more often [µs]. PX4 asks for it every 5 ms, only to log it."""
+
+
+@dataclass(frozen=True)
+class ConductedPx4:
+    """PX4 and what a conductor needs of it."""
+
+    stack: ExternalFlightStack
+    link: OnboardLink
+    """The companion's; closed with the stack."""
+    settle: Callable[[], None]
+    """Returns when PX4 has done all that is due by its clock."""
+    instance: int
+
+
+def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None) -> ConductedPx4:
+    """Bind the ports of an instance of PX4's and return it, not yet started.
+
+    Where PX4 is started here, that is the first free instance from the one asked for on: flights
+    that run side by side, in processes of their own, each find another one.
+
+    Args:
+        aircraft: What was asked of it.
+        vehicle: What it flies.
+        log: What it prints goes here; None: to a file in its folder.
+
+    Raises:
+        UsageError: No instance is free, or the program is not there.
+    """
+    ask_for_short_slices()
+    real = aircraft.real
+    wanted = Wanted(aircraft, vehicle, log, _no_ends)
+    if real.px4_dir is None:
+        return _instance(wanted, real.instance)
+    find_px4(real.px4_dir)
+    taken: UsageError | None = None
+    for instance in range(real.instance, GREATEST_INSTANCE + 1):
+        # Bound first: two processes that look at the same time do not take the same one.
+        try:
+            found = _instance(wanted, instance)
+        except UsageError as error:
+            taken = error
+            continue
+        try:
+            check_free(instance)
+        except UsageError as error:
+            taken = error
+            found.stack.close()
+            continue
+        return found
+    raise UsageError(
+        f"no instance of PX4's from {real.instance} to {GREATEST_INSTANCE} is free (other "
+        "simulators?): choose another with --instance, or fewer workers"
+    ) from taken
+
+
+def _instance(wanted: Wanted, instance: int) -> ConductedPx4:
+    newest: list[Px4Bridge] = []
+
+    def bridge(port: int) -> Px4Bridge:
+        newest[:] = [Px4Bridge(port, answer_s=ANSWER_S, least_state_us=STATE_US)]
+        return newest[0]
+
+    def alive() -> None:
+        for each in newest:
+            each.alive()
+
+    def settle() -> None:
+        for each in newest:
+            each.settle()
+
+    launcher, endpoint = px4_parts(wanted, instance, bridge)
+    try:
+        link = OnboardLink(instance, alive)
+    except UsageError:
+        endpoint.close()
+        launcher.close()
+        raise
+    stack = ExternalFlightStack(
+        launcher,
+        Observer(endpoint, "observer"),
+        wanted.aircraft.real.firmware_timeout,
+        on_close=link.close,
+    )
+    return ConductedPx4(stack, link, settle, instance)
+
+
+def _no_ends() -> UdpLinks:
+    raise RuntimeError("PX4 SITL binds its own ends of its links")
