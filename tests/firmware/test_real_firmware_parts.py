@@ -486,7 +486,12 @@ def test_ardupilot_is_started_with_its_parameters_in_a_file(tmp_path: Path) -> N
             "sitl",
             "ports.api_port 15000: accepted: its default: PX4 SITL's ports move with instance",
         ),
-        ({"firmware": "px4", "px4_connect": True}, "lockstep", "at level sitl, not lockstep"),
+        ({"firmware": "px4", "px4_connect": True}, "gym", "at level lockstep or sitl"),
+        (
+            {"firmware": "ardupilot", "ardupilot_connect": True},
+            "lockstep",
+            "at level sitl; at level lockstep only builtin and px4",
+        ),
         ({"firmware": "px4-hitl", "serial": "x"}, "sitl", "speed 2: accepted: 1 with firmware px4"),
     ],
     ids=str,
