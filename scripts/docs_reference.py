@@ -5,6 +5,7 @@ A page asks for them with a comment on a line of its own:
 - `<!-- fields: MODULE:MODEL -->` becomes a table of the fields of a pydantic model and of the
   models inside it: name, meaning, unit and range, default.
 - `<!-- help: COMMAND -->` becomes what `COMMAND --help` prints.
+- `<!-- tables: MODULE:FUNCTION -->` becomes the Markdown that a function returns.
 """
 
 from __future__ import annotations
@@ -37,11 +38,16 @@ HELP_COLUMNS = "100"
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the comments of a page (mkdocs calls this for every page)."""
-    return re.sub(r"^<!-- (fields|help): (.+?) -->$", _generated, markdown, flags=re.MULTILINE)
+    return re.sub(
+        r"^<!-- (fields|help|tables): (.+?) -->$", _generated, markdown, flags=re.MULTILINE
+    )
 
 
 def _generated(match: re.Match[str]) -> str:
     kind, what = match.groups()
+    if kind == "tables":
+        module, name = what.split(":")
+        return str(getattr(importlib.import_module(module), name)())
     return field_tables(what) if kind == "fields" else help_text(what)
 
 

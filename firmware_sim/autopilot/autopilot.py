@@ -13,6 +13,7 @@ from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ, TICK_S, US_PER_S
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
+from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
     WITH_STICKS,
     Arming,
@@ -28,7 +29,9 @@ from firmware_sim.autopilot.autopilot_state import (
 from firmware_sim.autopilot.commander import READINESS, Ask, Event, Flight, Phase, transition
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
-from firmware_sim.autopilot.failsafe import FailsafeTimers
+from firmware_sim.autopilot.failsafes.conditions import FenceBreach
+from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
+from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.land_detector import LandDetector
@@ -71,7 +74,9 @@ class BuiltinAutopilot:
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._manual_control = ManualControl(value)
-        self._failsafe = FailsafeTimers(value)
+        self.supervisor = Supervisor(value, self.estimator)
+        """Failsafes and pre-arm checks."""
+        self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
         parameters.on_change(self._parameters_changed)
@@ -108,26 +113,30 @@ class BuiltinAutopilot:
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Take one tick's sensors and return the motor commands until the next."""
-        time_us = sample.time_us
-        self.estimator.step(sample)
+        time_us, supervisor, sensors = sample.time_us, self.supervisor, self.supervisor.sensors
+        self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self.sample, self._snapshot = sample, None
         if sample.mag is not None:
             self._mag = sample.mag
+            sensors.mag.take(sample)
         if sample.pressure_hpa is not None:
             self._pressure_hpa = sample.pressure_hpa
+            sensors.baro.take(sample)
         if sample.gps is not None:
             self._gps = sample.gps
+            sensors.gps.take(sample)
         if self._home is None and self.estimator.origin is not None:
             self._set_home()
         readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
             self._handle(readiness)
         idle = self._demand is None
-        for due in self._failsafe.events(self.flight, time_us, sample.battery.remaining, idle=idle):
-            if isinstance(due, Message):
-                self._say(due)
-            else:
-                self._handle(due)
+        if time_us >= supervisor.next_us:
+            self._look()
+            self._obey(NO_INTERVENTION)
+        due = self._auto_disarm.event(self.flight, time_us, idle=idle)
+        if due is not None:
+            self._handle(due)
         if time_us >= self._navigator.due_us:
             self._navigate()
         if self._manual_control.was_heard:
@@ -149,6 +158,10 @@ class BuiltinAutopilot:
         armed = flight.phase >= _GROUND
         navigator.step(situation, flight.mode, self._fenced_place, armed=armed)
         context.triplet, context.mission_over = navigator.triplet, navigator.mission_over
+        reports = self.supervisor.watch.reports
+        reports.fence = FenceBreach(*navigator.fence.status.breached)
+        reports.mission_missing = not navigator.mission.valid
+        reports.mission_finished = navigator.mission_over
 
     def _fenced_place(self) -> Geodetic:
         """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS."""
@@ -196,28 +209,63 @@ class BuiltinAutopilot:
     # --- commander
 
     def _handle(self, event: Ask | Event, request: Request | None = None) -> Result:
-        before = self.flight
-        step = transition(before, event)
-        self.flight, self._status = step.flight, _status(step.flight)
-        self._snapshot = None
+        step = transition(self.flight, event)
         if step.text is not None:
             self._say(step.text)
-        if step.flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
+        flown = self.flight.mode
+        asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
+        if asked and step.flight.phase >= _GROUND:
+            # A failsafe may insist, or yield to the user.
+            self._become(step.flight, step.flight.mode)
+            self._obey(Intervention(mode_chosen=True), flown, request)
+        else:
+            self._become(step.flight, flown, request if asked else None)
+        return step.result
+
+    def _become(self, flight: Flight, flown: Mode, request: Request | None = None) -> None:
+        """Take a new state; `flown` is the mode that guidance is in, `request` the user's."""
+        before = self.flight
+        self.flight, self._status = flight, _status(flight)
+        self._snapshot = None
+        if flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
             self._explain_loss()
         if self.sample is None:
-            return step.result
-        asked_for_more = request is not None and step.result is Result.ACCEPTED
-        if step.flight.mode is not before.mode or asked_for_more:
+            return
+        if flight.mode is not flown or request is not None:
             self._navigator.due_us = 0
-            self._guidance.enter(step.flight.mode, self._state, request)
-        if step.flight.phase is not before.phase:
-            self._note_times(step.flight.phase)
-        if before.phase < _GROUND <= step.flight.phase:
-            self._failsafe.armed()
+            self._guidance.enter(flight.mode, self._state, request)
+        if flight.phase is not before.phase:
+            self._note_times(flight.phase)
+            self.supervisor.next_us = 0
+        if before.phase < _GROUND <= flight.phase:
+            self._auto_disarm.armed()
             if not self._home_is_chosen:
                 self._set_home()
-            self._guidance.enter(step.flight.mode, self._state)
-        return step.result
+            self._guidance.enter(flight.mode, self._state)
+
+    def _look(self) -> None:
+        if self.sample is not None:
+            self._say_all(self.supervisor.look(self.sample, self.flight))
+
+    def _obey(
+        self,
+        intervention: Intervention,
+        flown: Mode | None = None,
+        request: Request | None = None,
+    ) -> None:
+        """Do what the failsafes decide; see `_become`."""
+        flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
+        decision = self.supervisor.decide(self._now_us, self.flight, intervention)
+        if decision is None:
+            return
+        if decision.text is not None:
+            self._say(decision.text)
+        flight = decision.flight
+        request = request if flight.mode is asked else None
+        if flight != self.flight or flight.mode is not flown or request is not None:
+            self._become(flight, flown, request)
+        if decision.disarm:
+            self._handle(Event.FAILSAFE_DISARM)
 
     def _note_times(self, phase: Phase) -> None:
         """Note when it was armed and took off, and forget both once it is disarmed."""
@@ -250,6 +298,7 @@ class BuiltinAutopilot:
 
     def _parameters_changed(self) -> None:
         self._controller.set_gains(Gains.from_parameters(self.parameters.value))
+        self.supervisor.read_parameters()
         self._say_all(self.parameters.take_texts())
 
     def _say_all(self, messages: Sequence[Message]) -> None:
@@ -288,13 +337,22 @@ class BuiltinAutopilot:
         return taken
 
     def arm(self, *, force: bool) -> Result:
-        """Ask to arm. Force skips the offboard check, never the estimator's health."""
-        blind = self.flight.mode is Mode.OFFBOARD and not self._failsafe.setpoint_fresh(
-            self._now_us
-        )
+        """Ask to arm. PX4 runs its checks although a client asks by force, and so do we."""
+        del force
+        if self.sample is None or self.flight.phase >= _GROUND:
+            return self._handle(Event.ARM)
         if self.flight.mode is Mode.MISSION:
-            blind = not self._navigator.mission_is_valid(self._situation())
-        return self._handle(Event.ARM_BLIND if blind and not force else Event.ARM)
+            valid = self._navigator.mission_is_valid(self._situation())
+            self.supervisor.watch.reports.mission_missing = not valid
+        self._look()
+        self._obey(NO_INTERVENTION)
+        refusals = self.supervisor.refusals(self.sample, self.flight)
+        self._say_all(refusals)
+        return self._handle(Event.ARM_UNREADY if refusals else Event.ARM)
+
+    def terminate(self) -> Result:
+        """Ask to stop the motors for good (MAV_CMD_DO_FLIGHTTERMINATION)."""
+        return self._handle(Ask(Mode.TERMINATION))
 
     def disarm(self, *, force: bool) -> Result:
         """Ask to disarm; force = kill, also in the air."""
@@ -312,19 +370,24 @@ class BuiltinAutopilot:
             self._say(Message(Severity.CRITICAL, "Already higher than takeoff altitude"))
             altitude_m = height if self.flight.phase is _AIR else 0.0
         context.takeoff_altitude_m = altitude_m
-        return self._handle(Ask(Mode.TAKEOFF))
+        return self._ask(Mode.TAKEOFF)
 
     def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
         """Ask for a mode, with what it takes beyond its name."""
-        if mode is Mode.OFFBOARD:
-            return self._handle(Ask(mode, self._failsafe.setpoint_fresh(self._now_us)))
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
+        return self._ask(mode, request)
+
+    def _ask(self, mode: Mode, request: Request | None = None) -> Result:
         if mode is Mode.MISSION:
-            return self._handle(Ask(mode, self._navigator.mission_is_valid(self._situation())))
+            valid = self._navigator.mission_is_valid(self._situation())
+            self.supervisor.watch.reports.mission_missing = not valid
+        self._look()
+        self._obey(NO_INTERVENTION)
+        available = self.supervisor.available(mode)
         if mode in WITH_STICKS:
-            return self._handle(Ask(mode, self._manual_control.sticks(self._now_us) is not None))
-        return self._handle(Ask(mode), request)
+            available = available and self._manual_control.sticks(self._now_us) is not None
+        return self._handle(Ask(mode, available), request)
 
     def change_speed(self, speed_m_s: float) -> None:
         """Set the horizontal speed of the present automatic mode [m/s]."""
@@ -386,14 +449,14 @@ class BuiltinAutopilot:
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
         self._guidance.context.setpoint = setpoint
-        self._failsafe.setpoint(time_us)
+        self.supervisor.setpoint(setpoint, time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint, time_us)
 
     def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
         """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
         self._guidance.context.setpoint = demand
-        self._failsafe.setpoint(time_us)
+        self.supervisor.setpoint(None, time_us)
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         """Note why an offboard setpoint was refused: the failsafe that follows names it."""
@@ -402,9 +465,13 @@ class BuiltinAutopilot:
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         """Hand over the pilot's sticks, received at `time_us` of simulated time."""
         moved = self._manual_control.offer(sticks, source, time_us)
+        self.supervisor.watch.hear_pilot(time_us)
         flown, override = self.flight.mode, int(self.parameters["COM_RC_OVERRIDE"])
         bit = 2 if flown is Mode.OFFBOARD else 1
         takes_over = moved and override & bit and flown not in WITH_STICKS
+        if takes_over and self.flight.failsafe:
+            self._obey(Intervention(sticks_moved=True))
+            return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._handle(Ask(Mode.POSITION))
             self._say(Message(Severity.INFO, "Pilot took over using sticks"))
@@ -415,7 +482,7 @@ class BuiltinAutopilot:
 
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""
-        self._failsafe.gcs_heartbeat(time_us)
+        self.supervisor.gcs_heartbeat(time_us)
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""

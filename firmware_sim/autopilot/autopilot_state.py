@@ -47,6 +47,10 @@ class Mode(IntEnum):
     ALTITUDE = 10
     ORBIT = 11
     FOLLOW = 12
+    DESCEND = 13
+    """Comes down level without knowing where; failsafes alone choose it."""
+    TERMINATION = 14
+    """The motors stand still for good."""
 
 
 MODE_NAMES = {
@@ -63,6 +67,8 @@ MODE_NAMES = {
     Mode.ALTITUDE: "Altitude",
     Mode.ORBIT: "Orbit",
     Mode.FOLLOW: "Follow Target",
+    Mode.DESCEND: "Descend",
+    Mode.TERMINATION: "Termination",
 }
 """As PX4's texts name them."""
 

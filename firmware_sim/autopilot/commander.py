@@ -1,8 +1,8 @@
 """The commander: an explicit table of (phase, event) -> what happens. Pure, no time, no I/O.
 
 Who may arm, which mode follows which, what is refused and with which text: as PX4 does it
-(measured on PX4 1.16 with MAVSDK 4.1). Timers and measurements that produce events live in
-`failsafe.py`; what a mode flies lives in `modes/`.
+(measured on PX4 1.16 with MAVSDK 4.1). When a failsafe decides instead is `failsafes/`, when the
+vehicle disarms by itself `auto_disarm`; what a mode flies lives in `modes/`.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class Event(Enum):
     NOT_READY = auto()
     """The estimator is no longer converged."""
     ARM = auto()
-    ARM_BLIND = auto()
-    """Arm requested in offboard mode without a fresh setpoint."""
+    ARM_UNREADY = auto()
+    """Arm requested although a pre-arm check fails."""
     DISARM = auto()
     KILL = auto()
     """Forced disarm."""
@@ -58,22 +58,10 @@ class Event(Enum):
     """Armed on the ground for COM_DISARM_PRFLT."""
     LANDED_TIMEOUT = auto()
     """Landed for COM_DISARM_LAND."""
-    SETPOINT_LOST_POSITION = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 0 (or 1, 2: there is no pilot's input here)."""
-    SETPOINT_LOST_RETURN = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 3."""
-    SETPOINT_LOST_LAND = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 4."""
-    SETPOINT_LOST_HOLD = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 5."""
-    SETPOINT_LOST_DISARM = auto()
-    """Offboard loss with COM_OBL_RC_ACT = 6 or 7."""
-    SETPOINT_BACK = auto()
-    """Setpoints have resumed while the offboard-loss failsafe flies."""
-    BATTERY_RETURN = auto()
-    """Critical battery, COM_LOW_BAT_ACT = 3."""
-    BATTERY_LAND = auto()
-    """Critical battery with COM_LOW_BAT_ACT = 2, or emergency with 3."""
+    LOCKDOWN_TIMEOUT = auto()
+    """Terminated for COM_KILL_DISARM."""
+    FAILSAFE_DISARM = auto()
+    """A failsafe stops the motors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +86,6 @@ class Choice(Enum):
     """No change."""
     ASK = auto()
     """The user wants `Row.mode`."""
-    FORCE = auto()
-    """A failsafe wants `Row.mode`; the intention stays."""
-    INTENDED = auto()
-    """Back to what the user asked for."""
     RESTORE = auto()
     """Disarmed: back to the last lasting mode."""
 
@@ -134,7 +118,6 @@ _B, _S, _G, _A = Phase
 _ARMED = Row(phase=_G, text=_info("Armed by external command"))
 _LIFTED = Row(phase=_A, text=_info("Takeoff detected"))
 _LANDED = Row(phase=_G, text=_info("Landing detected"))
-_BACK = Row(choice=Choice.INTENDED)
 
 
 def _ask(mode: Mode, text: Message | None = None) -> Row:
@@ -157,10 +140,6 @@ def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
     return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
 
 
-def _force(mode: Mode, text: str = "Failsafe activated") -> Row:
-    return Row(choice=Choice.FORCE, mode=mode, text=_critical(text))
-
-
 def _disarm(text: str) -> Row:
     return Row(phase=_S, choice=Choice.RESTORE, text=_info(text))
 
@@ -168,18 +147,17 @@ def _disarm(text: str) -> Row:
 _FLYING_TEXT = {Mode.LAND: _info("Landing at current position")}
 """What an armed vehicle says when it is asked for a mode."""
 
-_CUT = Row(phase=_S, choice=Choice.RESTORE, text=_critical("Failsafe activated: disarmed"))
-_LOW_RETURN = _force(Mode.RETURN, "Critical battery, returning now")
-_LOW_LAND = _force(Mode.LAND, "Critical battery, landing now")
 _DISARMED = _disarm("Disarmed by external command")
 _UNUSED = _disarm("Disarmed by auto preflight disarming")
+_LOCKED, _CUT = _disarm("Disarmed by lockdown"), _disarm("Disarmed by failsafe")
+_DENIED = Row(result=Result.DENIED)
 
 TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.READY: (Row(phase=_S), _IGNORE, _IGNORE, _IGNORE),
     # In the air there is no way back to the ground state: the estimate is flown as it is.
     Event.NOT_READY: (_IGNORE, Row(phase=_B), _IGNORE, _IGNORE),
     Event.ARM: (_NO_ARM, _ARMED, _IGNORE, _IGNORE),
-    Event.ARM_BLIND: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
+    Event.ARM_UNREADY: (_NO_ARM, _NO_ARM, _IGNORE, _IGNORE),
     Event.DISARM: (_IGNORE, _IGNORE, _DISARMED, _NOT_LANDED),
     Event.KILL: (_IGNORE, _IGNORE, _DISARMED, _DISARMED),
     Event.LIFTED: (_IGNORE, _IGNORE, _LIFTED, _IGNORE),
@@ -187,17 +165,12 @@ TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
     Event.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
     Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm("Disarmed by landing"), _IGNORE),
-    # On the ground the loss only drops out of offboard: nothing may take off by failsafe.
-    Event.SETPOINT_LOST_POSITION: (_IGNORE, _IGNORE, _force(Mode.POSITION), _force(Mode.POSITION)),
-    Event.SETPOINT_LOST_RETURN: (_IGNORE, _IGNORE, _force(Mode.LAND), _force(Mode.RETURN)),
-    Event.SETPOINT_LOST_LAND: (_IGNORE, _IGNORE, _force(Mode.LAND), _force(Mode.LAND)),
-    Event.SETPOINT_LOST_HOLD: (_IGNORE, _IGNORE, _force(Mode.HOLD), _force(Mode.HOLD)),
-    Event.SETPOINT_LOST_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
-    Event.SETPOINT_BACK: (_IGNORE, _IGNORE, _BACK, _BACK),
-    Event.BATTERY_RETURN: (_IGNORE, _IGNORE, _IGNORE, _LOW_RETURN),
-    Event.BATTERY_LAND: (_IGNORE, _IGNORE, _IGNORE, _LOW_LAND),
+    Event.LOCKDOWN_TIMEOUT: (_IGNORE, _IGNORE, _LOCKED, _LOCKED),
+    Event.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
     **{Ask(mode): _asked(mode) for mode in Mode},
     **{Ask(mode, available=False): _asked_in_vain(mode) for mode in Mode},
+    # Disarmed there is nothing to terminate.
+    Ask(Mode.TERMINATION): (_DENIED, _DENIED, _ask(Mode.TERMINATION), _ask(Mode.TERMINATION)),
 }
 """[event][phase]: what an event does in BOOT, STANDBY, GROUND and AIR; a test checks every pair."""
 
@@ -213,7 +186,7 @@ READINESS = tuple(
 """[phase][whether the estimator is healthy]: the event to handle, None where the table ignores it.
 Looked up at every tick."""
 
-_PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN}
+_PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN, Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND}
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +199,13 @@ class Step:
 
 
 def transition(flight: Flight, event: Ask | Event) -> Step:
-    """Return what an event does to a flight."""
+    """Return what an event does to a flight. Nobody leaves a termination."""
+    if flight.mode is Mode.TERMINATION:
+        if isinstance(event, Ask):
+            refused = _unavailable(event.mode)
+            return Step(flight, refused.result, refused.text)
+        if event is Event.MODE_DONE:
+            return Step(flight, Result.ACCEPTED, None)
     row = TABLE[event][flight.phase]
     phase = flight.phase if row.phase is None else row.phase
     moved = replace(flight, phase=phase)
@@ -235,10 +214,6 @@ def transition(flight: Flight, event: Ask | Event) -> Step:
         moved = replace(
             moved, mode=row.mode, intended=row.mode, after_disarm=lasting, failsafe=False
         )
-    elif row.choice is Choice.FORCE:
-        moved = replace(moved, mode=row.mode, failsafe=True)
-    elif row.choice is Choice.INTENDED:
-        moved = replace(moved, mode=flight.intended, failsafe=False)
     elif row.choice is Choice.RESTORE:
         mode = flight.after_disarm
         moved = replace(moved, mode=mode, intended=mode, failsafe=False)

@@ -32,6 +32,15 @@ _HEADING_BY_TURN_NED = np.array([-_down * _north, -_down * _east, _north**2 + _e
     _north**2 + _east**2
 )
 
+LONGEST_ALIGN_S = 10.0
+"""Samples at rest that are older are forgotten while a sensor is waited for [s]."""
+
+_NEEDED = ("gps", "mag", "pressure_hpa")
+"""Without one of each there is no alignment."""
+
+GPS_GONE_US = 1_000_000
+"""GPS that was not fused for so long no longer aids the filter (EKF2: its data are late)."""
+
 BIAS_STEP_S = 0.01
 """PX4's filter runs at 100 Hz; its bias process noises (EKF2_*_B_NOISE) are per such a step [s]."""
 
@@ -82,6 +91,8 @@ class Measurement:
         self.slot = es.RATIO + ratio
         self.h = h
         self.innovation, self.variance = np.zeros(len(h)), np.zeros(len(h))
+        self.fused_us: int | None = None
+        """When one was last within the gate; None = never."""
 
 
 def _selecting(*errors: int) -> Vector:
@@ -106,9 +117,11 @@ class Estimator:
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
         """Called with name, innovation and its covariance for every measurement, if set."""
         self._resting: list[SensorSample] = []
-        self._fixed = False
+        self._seen: set[str] = set()
+        """Which of the slower sensors have measured since alignment began."""
         self._origin_altitude_baro = 0.0
         self._time_us = 0
+        self._aligned_us: int | None = None
         self._estimate: Estimate | None = None
         horizontal = _selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         self._gps_horizontal = Measurement("gps_horizontal", 0, horizontal)
@@ -151,14 +164,46 @@ class Estimator:
             )
         return self._estimate
 
+    # --- what is known (PX4: EKF2's dead reckoning)
+
+    def knows_position(self, now_us: int) -> bool:
+        """Return whether horizontal position and velocity are valid.
+
+        Without GPS they are for EKF2_NOAID_TOUT: that long the vehicle flies by dead reckoning.
+        """
+        return self.origin is not None and self._recent(self._gps_horizontal, now_us)
+
+    def knows_height(self, now_us: int) -> bool:
+        """Return whether height and vertical speed are valid: barometer or GPS, as above."""
+        recent = self._recent(self._baro, now_us) or self._recent(self._gps_vertical, now_us)
+        return self.origin is not None and recent
+
+    def fuses_gps(self, now_us: int) -> bool:
+        """Return whether GPS has been fused lately."""
+        fused = self._gps_horizontal.fused_us
+        return fused is not None and now_us - fused <= GPS_GONE_US
+
+    def accuracy(self) -> tuple[float, float]:
+        """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
+        north, east = self.state[es.SIGMA : es.SIGMA + 2].tolist()
+        v_north, v_east = self.state[es.SIGMA + 3 : es.SIGMA + 5].tolist()
+        return math.hypot(north, east), math.hypot(v_north, v_east)
+
+    def _recent(self, m: Measurement, now_us: int) -> bool:
+        """Return whether it was fused lately; right after alignment all are."""
+        since = self._aligned_us if m.fused_us is None else m.fused_us
+        return since is not None and now_us - since <= self._value("EKF2_NOAID_TOUT")
+
     # --- start
 
     def _align(self, sample: SensorSample) -> None:
         """Average the sensors at rest; then level by gravity and point by the magnetic field."""
         self._resting.append(sample)
-        self._fixed = self._fixed or sample.gps is not None
+        self._seen |= self._kinds(sample)
         elapsed_s = (sample.time_us - self._resting[0].time_us) / US_PER_S
-        if elapsed_s < ALIGN_S or not self._fixed:
+        if elapsed_s < ALIGN_S or len(self._seen) < len(_NEEDED):
+            if elapsed_s > LONGEST_ALIGN_S:
+                self._forget()
             return
         ax, ay, az = np.mean([s.accel for s in self._resting], axis=0)
         roll, pitch = math.atan2(-ay, -az), math.atan2(ax, math.hypot(ay, az))
@@ -170,7 +215,17 @@ class Estimator:
         self._origin_altitude_baro = float(np.mean(baro))
         fixes = [s.gps.position for s in self._resting if s.gps is not None]
         self.origin = Geodetic(*(float(c) for c in np.mean(fixes, axis=0)))
+        self._aligned_us = sample.time_us
         self._resting.clear()
+
+    @staticmethod
+    def _kinds(sample: SensorSample) -> set[str]:
+        return {name for name in _NEEDED if getattr(sample, name) is not None}
+
+    def _forget(self) -> None:
+        """A sensor is missing: keep the newer half of the samples, so that memory stays bounded."""
+        self._resting = self._resting[len(self._resting) // 2 :]
+        self._seen = set().union(*(self._kinds(sample) for sample in self._resting))
 
     def _process_noise(self) -> Vector:
         value = self._value
@@ -188,7 +243,10 @@ class Estimator:
         if self.innovations is not None:
             s = m.h @ self.filter.covariance @ m.h.T + np.diag(m.variance)
             self.innovations(m.name, m.innovation.copy(), s)
-        self.state[m.slot] = self.filter.fuse(self.state, m.innovation, m.h, m.variance)
+        ratio = self.filter.fuse(self.state, m.innovation, m.h, m.variance)
+        self.state[m.slot] = ratio
+        if ratio <= 1.0:
+            m.fused_us = self._time_us
 
     def _fuse_gps(self, fix: GpsFix, origin: Geodetic) -> None:
         measured, state, value = geodetic_to_local(fix.position, origin), self.state, self._value

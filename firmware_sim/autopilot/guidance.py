@@ -30,10 +30,15 @@ class Guidance:
         """What the modes share."""
         self._modes = {mode: new(self.context) for mode, new in MODES.items()}
         self._flown: FlightMode = self._modes[Mode.HOLD]
+        self._stopped = False
+        """Whether the motors stand still for good."""
         self._spool_since_us: int | None = None
 
     def enter(self, mode: Mode, state: Vector, request: Request | None = None) -> None:
         """Begin a mode at the present state, with what the user asks for beyond its name."""
+        self._stopped = mode is Mode.TERMINATION
+        if self._stopped:
+            return
         if request is None:
             request = self._flown.remainder(state)
         new = self._modes[mode]
@@ -49,11 +54,13 @@ class Guidance:
 
     def is_done(self, state: Vector) -> bool:
         """Return whether the present mode has reached its end."""
-        return self._flown.is_done(state)
+        return not self._stopped and self._flown.is_done(state)
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> AnyDemand | None:
         """Return what to fly now; None = the motors are stopped."""
         self.context.standing = phase is not _AIR
+        if self._stopped:
+            return None
         if phase is _AIR:
             self._spool_since_us = None
             return self._flown.demand(state, time_us)

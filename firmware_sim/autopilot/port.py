@@ -167,6 +167,10 @@ class AutopilotPort(Protocol):
         """Ask to disarm; force = kill, also in the air."""
         ...
 
+    def terminate(self) -> Result:
+        """Ask to stop the motors for good; DENIED while disarmed."""
+        ...
+
     def takeoff(self, altitude_m: float | None) -> Result:
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
         ...

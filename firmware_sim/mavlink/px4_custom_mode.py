@@ -10,7 +10,7 @@ from firmware_sim.autopilot.autopilot_state import WITH_STICKS, Arming, Commande
 from firmware_sim.mavlink.codec import dialect
 
 MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL = 4, 6, 3
-_MAIN_ACRO = 5
+_MAIN_ACRO, _MAIN_TERMINATION = 5, 10
 
 _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.HOLD: (MAIN_AUTO, 3),
@@ -26,6 +26,8 @@ _MAIN_SUB: dict[Mode, tuple[int, int]] = {
     Mode.ALTITUDE: (2, 0),
     Mode.ACRO: (_MAIN_ACRO, 0),
     Mode.STABILIZED: (7, 0),
+    Mode.DESCEND: (MAIN_AUTO, 6),  # PX4 reports it as Land
+    Mode.TERMINATION: (_MAIN_TERMINATION, 0),
 }
 
 
@@ -36,14 +38,20 @@ def _unavailable(name: str) -> str:
 # What can be asked for, by main mode, in AUTO and POSCTL by sub mode. The texts: modes of a real
 # PX4 that are known by name and never available.
 _MAIN_MODES: dict[int, Mode | str] = {
-    main: mode for mode, (main, sub) in _MAIN_SUB.items() if main != MAIN_AUTO and sub == 0
+    main: mode
+    for mode, (main, sub) in _MAIN_SUB.items()
+    if main not in (MAIN_AUTO, _MAIN_TERMINATION) and sub == 0
 }
 _POSITION_MODES: dict[int, Mode | str] = {
     **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_POSCTL},
     2: _unavailable("Position Slow"),
 }
 _AUTO_MODES: dict[int, Mode | str] = {
-    **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_AUTO},
+    **{
+        sub: mode
+        for mode, (main, sub) in _MAIN_SUB.items()
+        if main == MAIN_AUTO and mode is not Mode.DESCEND
+    },
     0: Mode.MISSION,
     9: _unavailable("Precision Landing"),
     **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},
@@ -71,7 +79,12 @@ def base_mode(status: CommanderStatus) -> int:
 
 
 def system_status(status: CommanderStatus) -> int:
-    """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe."""
+    """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe.
+
+    Once terminated it is FLIGHT_TERMINATION, armed or not.
+    """
+    if status.mode is Mode.TERMINATION:
+        return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
     if status.arming is Arming.ARMED:
         return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
     standby = status.arming is Arming.STANDBY

@@ -149,11 +149,16 @@ def test_loss_hold_holds() -> None:
         assert rig.ap.flight.phase is Phase.AIR
 
 
-@pytest.mark.parametrize("action", [6, 7])
-def test_loss_disarm_falls(action: int) -> None:
+@pytest.mark.parametrize(
+    ("action", "phase", "text"),
+    [(6, Phase.AIR, "Disarmed by lockdown"), (7, Phase.STANDBY, "Disarmed by failsafe")],
+    ids=["terminate", "disarm"],
+)
+def test_loss_terminate_and_disarm_fall(action: int, phase: Phase, text: str) -> None:
     with flight(SEED, parameters={"COM_OBL_RC_ACT": action}) as rig:
         assert LOSS_S[0] <= lose_offboard(rig) <= LOSS_S[1]
-        assert rig.ap.flight.phase is Phase.STANDBY
+        assert rig.ap.flight.phase is phase
+        rig.tick()
         assert rig.height > 4.0
         assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
         # Free fall from there: sqrt(2 h / g), a little longer for the rotors' last thrust.
@@ -162,8 +167,10 @@ def test_loss_disarm_falls(action: int) -> None:
         assert fall_s < took < fall_s + 0.3
         # Setpoints that come back start no motor.
         rig.stream(NORTHWARD)
-        rig.run(NO_TAKEOVER_S)
+        rig.run(5.0)
         assert rig.ap.flight.phase is Phase.STANDBY
+        assert count(rig, text) == 1
+        assert rig.ap.state().motors == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_same_seed_same_tick() -> None:
@@ -185,7 +192,7 @@ def test_setpoints_that_come_back_take_over(action: int, mode: Mode) -> None:
         rig.run(1.5)
         assert rig.mode is mode
         rig.stream(NORTHWARD)
-        rig.tick()
+        rig.run(0.01)
         assert rig.mode is Mode.OFFBOARD
         assert not rig.ap.flight.failsafe
         rig.run(4.0)
@@ -315,9 +322,10 @@ def test_kill_in_the_air_cuts_the_motors() -> None:
 
 # --- battery
 
-LOW = "Low battery level, return advised"
-CRITICAL = "Critical battery level, land now"
-EMERGENCY = "Dangerously low battery level! Land immediately!"
+LOW, CRITICAL, EMERGENCY = "Low battery", "Critical battery", "Emergency battery level"
+HELD = "Failsafe activated: entering Hold for 5 seconds"
+HOLD_S = 5.0
+"""COM_FAIL_ACT_T: so long the vehicle holds before it does what a failsafe asks."""
 
 
 class Drain:
@@ -345,14 +353,19 @@ def test_battery_levels_are_said_once_each() -> None:
         def note() -> None:
             said.extend((m.severity, m.text, drain.remaining) for m in rig.ap.take_messages())
 
-        drain.remaining, drain.per_s = 0.2, 0.02
-        rig.run(10.0, note)
+        drain.remaining, drain.per_s = 0.16, 0.008
+        rig.run(16.0, note)
+        warned = (Severity.CRITICAL, "Failsafe activated")
         assert [(severity, text) for severity, text, _ in said] == [
-            (Severity.WARNING, LOW),
-            (Severity.CRITICAL, CRITICAL),
+            (Severity.EMERGENCY, LOW),
+            warned,
+            (Severity.EMERGENCY, CRITICAL),
+            warned,
             (Severity.EMERGENCY, EMERGENCY),
+            warned,
         ]
-        assert [at for _, _, at in said] == pytest.approx([0.15, 0.07, 0.05], abs=2e-4)
+        levels = [0.15, 0.15, 0.07, 0.07, 0.05, 0.05]
+        assert [at for _, _, at in said] == pytest.approx(levels, abs=1e-3)
         assert rig.mode is Mode.HOLD  # 0 = only warn
         assert not rig.ap.flight.failsafe
 
@@ -360,37 +373,43 @@ def test_battery_levels_are_said_once_each() -> None:
 def test_a_charge_that_wavers_is_said_once() -> None:
     with flight(SEED) as rig:
         drain = Drain(rig)
-        rig.boot()
-        for k in range(100):
+        rig.arm()
+        for k in range(1000):
             drain.remaining = 0.15 + 0.001 * (-1) ** k
             rig.tick()
         assert count(rig, LOW) == 1
 
 
-def test_critical_battery_lands() -> None:
+def test_critical_battery_holds_then_lands() -> None:
     with flight(SEED, parameters={"COM_LOW_BAT_ACT": 2}) as rig:
         drain = Drain(rig)
         rig.take_off(2.5, settle_s=1.0)
         drain.remaining = 0.10
         rig.run(1.0)
-        low = rig.mode
-        assert low is Mode.HOLD
+        assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, False)
         drain.remaining = 0.065
-        rig.tick()
-        assert rig.mode is Mode.LAND
-        assert rig.ap.flight.failsafe
+        rig.until(lambda: rig.ap.flight.failsafe, 0.1)
+        assert (rig.mode, count(rig, HELD)) == (Mode.HOLD, 1)
+        assert rig.until(lambda: rig.mode is Mode.LAND, 6.0) == pytest.approx(HOLD_S, abs=0.05)
         until_disarmed(rig, 20.0)
         assert rig.truth.position[2] == pytest.approx(REST_DOWN_M, abs=0.01)
 
 
-def test_a_battery_low_before_take_off_acts_in_the_air() -> None:
+def test_a_critical_battery_forbids_arming_unless_it_is_allowed() -> None:
+    """PX4: COM_ARM_BAT_MIN allows it, and then the failsafe of that charge does not act."""
     with flight(SEED, parameters={"COM_LOW_BAT_ACT": 2}) as rig:
         Drain(rig).remaining = 0.06
-        rig.arm()
-        assert rig.ap.takeoff(3.0) is Result.ACCEPTED
-        rig.until(lambda: rig.mode is Mode.LAND, 20.0)
-        rig.until(lambda: rig.ap.flight.phase is Phase.STANDBY, 30.0)
-    assert [text for _, text in rig.texts].count(CRITICAL) == 1
+        rig.boot()
+        rig.run(0.2)
+        assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
+        assert count(rig, CRITICAL) >= 1
+        assert rig.texts[-1][1] == "Arming denied: Resolve system health failures first"
+        rig.ap.parameters.set("COM_ARM_BAT_MIN", 0.05)
+        assert rig.ap.arm(force=False) is Result.ACCEPTED
+        assert rig.ap.takeoff(2.0) is Result.ACCEPTED
+        rig.until(lambda: rig.mode is Mode.HOLD, 20.0)
+        rig.run(7.0)
+        assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, False)
 
 
 def test_critical_battery_returns_then_lands_in_an_emergency() -> None:
@@ -401,13 +420,11 @@ def test_critical_battery_returns_then_lands_in_an_emergency() -> None:
         rig.run(3.0)
         assert horizontal(rig) > 6.0
         drain.remaining = 0.065
-        rig.tick()
-        critical = rig.mode
-        assert critical is Mode.RETURN
+        rig.until(lambda: rig.mode is Mode.RETURN, 6.0)
         rig.until(lambda: horizontal(rig) < 4.0, 20.0)
         drain.remaining = 0.045
-        rig.tick()
-        assert rig.mode is Mode.LAND
+        rig.run(0.1)
+        assert rig.mode is Mode.LAND  # at once: it is in a failsafe already
         until_disarmed(rig, 30.0)
         assert 0.5 < horizontal(rig) < 4.0
 
@@ -417,8 +434,7 @@ def test_critical_battery_returns_home() -> None:
         drain = Drain(rig)
         under_way(rig)
         drain.remaining = 0.065
-        rig.tick()
-        assert rig.mode is Mode.RETURN
+        rig.until(lambda: rig.mode is Mode.RETURN, 6.0)
         until_disarmed(rig, 60.0)
         assert horizontal(rig) < 1.0
 
@@ -433,10 +449,23 @@ def test_setpoints_do_not_overrule_the_battery(lost: bool) -> None:
         else:
             under_way(rig)
         drain.remaining = 0.065
-        rig.tick()
+        rig.run(0.1)
         rig.stream(NORTHWARD)
-        rig.run(NO_TAKEOVER_S)
+        rig.run(HOLD_S + NO_TAKEOVER_S)
         assert rig.mode is Mode.LAND
+
+
+def test_the_user_flies_on_in_spite_of_the_battery() -> None:
+    with flight(SEED, parameters={"COM_LOW_BAT_ACT": 2}) as rig:
+        drain = Drain(rig)
+        rig.take_off(5.0, settle_s=1.0)
+        drain.remaining = 0.065
+        rig.run(1.0)
+        assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, True)
+        assert rig.ap.set_mode(Mode.HOLD) is Result.ACCEPTED
+        assert not rig.ap.flight.failsafe
+        rig.run(8.0)
+        assert (rig.mode, rig.ap.flight.failsafe) == (Mode.HOLD, False)
 
 
 # --- ground station

@@ -40,6 +40,16 @@ def test_arming(rig: Rig) -> None:
     assert rig.autopilot.arming is Arming.STANDBY
 
 
+def test_termination(rig: Rig) -> None:
+    """PX4: denied while disarmed, and there is no way back."""
+    assert rig.command(185, 1)[0] == DENIED
+    rig.command(400, 1)
+    assert rig.command(185, 0)[0] == DENIED
+    assert rig.command(185, NAN)[0] == DENIED
+    assert rig.command(185, 1)[0] == ACCEPTED
+    assert rig.autopilot.commands == ["terminate", "arm force=False", "terminate"]
+
+
 def test_texts_go_to_all_links(rig: Rig) -> None:
     rig.command(400, 1)
     rig.bench.tick()

@@ -404,6 +404,9 @@ def test_mission_is_empty() -> None:
         (Arming.ARMED, Mode.OFFBOARD, False, 145, 393_216, 4),
         (Arming.STANDBY, Mode.OFFBOARD, False, 17, 393_216, 3),
         (Arming.ARMED, Mode.POSITION, True, 209, 196_608, 5),
+        (Arming.ARMED, Mode.DESCEND, True, 157, 100_925_440, 5),
+        (Arming.ARMED, Mode.TERMINATION, True, 145, 655_360, 8),
+        (Arming.STANDBY, Mode.TERMINATION, False, 17, 655_360, 8),
     ],
 )
 def test_heartbeat(
@@ -424,8 +427,11 @@ def test_heartbeat(
 
 @pytest.mark.parametrize("mode", list(Mode))
 def test_a_requested_mode_is_the_reported_one(mode: Mode) -> None:
+    """Descend is shown as Land, and a termination cannot be asked for as a mode, as in PX4."""
     number = custom_mode(mode)
-    assert requested_mode(129, number >> 16 & 0xFF, number >> 24) is mode
+    requested = requested_mode(129, number >> 16 & 0xFF, number >> 24)
+    alike = {Mode.DESCEND: Mode.LAND, Mode.TERMINATION: None}
+    assert requested is alike.get(mode, mode)
 
 
 @pytest.mark.parametrize(

@@ -102,6 +102,7 @@ class Rig:
     def step_through(self, step: Callable[[SensorSample], ActuatorControls]) -> None:
         """Let the autopilot be stepped by this from now on, as a test that listens in does."""
         self.ap.step = step  # type: ignore[method-assign, assignment]  # a test listens in
+        self.sim._fly = step
 
     def run(self, seconds: float, each: Callable[[], None] | None = None) -> None:
         """Fly on for some time, calling `each` after every tick."""

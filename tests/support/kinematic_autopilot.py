@@ -161,6 +161,13 @@ class KinematicAutopilot:
             self.arming = Arming.STANDBY
         return Result.ACCEPTED
 
+    def terminate(self) -> Result:
+        self.commands.append("terminate")
+        if self.arming is not Arming.ARMED:
+            return Result.DENIED
+        self.mode = Mode.TERMINATION
+        return Result.ACCEPTED
+
     def takeoff(self, altitude_m: float | None) -> Result:
         self.takeoffs.append(altitude_m)
         default = float(self.parameters.values["MIS_TAKEOFF_ALT"])

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.modes.acro import Acro
 from firmware_sim.autopilot.modes.altitude import Altitude
+from firmware_sim.autopilot.modes.descend import Descend
 from firmware_sim.autopilot.modes.follow import Follow
 from firmware_sim.autopilot.modes.hold import Hold
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode
@@ -35,6 +36,7 @@ MODES: Mapping[Mode, Callable[[FlightContext], FlightMode]] = MappingProxyType(
         Mode.ALTITUDE: Altitude,
         Mode.ORBIT: Orbit,
         Mode.FOLLOW: Follow,
+        Mode.DESCEND: Descend,
     }
 )
 """What flies each mode."""

@@ -31,6 +31,7 @@ from firmware_sim.mavlink.services.context import (
     sender,
 )
 from firmware_sim.mavlink.services.standard_modes import change_mode
+from firmware_sim.mavlink.services.termination import terminate
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
@@ -85,6 +86,7 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_NAV_LAND: lambda _, context: context.port.set_mode(Mode.LAND),
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, context: context.port.set_mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
+    dialect.MAV_CMD_DO_FLIGHTTERMINATION: terminate,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
     **logs.ACTIONS,

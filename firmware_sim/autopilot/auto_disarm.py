@@ -1,0 +1,52 @@
+"""When an armed vehicle is disarmed by itself: landed, never taken off, or stopped for good."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.commander import Event, Flight, Phase
+
+_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_TERMINATION = Mode.TERMINATION
+
+
+class AutoDisarm:
+    """Counts the time on the ground and the time of a termination, in simulated time."""
+
+    def __init__(self, value: Callable[[str], float]) -> None:
+        """Take a lookup of PX4 parameter names."""
+        self._value = value
+        self._standing_since_us: int | None = None
+        self._stopped_since_us: int | None = None
+        self._flown = False
+
+    def armed(self) -> None:
+        """A flight begins: time on the ground before it does not count."""
+        self._standing_since_us = None
+
+    def event(self, flight: Flight, time_us: int, *, idle: bool) -> Event | None:
+        """Return what is due.
+
+        `idle`: the motors are stopped; the spool-up and the ramp of a take-off do not count as time
+        on the ground.
+        """
+        if flight.mode is _TERMINATION and flight.phase >= _GROUND:
+            if self._stopped_since_us is None:
+                self._stopped_since_us = time_us
+            stopped_us = time_us - self._stopped_since_us
+            if stopped_us >= self._value("COM_KILL_DISARM") * US_PER_S:
+                return Event.LOCKDOWN_TIMEOUT
+            return None
+        self._stopped_since_us = None
+        if flight.phase is not _GROUND:
+            self._standing_since_us = None
+            self._flown = flight.phase is _AIR
+            return None
+        if self._standing_since_us is None or not idle:
+            self._standing_since_us = time_us
+        limit_s = self._value("COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT")
+        if limit_s > 0.0 and time_us - self._standing_since_us >= limit_s * US_PER_S:
+            return Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
+        return None

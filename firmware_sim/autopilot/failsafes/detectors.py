@@ -1,0 +1,79 @@
+"""Small detectors over simulated time: what must last before it counts."""
+
+from __future__ import annotations
+
+import math
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.error_state import Q
+
+VALID_AFTER_US = US_PER_S
+"""An estimate that was invalid counts again after it has been good for so long."""
+
+HYSTERESIS = 2.5
+"""An estimate that is valid stays so up to this many times the accuracy that it needed."""
+
+
+class Validity:
+    """Whether an estimate is good enough, with hysteresis in level and time.
+
+    Source: PX4 1.16, EstimatorChecks::checkPosVelValidity.
+    """
+
+    def __init__(self) -> None:
+        """Begin invalid; the first good estimate counts at once."""
+        self.valid = False
+        self._failed_us: int | None = None
+
+    def update(self, now_us: int, *, good: bool, accuracy: float, needed: float) -> bool:
+        """Take the newest estimate; `accuracy` is its standard deviation, `needed` its limit."""
+        if good and accuracy < (HYSTERESIS * needed if self.valid else needed):
+            failed_us = self._failed_us
+            self.valid = self.valid or failed_us is None or now_us > failed_us + VALID_AFTER_US
+        else:
+            self.valid, self._failed_us = False, now_us
+        return self.valid
+
+
+class Lasting:
+    """Whether something has been so for some time."""
+
+    def __init__(self) -> None:
+        self._since_us: int | None = None
+
+    def update(self, now_us: int, seconds: float, *, true: bool) -> bool:
+        """Return whether it is true now and has been at every update for `seconds`."""
+        if not true:
+            self._since_us = None
+            return False
+        if self._since_us is None:
+            self._since_us = now_us
+        return now_us - self._since_us >= seconds * US_PER_S
+
+
+class AttitudeFailure:
+    """The failure detector's roll and pitch: FD_FAIL_R, FD_FAIL_P for FD_FAIL_R_TTRI, _P_TTRI.
+
+    Source: PX4 1.16, FailureDetector::updateAttitudeStatus.
+    """
+
+    def __init__(self) -> None:
+        self._roll, self._pitch = Lasting(), Lasting()
+        self.roll = self.pitch = False
+
+    def update(
+        self,
+        now_us: int,
+        state: Vector,
+        limits_deg: tuple[float, float],
+        lasting_s: tuple[float, float],
+    ) -> bool:
+        """Return whether roll or pitch of the nominal state is out of limits [deg], 0 = none."""
+        w, x, y, z = state[Q : Q + 4].tolist()
+        roll = abs(math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
+        pitch = abs(math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))))
+        roll_max, pitch_max = math.radians(abs(limits_deg[0])), math.radians(abs(limits_deg[1]))
+        self.roll = self._roll.update(now_us, lasting_s[0], true=0.0 < roll_max < roll)
+        self.pitch = self._pitch.update(now_us, lasting_s[1], true=0.0 < pitch_max < pitch)
+        return self.roll or self.pitch

@@ -1,0 +1,324 @@
+"""Which of the active failsafes flies, from when, until when: a pure state machine.
+
+What has failed is held until it clears as its row says. Of the actions held the greatest is taken;
+one that lets the user take over waits in Hold for COM_FAIL_ACT_T first. An action whose mode cannot
+fly gives way to the next in the chain. Source: PX4 1.16, commander/failsafe/framework.cpp.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, can_run
+from firmware_sim.autopilot.failsafes.fallback import mode_fallback, mode_of, possible
+from firmware_sim.autopilot.failsafes.settings import Settings
+from firmware_sim.autopilot.failsafes.table import Situation, Trigger, answers
+
+DEFER_S = 30.0
+"""How long failsafes may be deferred where no time is given [s]."""
+
+
+class Vehicle(NamedTuple):
+    """What the failsafes must know of the flight."""
+
+    armed: bool
+    intended: Mode
+    mission_finished: bool = False
+
+
+class Intervention(NamedTuple):
+    """What the user did since the last update."""
+
+    mode_chosen: bool = False
+    """A mode was asked for, also the one that is intended already."""
+    sticks_moved: bool = False
+    """The pilot takes over with the sticks."""
+
+
+NO_INTERVENTION = Intervention()
+
+
+class Held(NamedTuple):
+    """An action that is active."""
+
+    trigger: Trigger
+    options: Options
+    failing: bool
+    """Whether its condition still lasts."""
+
+
+class FailsafeState(NamedTuple):
+    """All that the failsafes remember."""
+
+    held: tuple[Held, ...] = ()
+    action: Action = Action.NONE
+    """The action taken."""
+    taken_over: bool = False
+    """The user flies on in spite of it."""
+    time_us: int | None = None
+    """Of the last update."""
+    armed: bool = False
+    intended: Mode | None = None
+    start_delay_us: int | None = None
+    """How long the next wait in Hold lasts; None = as COM_FAIL_ACT_T says."""
+    delay_us: int = 0
+    """How long the present wait in Hold still lasts."""
+    defer_until_us: int | None = None
+    """Failsafes are deferred until then; None = they are not."""
+    deferring: bool = False
+    """Whether an action is being deferred."""
+    armed_us: int | None = None
+    manual_control_lost_at_arming: bool = False
+    battery_at_arming: BatteryWarning = BatteryWarning.NONE
+
+    @property
+    def active(self) -> bool:
+        """Whether a failsafe decides what flies."""
+        return self.action > Action.WARN
+
+
+class Outcome(NamedTuple):
+    """The result of an update."""
+
+    state: FailsafeState
+    mode: Mode
+    """What flies."""
+    intended: Mode
+    """What the user wants; the sticks may have changed it."""
+    text: Message | None
+    """What the operator is told; None = nothing new."""
+    delayed: Action = Action.NONE
+    """What follows the wait in Hold."""
+    cause: Cause = Cause.GENERIC
+
+
+class _Choice(NamedTuple):
+    """The action selected, and how."""
+
+    action: Action
+    intended: Mode
+    delayed: Action = Action.NONE
+    cause: Cause = Cause.GENERIC
+    taken_over: bool = False
+    deferred: bool = False
+
+
+def update(
+    state: FailsafeState,
+    time_us: int,
+    vehicle: Vehicle,
+    conditions: Conditions,
+    settings: Settings,
+    intervention: Intervention = NO_INTERVENTION,
+) -> Outcome:
+    """Return what flies now.
+
+    Args:
+        state: As the last update left it; a new one after boot.
+        time_us: Simulated time, never less than at the last update [µs].
+        vehicle: What flies, and what the user wants.
+        conditions: What is wrong now.
+        settings: The parameters.
+        intervention: What the user did since the last update.
+    """
+    elapsed_us = 0 if state.time_us is None else time_us - state.time_us
+    chosen = intervention.mode_chosen or (
+        state.intended is not None and state.intended is not vehicle.intended
+    )
+    state = _begin(state, time_us, elapsed_us, vehicle, conditions)
+    if state.armed is not vehicle.armed:
+        state = state._replace(held=_released(state.held), taken_over=False)
+    if chosen or state.taken_over:
+        state = state._replace(held=_released(state.held))
+    state, warned = _hold(state, time_us, vehicle, conditions, settings)
+    if state.action > Action.HOLD or state.taken_over or not can_run(Mode.HOLD, conditions):
+        state = state._replace(delay_us=0)
+    intervention = intervention._replace(mode_chosen=chosen)
+    choice = _select(state, vehicle, conditions, settings, intervention)
+    text = None
+    if choice.action > state.action or (choice.action is not Action.NONE and warned):
+        text = _text(choice, state.delay_us)
+    intended = choice.intended
+    if state.active and mode_of(choice.action, intended) is Mode.ORBIT:
+        intended = Mode.HOLD  # A circle that was interrupted is not resumed.
+    state = state._replace(
+        action=choice.action,
+        taken_over=choice.taken_over,
+        time_us=time_us,
+        armed=vehicle.armed,
+        intended=intended,
+        start_delay_us=_start_delay(state, settings, elapsed_us, choice.delayed),
+        deferring=choice.deferred,
+    )
+    mode = mode_of(choice.action, intended)
+    return Outcome(state, mode, intended, text, choice.delayed, choice.cause)
+
+
+def defer(state: FailsafeState, time_us: int, seconds: float = DEFER_S) -> FailsafeState:
+    """Put off all failsafes that may be put off; refused (no change) while one is active.
+
+    `seconds` <= 0 ends the deferral.
+    """
+    if seconds <= 0.0:
+        return state._replace(defer_until_us=None)
+    if state.active:
+        return state
+    return state._replace(defer_until_us=time_us + round(seconds * US_PER_S))
+
+
+def _begin(
+    state: FailsafeState, time_us: int, elapsed_us: int, vehicle: Vehicle, conditions: Conditions
+) -> FailsafeState:
+    """Let the delays run, and note what was wrong at arming."""
+    if not state.deferring:
+        state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
+    if state.defer_until_us is not None and time_us > state.defer_until_us:
+        state = state._replace(defer_until_us=None)
+    lost = conditions.manual_control_signal_lost
+    if vehicle.armed and not state.armed:
+        state = state._replace(
+            armed_us=time_us,
+            manual_control_lost_at_arming=lost,
+            battery_at_arming=conditions.battery_warning,
+        )
+    elif not vehicle.armed:
+        # Nothing is added while disarmed.
+        state = state._replace(armed_us=None, manual_control_lost_at_arming=lost)
+    if not lost:
+        state = state._replace(manual_control_lost_at_arming=False)
+    return state
+
+
+def _released(held: tuple[Held, ...]) -> tuple[Held, ...]:
+    """Return what is held after the user chose a mode."""
+    return tuple(h for h in held if h.failing or h.options.clear is not Clear.ON_MODE_CHANGE)
+
+
+def _hold(
+    state: FailsafeState,
+    time_us: int,
+    vehicle: Vehicle,
+    conditions: Conditions,
+    settings: Settings,
+) -> tuple[FailsafeState, bool]:
+    """Add what fails now, let go what is over; return also whether a warning is new."""
+    situation = Situation(
+        time_us,
+        conditions,
+        settings,
+        vehicle.intended,
+        vehicle.mission_finished,
+        state.armed_us,
+        state.manual_control_lost_at_arming,
+        state.battery_at_arming,
+    )
+    failing = dict(answers(situation))
+    held: list[Held] = []
+    for item in state.held:
+        now = failing.pop(item.trigger, None)
+        if now is not None:
+            # The action may change; when it clears and who may take over stay.
+            held.append(Held(item.trigger, item.options._replace(action=now.action), True))
+        elif item.options.clear is not Clear.WITH_CONDITION:
+            held.append(item._replace(failing=False))
+    warned = False
+    waits = settings.com_fail_act_t > 0.1
+    delay_us = state.delay_us
+    for trigger, options in failing.items():
+        if options.takeover is Takeover.AUTO:
+            if waits and options.action is not Action.WARN and delay_us == 0:
+                delay_us = _next_delay(state, settings)
+            takeover = Takeover.ALWAYS if waits else Takeover.MODE_SWITCH
+            options = options._replace(takeover=takeover)
+        held.append(Held(trigger, options, True))
+        warned = warned or options.action is Action.WARN
+        if options.action >= Action.HOLD:
+            state = state._replace(taken_over=False)
+    return state._replace(held=tuple(held), delay_us=delay_us), warned
+
+
+def _next_delay(state: FailsafeState, settings: Settings) -> int:
+    full_us = round(settings.com_fail_act_t * US_PER_S)
+    return full_us if state.start_delay_us is None else min(full_us, state.start_delay_us)
+
+
+def _start_delay(
+    state: FailsafeState, settings: Settings, elapsed_us: int, delayed: Action
+) -> int | None:
+    """Return how long the next wait lasts: a condition that comes and goes shortens it."""
+    left = _next_delay(state, settings)
+    if delayed is not Action.NONE:
+        return max(0, left - elapsed_us)
+    left += elapsed_us // 4
+    return None if left >= settings.com_fail_act_t * US_PER_S else left
+
+
+def _select(
+    state: FailsafeState,
+    vehicle: Vehicle,
+    conditions: Conditions,
+    settings: Settings,
+    intervention: Intervention,
+) -> _Choice:
+    if state.action is Action.TERMINATE:
+        return _Choice(Action.TERMINATE, vehicle.intended)
+    if not vehicle.armed:
+        return _Choice(Action.NONE, vehicle.intended)
+    worst = Options(Action.NONE, takeover=Takeover.ALWAYS)
+    strictest = Takeover.ALWAYS
+    for item in state.held:
+        strictest = max(strictest, item.options.takeover)
+        if item.options.action > worst.action:
+            worst = item.options
+    action, cause, intended = worst.action, worst.cause, vehicle.intended
+    deferrable = all(item.options.deferrable for item in state.held)
+    if state.defer_until_us is not None and deferrable and action is not Action.NONE:
+        return _Choice(Action.NONE, intended, deferred=action > Action.WARN)
+    delayed = Action.NONE
+    if (
+        state.delay_us > 0
+        and not state.taken_over
+        and strictest <= Takeover.MODE_SWITCH
+        and action not in (Action.DISARM, Action.TERMINATE, Action.HOLD)
+    ):
+        delayed, action, strictest = action, Action.HOLD, Takeover.MODE_SWITCH
+    # A mode switch in the same update as the action's beginning is no wish to end the action.
+    by_mode = intervention.mode_chosen and state.action is action
+    wanted = state.taken_over or by_mode
+    if strictest is Takeover.ALWAYS:
+        wanted = wanted or intervention.sticks_moved
+    taken_over = False
+    if Action.HOLD <= action <= Action.DESCEND and strictest < Takeover.AUTO and wanted:
+        if not state.taken_over and intervention.sticks_moved:
+            intended = Mode.POSITION
+        action, taken_over, delayed = Action.WARN, True, Action.NONE
+        action = max(action, mode_fallback(conditions, settings, intended))
+    possible_now = possible(action, conditions)
+    if possible_now is not action:
+        action, cause = possible_now, Cause.GENERIC
+    if _already_on_the_way(intended, action, delayed, conditions):
+        action, delayed = Action.WARN, Action.NONE
+    return _Choice(action, intended, delayed, cause, taken_over)
+
+
+def _already_on_the_way(
+    intended: Mode, action: Action, delayed: Action, conditions: Conditions
+) -> bool:
+    """Return whether a return is asked of a vehicle that lands or returns as it is."""
+    return (
+        intended in (Mode.LAND, Mode.RETURN)
+        and Action.RETURN in (action, delayed)
+        and can_run(intended, conditions)
+    )
+
+
+def _text(choice: _Choice, delay_us: int) -> Message:
+    if choice.action is Action.HOLD and choice.delayed is not Action.NONE:
+        seconds = (delay_us + US_PER_S // 2) // US_PER_S
+        text = f"Failsafe activated: entering Hold for {seconds} seconds"
+    else:
+        text = "Failsafe activated"
+    return Message(Severity.CRITICAL, text)

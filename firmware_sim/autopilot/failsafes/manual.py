@@ -1,0 +1,129 @@
+"""The tables of failsafes and pre-arm checks as the documentation prints them (Markdown)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from airl_mav.profiles.parameters import SPEC_BY_NAME
+from firmware_sim.autopilot import prearm
+from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Mode
+from firmware_sim.autopilot.failsafes.actions import Action, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.conditions import NEEDS
+from firmware_sim.autopilot.failsafes.fallback import MODE_OF_ACTION, OFFBOARD_LOSS
+from firmware_sim.autopilot.failsafes.table import TABLE, Row
+
+ACTION_NAMES = {
+    Action.NONE: "nothing",
+    Action.WARN: "warn",
+    Action.FALLBACK_POSITION: "Position",
+    Action.FALLBACK_ALTITUDE: "Altitude",
+    Action.FALLBACK_STABILIZED: "Stabilized",
+    Action.HOLD: "Hold",
+    Action.RETURN: "Return",
+    Action.LAND: "Land",
+    Action.DESCEND: "Descend",
+    Action.DISARM: "disarm",
+    Action.TERMINATE: "terminate",
+}
+
+_TAKEOVER = {
+    Takeover.ALWAYS: "at once",
+    Takeover.AUTO: "yes",
+    Takeover.MODE_SWITCH: "by mode",
+    Takeover.NEVER: "no",
+}
+_CLEAR = {
+    Clear.WITH_CONDITION: "with its cause",
+    Clear.ON_MODE_CHANGE: "by choosing a mode, or disarmed",
+    Clear.NEVER: "never",
+}
+
+
+def failsafes() -> str:
+    """Return every failsafe: condition, parameter, action for each of its values."""
+    head = ("failsafe", "when", "action", "take over", "ends")
+    return _table(head, (_failsafe(row) for row in TABLE))
+
+
+def _failsafe(row: Row) -> Sequence[str]:
+    shown = _shown(row)
+    if row.parameter is None:
+        action = ACTION_NAMES[row.answers[0].action]
+    else:
+        default = int(SPEC_BY_NAME[row.parameter].default)
+        choices = ", ".join(
+            _choice(value, options, default) for value, options in sorted(row.answers.items())
+        )
+        action = f"`{row.parameter}`: {choices}"
+    related = ", ".join(_parameter(name) for name in row.related)
+    when = f"{row.when} ({related})" if related else row.when
+    if shown is None:
+        return row.title, when, action, "–", "–"
+    final = shown.action >= Action.DISARM
+    takeover = "no" if final else _TAKEOVER[shown.takeover]
+    return row.title, when, action, takeover, _CLEAR[shown.clear]
+
+
+def _shown(row: Row) -> Options | None:
+    """Return the answer whose end is told: the default, else the mildest that acts."""
+    value = 0 if row.parameter is None else int(SPEC_BY_NAME[row.parameter].default)
+    acting = [options for options in row.answers.values() if options.action > Action.WARN]
+    chosen = row.answers.get(value)
+    if chosen is not None and chosen.action > Action.WARN:
+        return chosen
+    returning = [options for options in acting if options.action is Action.RETURN]
+    return next(iter(returning or acting), None)
+
+
+def _choice(value: int, options: Options, default: int) -> str:
+    text = f"{value} {ACTION_NAMES[options.action]}"
+    return f"**{text}**" if value == default else text
+
+
+def _parameter(name: str) -> str:
+    spec = SPEC_BY_NAME[name]
+    unit = f" {spec.unit}" if spec.unit else ""
+    return f"`{name}` {spec.default:g}{unit}"
+
+
+def offboard_loss() -> str:
+    """Return what replaces Offboard when its setpoints stop."""
+    default = int(SPEC_BY_NAME["COM_OBL_RC_ACT"].default)
+    rows = (
+        (f"**{value}**" if value == default else f"{value}", ACTION_NAMES[action])
+        for value, (action, _) in OFFBOARD_LOSS.items()
+    )
+    return _table(("`COM_OBL_RC_ACT`", "action"), rows)
+
+
+def fallbacks() -> str:
+    """Return the chain of actions, each given way to by the one before it."""
+    return " → ".join(ACTION_NAMES[action] for action in MODE_OF_ACTION)
+
+
+def needs() -> str:
+    """Return what each mode needs."""
+
+    def words(mode: Mode) -> str:
+        names = [need.name or "" for need in NEEDS[mode]]
+        return ", ".join(name.lower().replace("_", " ") for name in names)
+
+    return _table(("mode", "needs"), ((MODE_NAMES[mode], words(mode)) for mode in NEEDS))
+
+
+def checks() -> str:
+    """Return the pre-arm checks in the order in which they are told."""
+    rows = (
+        (
+            check.text,
+            (check.part.name or "").lower().replace("_", " "),
+            "by itself" if check.said else "when arming is refused",
+        )
+        for check in prearm.CHECKS
+    )
+    return _table(("text", "part", "told"), rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,179 @@
+"""Puts the failsafes together for one vehicle: look, decide, tell.
+
+It looks at 50 Hz and whenever the user does something; the state machine runs only when something
+has changed or a delay is running.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot import prearm
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Setpoint, Severity
+from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.failsafes.actions import Action
+from firmware_sim.autopilot.failsafes.conditions import Conditions, Need, lacking
+from firmware_sim.autopilot.failsafes.framework import (
+    NO_INTERVENTION,
+    FailsafeState,
+    Intervention,
+    Vehicle,
+    update,
+)
+from firmware_sim.autopilot.failsafes.settings import Settings
+from firmware_sim.autopilot.failsafes.watch import Watch
+from firmware_sim.autopilot.prearm import ArmingSettings, Check, Readiness
+from firmware_sim.interfaces import SensorSample
+
+LOOK_US = 20_000
+"""Time between two looks [µs]."""
+
+CHECK_US = 100_000
+"""Time between two runs of the pre-arm checks [µs] (PX4: 10 Hz)."""
+
+REPORT_US = 2 * US_PER_S
+"""What keeps the vehicle from arming is told no more often than that (PX4's reporting interval)."""
+
+_GROUND = Phase.GROUND
+
+
+class Decision(NamedTuple):
+    """What a failsafe makes of a flight."""
+
+    flight: Flight
+    text: Message | None
+    disarm: bool
+    """The motors stop now."""
+
+
+class Supervisor:
+    """The failsafes and pre-arm checks of one vehicle."""
+
+    def __init__(self, value: Callable[[str], float], estimator: Estimator) -> None:
+        """Take a lookup of PX4 parameter names, and the estimator."""
+        self._value = value
+        self._estimator = estimator
+        self.watch = Watch(value, estimator)
+        """What is heard and measured."""
+        self.sensors = self.watch.sensors
+        """Which sensors can be believed."""
+        self.next_us = 0
+        """When to look next: any earlier look does no harm."""
+        self.conditions = Conditions()
+        """What was wrong at the last look."""
+        self.failing: tuple[Check, ...] = ()
+        """Pre-arm checks that failed at the last look."""
+        self._state = FailsafeState()
+        self._decided: tuple[object, ...] = ()
+        self._told: tuple[Check, ...] | None = None
+        """Checks that were told as failing; None: nothing is told before the vehicle is ready."""
+        self._told_us = 0
+        self._check_us = 0
+        self.read_parameters()
+
+    def read_parameters(self) -> None:
+        """Read the parameters anew."""
+        self.watch.read_parameters()
+        self._settings = Settings.read(self._value)
+        self._arming = ArmingSettings.read(self._value)
+        self.next_us = 0
+
+    # --- what is heard
+
+    def setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
+        """Note a valid offboard setpoint; None = one of attitude or body rates."""
+        self.watch.hear_setpoint(setpoint, time_us)
+        if self.conditions.offboard_control_signal_lost:
+            self.next_us = 0
+
+    def gcs_heartbeat(self, time_us: int) -> None:
+        """Note a ground station's heartbeat."""
+        self.watch.hear_gcs(time_us)
+        if self.conditions.gcs_connection_lost:
+            self.next_us = 0
+
+    # --- looking
+
+    def look(self, sample: SensorSample, flight: Flight) -> list[Message]:
+        """Find out what is wrong; return what the operator is told of it."""
+        now_us = sample.time_us
+        self.next_us = now_us + LOOK_US
+        before = self.conditions
+        self.conditions, texts = self.watch.look(sample, flight.phase)
+        if now_us >= self._check_us or self.conditions != before:
+            self._check_us = now_us + CHECK_US
+            self.failing = prearm.failing(self.readiness(sample, flight, flight.mode))
+            texts += self._report(now_us, flight)
+        return texts
+
+    def readiness(self, sample: SensorSample, flight: Flight, mode: Mode) -> Readiness:
+        """Return what the pre-arm checks look at, for arming in a mode."""
+        now_us, sensors, attitude = sample.time_us, self.sensors, self.watch.attitude
+        return Readiness(
+            mode,
+            self.conditions,
+            self._arming,
+            converged=self._estimator.healthy,
+            gyro=sensors.gyro.has_data(now_us),
+            accel=sensors.accel.has_data(now_us),
+            mag=sensors.mag.has_data(now_us),
+            baro=sensors.baro.has_data(now_us),
+            gps=sensors.gps.has_data(now_us),
+            rolled=attitude.roll,
+            pitched=attitude.pitch,
+            charge=sample.battery.remaining,
+            terminated=flight.mode is Mode.TERMINATION,
+            armed=flight.phase >= _GROUND,
+        )
+
+    def _report(self, now_us: int, flight: Flight) -> list[Message]:
+        """Return the checks that have begun to fail, once the vehicle has been ready."""
+        if self._told is None:
+            if flight.phase is Phase.BOOT:
+                return []
+            self._told = ()
+        if self.failing == self._told or now_us < self._told_us + REPORT_US:
+            return []
+        new = [check for check in self.failing if check.said and check not in self._told]
+        self._told, self._told_us = self.failing, now_us
+        return [Message(check.severity, check.text) for check in new]
+
+    # --- arming and modes
+
+    def refusals(self, sample: SensorSample, flight: Flight) -> list[Message]:
+        """Return why the vehicle cannot be armed in its mode; nothing = it can."""
+        checks = prearm.can_arm(self.readiness(sample, flight, flight.mode))
+        return [Message(Severity.CRITICAL, check.text) for check in checks]
+
+    def available(self, mode: Mode) -> bool:
+        """Return whether a mode has what it needs, a pilot apart, for the user to choose it."""
+        return not lacking(mode, self.conditions) & ~(Need.NOT_ARMING | Need.MANUAL_CONTROL)
+
+    # --- deciding
+
+    def decide(
+        self, time_us: int, flight: Flight, intervention: Intervention = NO_INTERVENTION
+    ) -> Decision | None:
+        """Return what becomes of a flight; None = nothing changes."""
+        state, finished = self._state, self.watch.reports.mission_finished
+        armed = flight.phase >= _GROUND
+        seen = (self.conditions, armed, flight.intended, finished, self._settings)
+        # What changes with time alone: delays, and rows that end some time after arming.
+        waiting = state.delay_us > 0 or state.deferring or state.start_delay_us is not None
+        timed = self.conditions.fd_critical_failure or self.conditions.battery_unhealthy
+        idle = not (waiting or timed or state.taken_over)
+        if idle and seen == self._decided and intervention == NO_INTERVENTION:
+            return None
+        self._decided = seen
+        vehicle = Vehicle(armed, flight.intended, finished)
+        outcome = update(state, time_us, vehicle, self.conditions, self._settings, intervention)
+        self._state = outcome.state
+        action = outcome.state.action
+        followed = replace(
+            flight, mode=outcome.mode, intended=outcome.intended, failsafe=outcome.state.active
+        )
+        return Decision(followed, outcome.text, action is Action.DISARM and armed)

@@ -1,0 +1,394 @@
+"""The table of failsafes: condition, parameter, action. One row a failsafe, pure.
+
+Source: PX4 1.16, commander/failsafe/failsafe.cpp (checkStateAndMode and what it calls). Left out is
+what this vehicle does not have: transitions of a VTOL, an ESC that fails to arm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions
+from firmware_sim.autopilot.failsafes.fallback import mode_fallback
+from firmware_sim.autopilot.failsafes.settings import FLIGHT_TERMINATION_OFF, Settings
+
+NOTHING = Options(Action.NONE)
+
+
+class Situation(NamedTuple):
+    """All that a row may look at."""
+
+    time_us: int
+    conditions: Conditions
+    settings: Settings
+    intended: Mode
+    """The mode that the user asked for."""
+    mission_finished: bool = False
+    armed_us: int | None = None
+    """When the vehicle was armed; None = it is not armed."""
+    manual_control_lost_at_arming: bool = False
+    """Manual control was lost at arming and has not been there since: it is optional."""
+    battery_at_arming: BatteryWarning = BatteryWarning.NONE
+
+
+class Trigger(Enum):
+    """What sets a failsafe off; of each only one action is held."""
+
+    MANUAL_CONTROL = auto()
+    GCS = auto()
+    MISSION = auto()
+    MISSION_WITHOUT_LINKS = auto()
+    WIND = auto()
+    FLIGHT_TIME = auto()
+    POSITION_ACCURACY = auto()
+    NAVIGATOR = auto()
+    GEOFENCE = auto()
+    REMAINING_TIME = auto()
+    BATTERY_UNHEALTHY = auto()
+    BATTERY_LOW = auto()
+    BATTERY_CRITICAL = auto()
+    BATTERY_EMERGENCY = auto()
+    ATTITUDE = auto()
+    PROPELLER = auto()
+    MOTOR = auto()
+    MODE_FALLBACK = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One failsafe."""
+
+    trigger: Trigger
+    title: str
+    when: str
+    """The condition, for the manual."""
+    occurs: Callable[[Situation], bool]
+    answers: Mapping[int, Options]
+    """By the parameter's value; a row without a parameter has the answer 0 alone."""
+    parameter: str | None = None
+    otherwise: Options = NOTHING
+    """For a value that the parameter does not have."""
+    related: tuple[str, ...] = ()
+    """Other parameters of the condition."""
+    value: Callable[[Situation], int] | None = None
+    """The value to go by, where it is not simply the parameter's."""
+
+    def options(self, situation: Situation) -> Options:
+        """Return the answer in a situation in which the failsafe occurs."""
+        if self.value is not None:
+            chosen = self.value(situation)
+        elif self.parameter is not None:
+            chosen = getattr(situation.settings, self.parameter.lower())
+        else:
+            chosen = 0
+        return self.answers.get(chosen, self.otherwise)
+
+
+_STICKS_OFF = 4
+"""COM_RC_IN_MODE: no sticks are used."""
+_EXCEPT_MISSION, _EXCEPT_HOLD, _EXCEPT_OFFBOARD = 1, 2, 4
+"""Bits of COM_RCL_EXCEPT."""
+
+_NONE, _WARN, _HOLD = NOTHING, Options(Action.WARN), Options(Action.HOLD)
+_RETURN = Options(Action.RETURN, Clear.ON_MODE_CHANGE)
+_LAND = Options(Action.LAND, Clear.ON_MODE_CHANGE)
+_LASTING_HOLD = Options(Action.HOLD, Clear.ON_MODE_CHANGE)
+_TERMINATE = Options(Action.TERMINATE, Clear.NEVER, Takeover.NEVER)
+_DISARM = Options(Action.DISARM, takeover=Takeover.NEVER)
+
+
+def _caused(answers: Mapping[int, Options], cause: Cause) -> dict[int, Options]:
+    return {value: options._replace(cause=cause) for value, options in answers.items()}
+
+
+def _undeferred(answers: Mapping[int, Options]) -> dict[int, Options]:
+    return {value: options._replace(deferrable=False) for value, options in answers.items()}
+
+
+_LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
+"""NAV_RCL_ACT and NAV_DLL_ACT."""
+
+_ESCAPABLE_HOLD = _LASTING_HOLD._replace(takeover=Takeover.MODE_SWITCH)
+_LIMITS = {0: _NONE, 1: _WARN, 2: _ESCAPABLE_HOLD, 3: _RETURN, 4: _TERMINATE, 5: _LAND}
+"""GF_ACTION and COM_WIND_MAX_ACT."""
+
+_POSITION_LOW = {
+    value: Options(action, takeover=Takeover.MODE_SWITCH)
+    for value, action in enumerate(
+        (Action.NONE, Action.WARN, Action.HOLD, Action.RETURN, Action.TERMINATE, Action.LAND)
+    )
+} | {4: _TERMINATE}
+
+_ACTUATOR = {
+    0: _WARN,
+    1: _HOLD,
+    2: _LAND,
+    3: _RETURN,
+    4: Options(Action.TERMINATE, Clear.NEVER),
+}
+
+
+def ignores_manual_control(s: Situation) -> bool:
+    """Return whether a lost manual control is no failsafe in this mode (COM_RCL_EXCEPT)."""
+    mode, bits = s.intended, s.settings.com_rcl_except
+    return (
+        s.manual_control_lost_at_arming
+        or (mode is Mode.MISSION and bool(bits & _EXCEPT_MISSION))
+        or (mode in (Mode.HOLD, Mode.TAKEOFF) and bool(bits & _EXCEPT_HOLD))
+        or (mode is Mode.OFFBOARD and bool(bits & _EXCEPT_OFFBOARD))
+    )
+
+
+def _manual_control(s: Situation) -> bool:
+    lost = s.conditions.manual_control_signal_lost and s.settings.com_rc_in_mode != _STICKS_OFF
+    return lost and not ignores_manual_control(s)
+
+
+def _links_lost_after_mission(s: Situation) -> bool:
+    """Return whether neither link is a failsafe of its own, both are lost and nothing is left."""
+    unwatched = s.settings.com_rc_in_mode == _STICKS_OFF or bool(
+        s.settings.com_rcl_except & _EXCEPT_MISSION
+    )
+    return (
+        s.intended is Mode.MISSION
+        and s.mission_finished
+        and unwatched
+        and s.settings.nav_dll_act == 0
+        and s.conditions.gcs_connection_lost
+    )
+
+
+def _in_first(s: Situation, seconds: float) -> bool:
+    return s.armed_us is not None and s.time_us < s.armed_us + seconds * US_PER_S
+
+
+def _spooling(s: Situation) -> bool:
+    return _in_first(s, s.settings.com_spoolup_time)
+
+
+def _taking_off(s: Situation) -> bool:
+    return _in_first(s, s.settings.com_lkdown_tko + s.settings.com_spoolup_time)
+
+
+def _terminates(s: Situation) -> bool:
+    return s.settings.cbrk_flightterm != FLIGHT_TERMINATION_OFF
+
+
+def _battery_action(s: Situation) -> int:
+    """Return COM_LOW_BAT_ACT; 0 while the charge is no worse than it was at arming."""
+    worse = s.conditions.battery_warning > s.battery_at_arming
+    return s.settings.com_low_bat_act if worse else 0
+
+
+def _battery_row(
+    trigger: Trigger, level: BatteryWarning, title: str, cause: Cause, actions: tuple[Action, ...]
+) -> Row:
+    threshold = ("", "BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")[level]
+    return Row(
+        trigger,
+        title,
+        "the charge is below its limit, and was not at arming",
+        lambda s: s.conditions.battery_warning is level,
+        {value: Options(action, cause=cause) for value, action in enumerate(actions)},
+        "COM_LOW_BAT_ACT",
+        Options(Action.WARN, cause=cause),
+        related=(threshold,),
+        value=_battery_action,
+    )
+
+
+_W, _R, _L = Action.WARN, Action.RETURN, Action.LAND
+
+TABLE: tuple[Row, ...] = (
+    Row(
+        Trigger.MANUAL_CONTROL,
+        "Manual control lost",
+        "no pilot's input for so long, unless there was none at arming",
+        _manual_control,
+        _caused(_LINK_LOSS, Cause.MANUAL_CONTROL_LOSS),
+        "NAV_RCL_ACT",
+        related=("COM_RC_LOSS_T", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+    ),
+    Row(
+        Trigger.GCS,
+        "Ground station lost",
+        "no ground station's HEARTBEAT for so long; not in Land",
+        lambda s: s.conditions.gcs_connection_lost and s.intended is not Mode.LAND,
+        _caused(_LINK_LOSS, Cause.GCS_LOSS),
+        "NAV_DLL_ACT",
+        related=("COM_DL_LOSS_T",),
+    ),
+    Row(
+        Trigger.MISSION,
+        "Mission cannot be completed",
+        "the mission has become infeasible, in Mission",
+        lambda s: s.intended is Mode.MISSION and s.conditions.mission_failure,
+        {0: Options(Action.RETURN)},
+    ),
+    Row(
+        Trigger.MISSION_WITHOUT_LINKS,
+        "No link after the mission",
+        "the mission is finished, the ground station lost and NAV_DLL_ACT 0, manual control unused",
+        _links_lost_after_mission,
+        {0: Options(Action.RETURN)},
+        related=("NAV_DLL_ACT", "COM_RC_IN_MODE", "COM_RCL_EXCEPT"),
+    ),
+    Row(
+        Trigger.WIND,
+        "Wind above its limit",
+        "the estimated wind exceeds its limit",
+        lambda s: s.conditions.wind_limit_exceeded,
+        _undeferred(_LIMITS),
+        "COM_WIND_MAX_ACT",
+        Options(Action.WARN, deferrable=False),
+        related=("COM_WIND_MAX",),
+    ),
+    Row(
+        Trigger.FLIGHT_TIME,
+        "Flight time over",
+        "so long since take-off",
+        lambda s: s.conditions.flight_time_limit_exceeded,
+        {0: Options(Action.RETURN, deferrable=False)},
+        related=("COM_FLT_TIME_MAX",),
+    ),
+    Row(
+        Trigger.POSITION_ACCURACY,
+        "Position accuracy low",
+        "the position is valid, but less accurate than asked for, in Mission and Hold",
+        lambda s: (
+            s.intended in (Mode.MISSION, Mode.HOLD) and s.conditions.local_position_accuracy_low
+        ),
+        _POSITION_LOW,
+        "COM_POS_LOW_ACT",
+        Options(Action.WARN, takeover=Takeover.MODE_SWITCH),
+        related=("COM_POS_LOW_EPH",),
+    ),
+    Row(
+        Trigger.NAVIGATOR,
+        "Mode failed in Takeoff or Return",
+        "what the mode flies to cannot be reached",
+        lambda s: s.conditions.navigator_failure and s.intended in (Mode.TAKEOFF, Mode.RETURN),
+        {0: _LAND},
+    ),
+    Row(
+        Trigger.NAVIGATOR,
+        "Mode failed otherwise",
+        "what the mode flies to cannot be reached",
+        lambda s: s.conditions.navigator_failure and s.intended not in (Mode.TAKEOFF, Mode.RETURN),
+        {0: _LASTING_HOLD},
+    ),
+    Row(
+        Trigger.GEOFENCE,
+        "Geofence breached",
+        "too far from home, too high above it, or outside the uploaded fence",
+        lambda s: any(s.conditions.geofence),
+        _undeferred(_LIMITS),
+        "GF_ACTION",
+        Options(Action.WARN, deferrable=False),
+        related=("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
+    ),
+    Row(
+        Trigger.REMAINING_TIME,
+        "Remaining flight time low",
+        "the battery lasts no longer than a return takes",
+        lambda s: s.conditions.battery_low_remaining_time,
+        _caused({0: _NONE, 1: _WARN, 3: _RETURN}, Cause.FLIGHT_TIME_LOW),
+        "COM_FLTT_LOW_ACT",
+        related=("BAT1_CAPACITY", "RTL_TIME_FACTOR", "RTL_TIME_MARGIN"),
+    ),
+    Row(
+        Trigger.BATTERY_UNHEALTHY,
+        "Battery unhealthy at arming",
+        "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
+        lambda s: s.conditions.battery_unhealthy and _spooling(s),
+        {0: Options(Action.DISARM, deferrable=False)},
+    ),
+    Row(
+        Trigger.BATTERY_UNHEALTHY,
+        "Battery unhealthy",
+        "the battery reports nothing for 5 s",
+        lambda s: s.conditions.battery_unhealthy and not _spooling(s),
+        {0: _WARN},
+    ),
+    _battery_row(
+        Trigger.BATTERY_LOW,
+        BatteryWarning.LOW,
+        "Battery low",
+        Cause.BATTERY_LOW,
+        (_W, _W, _W, _W),
+    ),
+    _battery_row(
+        Trigger.BATTERY_CRITICAL,
+        BatteryWarning.CRITICAL,
+        "Battery critical",
+        Cause.BATTERY_CRITICAL,
+        (_W, _R, _L, _R),
+    ),
+    _battery_row(
+        Trigger.BATTERY_EMERGENCY,
+        BatteryWarning.EMERGENCY,
+        "Battery empty",
+        Cause.BATTERY_EMERGENCY,
+        (_W, _R, _L, _L),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure at take-off",
+        "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
+        lambda s: s.conditions.fd_critical_failure and _taking_off(s),
+        {0: Options(Action.DISARM, deferrable=False)},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure in flight, CBRK_FLIGHTTERM 0",
+        "roll or pitch out of limits",
+        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
+        {0: Options(Action.TERMINATE, deferrable=False)},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+    ),
+    Row(
+        Trigger.ATTITUDE,
+        "Attitude failure in flight",
+        "roll or pitch out of limits",
+        lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and not _terminates(s),
+        {0: _WARN},
+        related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
+    ),
+    Row(
+        Trigger.PROPELLER,
+        "Imbalanced propeller",
+        "the vibration exceeds its limit",
+        lambda s: s.conditions.fd_imbalanced_prop,
+        {-1: _NONE, 0: _WARN, 1: _RETURN, 2: _LAND},
+        "COM_IMB_PROP_ACT",
+        related=("FD_IMB_PROP_THR",),
+    ),
+    Row(
+        Trigger.MOTOR,
+        "Motor failure",
+        "what measures the motors reports that one does not do what it is told",
+        lambda s: s.conditions.fd_motor_failure,
+        _ACTUATOR,
+        "COM_ACT_FAIL_ACT",
+        _WARN,
+    ),
+)
+"""Every failsafe but the last, which `answers` adds: the fallback of a mode that cannot fly on."""
+
+
+def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
+    """Return what occurs now and the answer to each, in the table's order; no answer is none."""
+    found = [(row.trigger, row.options(situation)) for row in TABLE if row.occurs(situation)]
+    found = [(trigger, options) for trigger, options in found if options.action is not Action.NONE]
+    fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
+    if fallback is not Action.NONE:
+        options = Options(fallback, takeover=Takeover.ALWAYS, deferrable=False)
+        found.append((Trigger.MODE_FALLBACK, options))
+    return found

@@ -1,0 +1,208 @@
+"""Where the conditions come from: estimator, links, battery, clocks, and what others report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity
+from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.failsafes.conditions import (
+    NO_BREACH,
+    BatteryWarning,
+    Conditions,
+    FenceBreach,
+)
+from firmware_sim.autopilot.failsafes.detectors import AttitudeFailure, Validity
+from firmware_sim.autopilot.sensor_monitor import SensorMonitor
+from firmware_sim.interfaces import BatterySample, SensorSample
+
+_GROUND, _AIR = Phase.GROUND, Phase.AIR
+_WARNINGS = tuple(BatteryWarning)
+
+
+@dataclass
+class Reports:
+    """What other parts of the autopilot report; each writes its own and nobody else's."""
+
+    fence: FenceBreach = NO_BREACH
+    mission_missing: bool = True
+    """No mission is stored that could be flown."""
+    mission_failure: bool = False
+    """The mission that is flown has become infeasible."""
+    mission_finished: bool = False
+    navigator_failure: bool = False
+    """What the mode flies to cannot be reached."""
+    motor_failure: bool = False
+    """A motor does not do what it is told."""
+
+
+class WatchSettings(NamedTuple):
+    """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
+
+    bat_low_thr: float = 0.15
+    bat_crit_thr: float = 0.07
+    bat_emergen_thr: float = 0.05
+    com_dl_loss_t: float = 10.0
+    com_flt_time_max: float = -1.0
+    com_of_loss_t: float = 1.0
+    com_pos_fs_eph: float = 5.0
+    com_pos_low_eph: float = -1.0
+    com_rc_loss_t: float = 0.5
+    com_vel_fs_evh: float = 1.0
+    fd_fail_p: float = 60.0
+    fd_fail_p_ttri: float = 0.3
+    fd_fail_r: float = 60.0
+    fd_fail_r_ttri: float = 0.3
+
+    @classmethod
+    def read(cls, value: Callable[[str], float]) -> WatchSettings:
+        """Read them by a lookup of PX4 parameter names."""
+        return cls(*(value(name.upper()) for name in cls._fields))
+
+
+class Watch:
+    """Notes what is heard and measured, and says what is wrong."""
+
+    def __init__(self, value: Callable[[str], float], estimator: Estimator) -> None:
+        """Take a lookup of PX4 parameter names, and the estimator whose outputs are judged."""
+        self._value = value
+        self._estimator = estimator
+        self.settings = WatchSettings.read(value)
+        self.sensors = SensorMonitor()
+        """The sensors, watched."""
+        self.attitude = AttitudeFailure()
+        """The failure detector."""
+        self.reports = Reports()
+        """What others report."""
+        self._setpoint_us: int | None = None
+        self._setpoint: Setpoint | None = None
+        self._manual_us: int | None = None
+        self._gcs_us: int | None = None
+        self._gcs_lost = True
+        self._battery = BatteryWarning.NONE
+        self._takeoff_us: int | None = None
+        self._local, self._relaxed, self._velocity = Validity(), Validity(), Validity()
+        self._gps_fused = False
+
+    def read_parameters(self) -> None:
+        """Read the parameters anew."""
+        self.settings = WatchSettings.read(self._value)
+
+    def hear_setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
+        """Note a valid offboard setpoint; None = one of attitude or body rates."""
+        self._setpoint, self._setpoint_us = setpoint, time_us
+
+    def hear_pilot(self, time_us: int) -> None:
+        """Note a pilot's valid input: MANUAL_CONTROL or RC."""
+        self._manual_us = time_us
+
+    def hear_gcs(self, time_us: int) -> None:
+        """Note a ground station's heartbeat."""
+        if self._gcs_us is None:
+            self._gcs_lost = False  # The first one is no news.
+        self._gcs_us = time_us
+
+    def offboard_lost(self, time_us: int) -> bool:
+        """Return whether there is no setpoint that could be flown, young enough (COM_OF_LOSS_T)."""
+        setpoint = self._setpoint
+        if _silent(self._setpoint_us, time_us, self.settings.com_of_loss_t):
+            return True
+        if setpoint is None:
+            return False
+        by_position = not math.isnan(setpoint.position[0])
+        return not (self._local if by_position else self._velocity).valid
+
+    def look(self, sample: SensorSample, phase: Phase) -> tuple[Conditions, list[Message]]:
+        """Return what is wrong now, and what has changed that an operator is told at once."""
+        texts = self.sensors.judge(sample, flying=phase is _AIR)
+        conditions = self._conditions(sample, phase)
+        texts += self._texts(conditions, sample.time_us, phase)
+        return conditions, texts
+
+    def _conditions(self, sample: SensorSample, phase: Phase) -> Conditions:
+        now_us, p, reports = sample.time_us, self.settings, self.reports
+        estimator = self._estimator
+        armed = phase >= _GROUND
+        if phase is _AIR:
+            self._takeoff_us = now_us if self._takeoff_us is None else self._takeoff_us
+        elif not armed:
+            self._takeoff_us = None
+        accuracy, speed_accuracy = estimator.accuracy()
+        position = estimator.knows_position(now_us)
+        needed = p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf
+        if estimator.origin is not None:
+            for validity, sigma, limit in (
+                (self._local, accuracy, needed),
+                (self._relaxed, accuracy, math.inf),
+                (self._velocity, speed_accuracy, p.com_vel_fs_evh),
+            ):
+                validity.update(now_us, good=position, accuracy=sigma, needed=limit)
+        local = self._local.valid
+        self._battery = self._charge(sample.battery, armed=armed)
+        long_flight = (
+            p.com_flt_time_max > 0.0
+            and self._takeoff_us is not None
+            and now_us - self._takeoff_us > p.com_flt_time_max * US_PER_S
+        )
+        return Conditions(
+            angular_velocity_invalid=not self.sensors.gyro.has_data(now_us),
+            attitude_invalid=not (
+                estimator.origin is not None
+                and self.sensors.gyro.has_data(now_us)
+                and self.sensors.accel.has_data(now_us)
+            ),
+            local_altitude_invalid=not estimator.knows_height(now_us),
+            local_position_invalid=not local,
+            local_position_invalid_relaxed=not self._relaxed.valid,
+            local_velocity_invalid=not self._velocity.valid,
+            global_position_invalid=not local,
+            local_position_accuracy_low=local and 0.0 < p.com_pos_low_eph < accuracy,
+            home_position_invalid=estimator.origin is None,
+            auto_mission_missing=reports.mission_missing,
+            offboard_control_signal_lost=self.offboard_lost(now_us),
+            manual_control_signal_lost=_silent(self._manual_us, now_us, p.com_rc_loss_t),
+            gcs_connection_lost=_silent(self._gcs_us, now_us, p.com_dl_loss_t),
+            battery_warning=self._battery,
+            geofence=reports.fence,
+            mission_failure=reports.mission_failure,
+            navigator_failure=reports.navigator_failure,
+            flight_time_limit_exceeded=long_flight,
+            fd_critical_failure=self.attitude.update(
+                now_us,
+                estimator.state,
+                (p.fd_fail_r, p.fd_fail_p),
+                (p.fd_fail_r_ttri, p.fd_fail_p_ttri),
+            ),
+            fd_motor_failure=reports.motor_failure,
+        )
+
+    def _texts(self, conditions: Conditions, now_us: int, phase: Phase) -> list[Message]:
+        texts: list[Message] = []
+        if self._gcs_us is not None and conditions.gcs_connection_lost is not self._gcs_lost:
+            lost = self._gcs_lost = conditions.gcs_connection_lost
+            text = "Connection to ground station lost" if lost else "GCS connection regained"
+            texts.append(Message(Severity.INFO, text))
+        fused = self._estimator.fuses_gps(now_us)
+        if fused is not self._gps_fused:
+            self._gps_fused = fused
+            if phase >= _GROUND and fused:
+                texts.append(Message(Severity.INFO, "GNSS data fusion started"))
+            elif phase >= _GROUND:
+                texts.append(Message(Severity.WARNING, "GNSS data fusion stopped"))
+        return texts
+
+    def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
+        """Return how low the charge is; while armed it gets no better."""
+        p, left = self.settings, battery.remaining
+        below = (left < p.bat_low_thr) + (left < p.bat_crit_thr) + (left < p.bat_emergen_thr)
+        warning = _WARNINGS[below]
+        return max(warning, self._battery) if armed else warning
+
+
+def _silent(heard_us: int | None, now_us: int, limit_s: float) -> bool:
+    return heard_us is None or now_us - heard_us > limit_s * US_PER_S

@@ -1,0 +1,129 @@
+"""Which sensors can be believed: silent ones, and those that repeat themselves.
+
+Source: PX4 1.16, DataValidator and the preflight checks of each sensor. PX4 goes on with a sensor
+that repeats itself; here the estimator is spared it, as a real sensor's noise never repeats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.interfaces import SensorSample
+
+NO_DATA_US = US_PER_S
+"""A sensor that has been silent for so long has no valid data [µs]."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorKind:
+    """One sensor, and when it is given up."""
+
+    name: str
+    """As PX4's texts have it."""
+    title: str
+    """As the pre-flight checks have it."""
+    read: Callable[[SensorSample], Any]
+    """What must differ from sample to sample; None where the sample has nothing of it."""
+    timeout_us: int
+    """Silence after which it has failed."""
+    stale_us: int
+    """Time of repeating itself in flight after which it has failed."""
+
+
+def _mag(sample: SensorSample) -> Any:
+    return None if sample.mag is None else tuple(sample.mag.tolist())
+
+
+def _gps(sample: SensorSample) -> Any:
+    fix = sample.gps
+    return None if fix is None else (fix.position, *fix.velocity_ned.tolist())
+
+
+GYRO = SensorKind("GYRO", "Gyro 0", lambda s: tuple(s.gyro.tolist()), 500_000, 400_000)
+ACCEL = SensorKind("ACCEL", "Accel 0", lambda s: tuple(s.accel.tolist()), 500_000, 400_000)
+MAG = SensorKind("MAG", "Compass 0", _mag, 300_000, 2_000_000)
+BARO = SensorKind("BARO", "Baro 0", lambda s: s.pressure_hpa, 300_000, 2_000_000)
+GPS = SensorKind("GPS", "GPS 0", _gps, 1_000_000, 1_000_000)
+
+
+class SensorWatch:
+    """One sensor under watch; looked at whenever it may have measured."""
+
+    def __init__(self, kind: SensorKind) -> None:
+        """Begin without a sample."""
+        self.kind = kind
+        self._value: Any = None
+        self._seen_us: int | None = None
+        self._changed_us = 0
+        self.failed = ""
+        """Why it has failed: TIMEOUT or STALE; empty = it has not."""
+
+    @property
+    def seen(self) -> bool:
+        """Whether it has ever measured."""
+        return self._seen_us is not None
+
+    def take(self, sample: SensorSample) -> None:
+        """Take a sample in which it has measured."""
+        value, now_us = self.kind.read(sample), sample.time_us
+        if value != self._value:
+            self._value, self._changed_us = value, now_us
+        self._seen_us = now_us
+
+    def judge(self, now_us: int, *, flying: bool) -> Message | None:
+        """Return a text when it fails now. Standing still, a perfect sensor may repeat itself."""
+        if self._seen_us is None:
+            return None
+        if not flying:
+            self._changed_us = self._seen_us
+        before = self.failed
+        if now_us - self._seen_us > self.kind.timeout_us:
+            self.failed = "TIMEOUT"
+        elif flying and now_us - self._changed_us > self.kind.stale_us:
+            self.failed = "STALE"
+        else:
+            self.failed = ""
+        if not self.failed or before:
+            return None
+        text = f"{self.kind.name} #0 failed: {self.failed}!"
+        return Message(Severity.EMERGENCY, text)
+
+    def has_data(self, now_us: int) -> bool:
+        """Return whether its data are valid for flight."""
+        seen_us = self._seen_us
+        if seen_us is None or now_us - seen_us >= NO_DATA_US:
+            return False
+        return self.failed != "STALE" or now_us - self._changed_us < NO_DATA_US
+
+
+class SensorMonitor:
+    """Watches all sensors of the vehicle."""
+
+    def __init__(self) -> None:
+        """Begin without a sample."""
+        self.gyro, self.accel = SensorWatch(GYRO), SensorWatch(ACCEL)
+        self.mag, self.baro, self.gps = SensorWatch(MAG), SensorWatch(BARO), SensorWatch(GPS)
+        self.all = (self.gyro, self.accel, self.mag, self.baro, self.gps)
+        self.distrusted = False
+        """Whether a sensor repeats itself, so that `trusted` leaves something out."""
+
+    def judge(self, sample: SensorSample, *, flying: bool) -> list[Message]:
+        """Look at the inertial sensors too, and return what has failed since the last call."""
+        now_us = sample.time_us
+        self.gyro.take(sample)
+        self.accel.take(sample)
+        texts = [watch.judge(now_us, flying=flying) for watch in self.all]
+        self.distrusted = any(w.failed == "STALE" for w in (self.mag, self.baro, self.gps))
+        return [text for text in texts if text is not None]
+
+    def trusted(self, sample: SensorSample) -> SensorSample:
+        """Return a sample without what must not be fused."""
+        return sample._replace(
+            mag=None if self.mag.failed else sample.mag,
+            pressure_hpa=None if self.baro.failed else sample.pressure_hpa,
+            gps=None if self.gps.failed else sample.gps,
+        )

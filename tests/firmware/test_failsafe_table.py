@@ -1,0 +1,614 @@
+"""The failsafes as a pure table: every pair of conditions, and PX4's rules as a second opinion.
+
+The rules are written here a second time, as PX4's documentation tells them: a list of what each
+single failure does, the worst of which is flown, and the chain of modes that it gives way to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.failsafes.actions import Action
+from firmware_sim.autopilot.failsafes.conditions import (
+    NEEDS,
+    BatteryWarning,
+    Conditions,
+    FenceBreach,
+    can_run,
+)
+from firmware_sim.autopilot.failsafes.fallback import MODE_OF_ACTION, possible
+from firmware_sim.autopilot.failsafes.framework import (
+    NO_INTERVENTION,
+    FailsafeState,
+    Intervention,
+    Outcome,
+    Vehicle,
+    defer,
+    update,
+)
+from firmware_sim.autopilot.failsafes.settings import Settings
+from firmware_sim.autopilot.failsafes.table import TABLE, Situation, Trigger, answers
+
+MS, S = 1_000, 1_000_000
+FINE = Conditions(
+    auto_mission_missing=False,
+    offboard_control_signal_lost=False,
+    manual_control_signal_lost=False,
+    gcs_connection_lost=False,
+)
+"""A vehicle that lacks nothing."""
+
+LONG_ARMED_US = 60 * S
+
+
+class Machine:
+    """Steps the failsafes and keeps their state."""
+
+    def __init__(self, mode: Mode = Mode.HOLD, options: Settings | None = None) -> None:
+        self.state = FailsafeState()
+        self.mode, self.armed, self.time_us = mode, True, 1 * S
+        self.options = options or Settings()
+        self.conditions = FINE
+        self.mission_finished = False
+        self.texts: list[str] = []
+        self.last = self.step(0)
+
+    def step(
+        self, elapsed_us: int = 10 * MS, asked: Intervention = NO_INTERVENTION, **changes: Any
+    ) -> Outcome:
+        """Let time pass, change what is wrong, and update; return the outcome."""
+        self.time_us += elapsed_us
+        self.conditions = self.conditions._replace(**changes)
+        vehicle = Vehicle(self.armed, self.mode, self.mission_finished)
+        self.last = update(self.state, self.time_us, vehicle, self.conditions, self.options, asked)
+        self.state, self.mode = self.last.state, self.last.intended
+        if self.last.text is not None:
+            self.texts.append(self.last.text.text)
+        return self.last
+
+    def action(self) -> Action:
+        return self.state.action
+
+
+def flying(mode: Mode = Mode.HOLD, **options: float) -> Machine:
+    """Return the failsafes of a vehicle that has been armed for a while."""
+    machine = Machine(mode, Settings(**options))  # type: ignore[arg-type]  # by name
+    machine.step(LONG_ARMED_US)
+    assert machine.action() is Action.NONE
+    return machine
+
+
+# --- PX4's own scenarios (failsafe_test.cpp, failsafe.cpp)
+
+
+def test_manual_control_lost_holds_then_returns() -> None:
+    m = flying(Mode.POSITION, nav_rcl_act=2)
+    assert m.step(manual_control_signal_lost=True).state.action is Action.HOLD
+    assert m.texts == ["Failsafe activated: entering Hold for 5 seconds"]
+    assert m.last.delayed is Action.RETURN
+    assert m.last.mode is Mode.HOLD
+    m.step(4900 * MS)
+    assert m.action() is Action.HOLD
+    m.step(200 * MS)
+    assert m.action() is Action.RETURN
+    assert m.texts[-1] == "Failsafe activated"
+    # The signal is back: the return goes on until the user chooses a mode.
+    m.step(manual_control_signal_lost=False)
+    assert m.action() is Action.RETURN
+    m.mode = Mode.ALTITUDE
+    assert m.step().mode is Mode.ALTITUDE
+    assert m.action() is Action.NONE
+
+
+def test_the_worse_of_two_is_taken_and_the_other_after_it() -> None:
+    m = flying(Mode.POSITION, nav_rcl_act=2, nav_dll_act=3)
+    m.step(manual_control_signal_lost=True)
+    m.step(6 * S)
+    assert m.action() is Action.RETURN
+    m.step(gcs_connection_lost=True)
+    assert m.action() is Action.LAND, "no second wait: it is in a failsafe already"
+    m.mode = Mode.HOLD
+    m.step(gcs_connection_lost=False)
+    assert m.action() is Action.WARN, "the user flies on; the pilot's link is still lost"
+
+
+def test_the_user_takes_over_with_the_sticks_only_after_the_wait() -> None:
+    m = flying(Mode.MISSION)
+    m.step(mission_failure=True)
+    assert m.action() is Action.HOLD
+    m.step(3 * S, Intervention(sticks_moved=True))
+    assert m.action() is Action.HOLD
+    m.step(3 * S)
+    assert m.action() is Action.RETURN
+    m.step(10 * MS, Intervention(sticks_moved=True))
+    assert (m.action(), m.mode, m.state.taken_over) == (Action.WARN, Mode.POSITION, True)
+    m.step()
+    assert m.action() is Action.NONE
+    assert not m.state.taken_over
+
+
+def test_a_mode_ends_the_wait_but_not_one_asked_before() -> None:
+    m = flying(Mode.POSITION, nav_rcl_act=2)
+    m.step(10 * MS, Intervention(mode_chosen=True), manual_control_signal_lost=True)
+    assert m.action() is Action.HOLD, "asked for at the moment of the loss: no takeover"
+    m.step(1 * S, Intervention(mode_chosen=True))
+    assert (m.action(), m.state.taken_over) == (Action.WARN, True)
+    m.step(60 * S)
+    assert m.action() is Action.WARN
+
+
+def test_a_fence_is_escaped_by_mode_not_by_sticks_and_termination_by_nothing() -> None:
+    m = flying(Mode.POSITION, gf_action=2)
+    m.step(geofence=FenceBreach(distance=True))
+    assert m.action() is Action.HOLD
+    m.step(10 * MS, Intervention(sticks_moved=True))
+    assert m.action() is Action.HOLD
+    m.step(10 * MS, Intervention(mode_chosen=True))
+    assert m.action() is Action.WARN
+    m = flying(Mode.POSITION, gf_action=4)
+    m.step(geofence=FenceBreach(custom=True))
+    assert m.action() is Action.TERMINATE
+    m.armed, m.mode = False, Mode.HOLD
+    m.step(10 * S, Intervention(mode_chosen=True, sticks_moved=True), geofence=FenceBreach())
+    assert m.action() is Action.TERMINATE
+    assert m.last.mode is Mode.TERMINATION
+
+
+def test_already_returning_or_landing_it_only_warns() -> None:
+    for mode in (Mode.RETURN, Mode.LAND):
+        m = flying(mode, nav_rcl_act=2)
+        m.step(manual_control_signal_lost=True)
+        assert (m.action(), m.last.mode) == (Action.WARN, mode)
+
+
+def test_deferral() -> None:
+    m = flying(Mode.POSITION, nav_rcl_act=2, gf_action=3, com_fail_act_t=0.0)
+    m.state = defer(m.state, m.time_us, 10.0)
+    m.step(manual_control_signal_lost=True)
+    assert (m.action(), m.state.deferring) == (Action.NONE, True)
+    m.step(9 * S)
+    assert m.action() is Action.NONE
+    m.step(2 * S)
+    assert (m.action(), m.state.deferring) == (Action.RETURN, False)
+    assert defer(m.state, m.time_us) == m.state, "refused in a failsafe"
+    m = flying(Mode.POSITION, nav_rcl_act=2, gf_action=3, com_fail_act_t=0.0)
+    m.state = defer(m.state, m.time_us)
+    m.step(geofence=FenceBreach(altitude=True))
+    assert m.action() is Action.RETURN, "a fence cannot be deferred"
+
+
+def test_a_condition_that_flaps_acts_in_the_end() -> None:
+    """A wait that has begun runs on without its cause; the next is shorter than the first."""
+    m = flying(Mode.MISSION)
+    for _ in range(3):
+        m.step(mission_failure=True)
+        m.step(1 * S)
+        assert m.action() is Action.HOLD
+        m.step(mission_failure=False)
+        m.step(500 * MS)
+        assert m.action() is Action.HOLD
+    m.step(1 * S)
+    assert m.action() is Action.NONE
+    m.step(mission_failure=True)
+    assert m.texts[-1] == "Failsafe activated: entering Hold for 3 seconds"
+    m.step(3500 * MS)
+    assert m.action() is Action.RETURN
+
+
+def test_the_battery_acts_only_when_worse_than_at_arming() -> None:
+    m = Machine(Mode.HOLD, Settings(com_low_bat_act=3))
+    m.armed = False
+    m.step(battery_warning=BatteryWarning.CRITICAL)
+    m.armed = True
+    m.step()
+    m.step(LONG_ARMED_US)
+    assert m.action() is Action.WARN
+    m.step(battery_warning=BatteryWarning.EMERGENCY)
+    m.step(6 * S)
+    assert m.action() is Action.LAND
+
+
+def test_manual_control_that_was_missing_at_arming_is_optional() -> None:
+    m = Machine(Mode.HOLD, Settings(nav_rcl_act=2))
+    m.armed = False
+    m.step(manual_control_signal_lost=True)
+    m.armed = True
+    m.step(LONG_ARMED_US)
+    assert m.action() is Action.NONE
+    m.step(manual_control_signal_lost=False)
+    m.step(manual_control_signal_lost=True)
+    assert m.action() is Action.HOLD, "once it was there, its loss counts"
+
+
+@pytest.mark.parametrize(
+    ("after_s", "breaker", "expected"),
+    [
+        (3.9, 121212, Action.DISARM),
+        (3.9, 0, Action.DISARM),
+        (4.1, 121212, Action.WARN),
+        (4.1, 0, Action.TERMINATE),
+    ],
+)
+def test_attitude_failure(after_s: float, breaker: int, expected: Action) -> None:
+    m = Machine(Mode.TAKEOFF, Settings(cbrk_flightterm=breaker))
+    m.step(round(after_s * S), fd_critical_failure=True)
+    assert m.action() is expected
+
+
+def test_an_orbit_that_a_failsafe_ended_is_not_resumed() -> None:
+    m = flying(Mode.ORBIT, com_fail_act_t=0.0)
+    m.step(flight_time_limit_exceeded=True)
+    assert m.action() is Action.RETURN
+    m.step(flight_time_limit_exceeded=False)
+    assert (m.action(), m.mode) == (Action.NONE, Mode.HOLD)
+
+
+def test_offboard_lost_and_regained() -> None:
+    m = flying(Mode.OFFBOARD, com_obl_rc_act=3)
+    m.step(offboard_control_signal_lost=True)
+    assert (m.action(), m.last.mode, m.mode) == (Action.RETURN, Mode.RETURN, Mode.OFFBOARD)
+    assert m.texts == ["Failsafe activated"], "no wait in Hold for a mode that cannot fly on"
+    m.step(offboard_control_signal_lost=False)
+    assert (m.action(), m.last.mode) == (Action.NONE, Mode.OFFBOARD)
+
+
+# --- every pair
+
+
+def test_every_trigger_has_a_row_and_every_value_of_its_parameter_an_answer() -> None:
+    assert {row.trigger for row in TABLE} == set(Trigger) - {Trigger.MODE_FALLBACK}
+    for row in TABLE:
+        assert row.answers
+        if row.parameter is None:
+            assert set(row.answers) == {0}
+        else:
+            assert row.parameter.lower() in Settings._fields
+
+
+def test_every_mode_needs_something_known() -> None:
+    assert set(NEEDS) == set(Mode)
+
+
+_BAD: dict[str, Any] = {
+    **{name: True for name, default in Conditions()._asdict().items() if isinstance(default, bool)},
+    "battery_warning": BatteryWarning.CRITICAL,
+    "geofence": FenceBreach(distance=True),
+}
+SINGLES = [(name,) for name in Conditions._fields]
+PAIRS = [(a, b) for a, b in product(Conditions._fields, repeat=2) if a < b]
+
+
+def with_every_action(value: int) -> Settings:
+    """Return settings in which every parameter that chooses an action has this value."""
+    return Settings(
+        *(
+            value if isinstance(default, int) and "act" in name else default
+            for name, default in Settings._field_defaults.items()
+        )
+    )
+
+
+def assert_flown(mode: Mode, options: Settings, names: tuple[str, ...]) -> None:
+    """Let conditions occur; what is chosen at once and after the wait can be flown."""
+    m = Machine(mode, options)
+    for elapsed_us in (LONG_ARMED_US, 6 * S):
+        m.step(elapsed_us, **{name: _BAD[name] for name in names})
+        action, flown = m.action(), m.last.mode
+        where = f"{names} in {mode.name} with {options}: {action.name}"
+        if action in MODE_OF_ACTION:
+            assert flown is MODE_OF_ACTION[action], where
+            assert action is Action.TERMINATE or can_run(flown, m.conditions), where
+        else:
+            assert flown is m.mode, where
+            assert action is Action.DISARM or can_run(flown, m.conditions), where
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_every_condition_in_every_mode_has_an_outcome_that_can_be_flown(mode: Mode) -> None:
+    for value in range(-1, 8):
+        for names in SINGLES:
+            assert_flown(mode, with_every_action(value), names)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_every_pair_of_conditions_has_an_outcome_that_can_be_flown(mode: Mode) -> None:
+    for names in PAIRS:
+        assert_flown(mode, Settings(), names)
+
+
+def test_the_chain_of_fallbacks() -> None:
+    lost: dict[str, Any] = {}
+    ends = []
+    for name in (
+        "global_position_invalid",
+        "local_position_invalid",
+        "local_position_invalid_relaxed",
+        "local_altitude_invalid",
+        "attitude_invalid",
+    ):
+        lost[name] = True
+        conditions = FINE._replace(**lost)
+        ends.append(
+            (possible(Action.FALLBACK_POSITION, conditions), possible(Action.HOLD, conditions))
+        )
+    assert ends == [
+        (Action.FALLBACK_POSITION, Action.LAND),
+        (Action.FALLBACK_POSITION, Action.LAND),
+        (Action.FALLBACK_ALTITUDE, Action.DESCEND),
+        (Action.FALLBACK_STABILIZED, Action.DESCEND),
+        (Action.TERMINATE, Action.TERMINATE),
+    ]
+
+
+# --- the same rules, written a second time
+
+
+class Known(NamedTuple):
+    """What the second opinion looks at."""
+
+    c: Conditions
+    p: Settings
+    mode: Mode
+
+
+_LINK = [
+    Action.NONE,
+    Action.HOLD,
+    Action.RETURN,
+    Action.LAND,
+    None,
+    Action.TERMINATE,
+    Action.DISARM,
+]
+_LIMIT = [Action.NONE, Action.WARN, Action.HOLD, Action.RETURN, Action.TERMINATE, Action.LAND]
+
+
+def _pick(actions: list[Action | None], value: int, otherwise: Action) -> Action:
+    found = actions[value] if 0 <= value < len(actions) else None
+    return otherwise if found is None else found
+
+
+def _excepted(k: Known) -> bool:
+    """COM_RCL_EXCEPT, bit 0 Mission, 1 Hold (and Takeoff), 2 Offboard."""
+    bit = {Mode.MISSION: 1, Mode.HOLD: 2, Mode.TAKEOFF: 2, Mode.OFFBOARD: 4}.get(k.mode, 0)
+    return bool(k.p.com_rcl_except & bit)
+
+
+def _low_battery(k: Known) -> Action:
+    if k.c.battery_warning is BatteryWarning.NONE:
+        return Action.NONE
+    if k.c.battery_warning is BatteryWarning.LOW or k.p.com_low_bat_act not in (1, 2, 3):
+        return Action.WARN
+    if k.p.com_low_bat_act == 2:
+        return Action.LAND
+    empty = k.c.battery_warning is BatteryWarning.EMERGENCY
+    return Action.LAND if empty and k.p.com_low_bat_act == 3 else Action.RETURN
+
+
+def _unflyable(k: Known) -> Action:
+    """The mode itself cannot go on."""
+    mode, action = k.mode, Action.NONE
+    if mode is Mode.OFFBOARD and k.c.offboard_control_signal_lost:
+        losses = [
+            (Action.FALLBACK_POSITION, Mode.POSITION),
+            (Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (Action.FALLBACK_STABILIZED, Mode.STABILIZED),
+            (Action.RETURN, Mode.RETURN),
+            (Action.LAND, Mode.LAND),
+            (Action.HOLD, Mode.HOLD),
+            (Action.TERMINATE, Mode.TERMINATION),
+        ]
+        if k.p.com_obl_rc_act == 7:
+            return Action.DISARM
+        action, mode = losses[k.p.com_obl_rc_act]
+    steps = {
+        0: [
+            (Mode.POSITION, Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+            (Mode.ALTITUDE, Action.FALLBACK_STABILIZED, Mode.STABILIZED),
+        ],
+        1: [(Mode.POSITION, Action.LAND, Mode.LAND), (Mode.LAND, Action.DESCEND, Mode.DESCEND)],
+    }[k.p.com_posctl_navl]
+    if mode is Mode.POSITION or k.p.com_posctl_navl == 0:
+        for at, then, into in steps:
+            if mode is at and not _flies(at, k.c):
+                action, mode = then, into
+    return action if _flies(mode, k.c) else Action.RETURN
+
+
+def _flies(mode: Mode, c: Conditions) -> bool:
+    """PX4's table of mode requirements, column by column."""
+    level = not (c.angular_velocity_invalid or c.attitude_invalid)
+    height, somewhere = not c.local_altitude_invalid, not c.local_position_invalid_relaxed
+    guided = level and height and not c.local_position_invalid
+    on_the_map = guided and not c.global_position_invalid
+    return {
+        Mode.HOLD: on_the_map,
+        Mode.TAKEOFF: guided,
+        Mode.OFFBOARD: level and not c.offboard_control_signal_lost,
+        Mode.LAND: level and height and somewhere,
+        Mode.RETURN: on_the_map and not c.home_position_invalid,
+        Mode.POSITION: level and height and somewhere,
+        Mode.ALTITUDE: level and height,
+        Mode.STABILIZED: level,
+        Mode.MISSION: on_the_map and not c.auto_mission_missing,
+        Mode.ORBIT: guided,
+        Mode.FOLLOW: guided,
+        Mode.MANUAL: True,
+        Mode.ACRO: not c.angular_velocity_invalid,
+        Mode.DESCEND: level,
+        Mode.TERMINATION: True,
+    }[mode]
+
+
+RULES: list[Callable[[Known], Action]] = [
+    lambda k: (
+        _pick(_LINK, k.p.nav_rcl_act, Action.NONE)
+        if k.c.manual_control_signal_lost and k.p.com_rc_in_mode != 4 and not _excepted(k)
+        else Action.NONE
+    ),
+    lambda k: (
+        _pick(_LINK, k.p.nav_dll_act, Action.NONE)
+        if k.c.gcs_connection_lost and k.mode is not Mode.LAND
+        else Action.NONE
+    ),
+    lambda k: Action.RETURN if k.mode is Mode.MISSION and k.c.mission_failure else Action.NONE,
+    lambda k: (
+        _pick(list(_LIMIT), k.p.com_wind_max_act, Action.WARN)
+        if k.c.wind_limit_exceeded
+        else Action.NONE
+    ),
+    lambda k: Action.RETURN if k.c.flight_time_limit_exceeded else Action.NONE,
+    lambda k: (
+        _pick(list(_LIMIT), k.p.com_pos_low_act, Action.WARN)
+        if k.c.local_position_accuracy_low and k.mode in (Mode.HOLD, Mode.MISSION)
+        else Action.NONE
+    ),
+    lambda k: (
+        (Action.LAND if k.mode in (Mode.TAKEOFF, Mode.RETURN) else Action.HOLD)
+        if k.c.navigator_failure
+        else Action.NONE
+    ),
+    lambda k: (
+        _pick(list(_LIMIT), k.p.gf_action, Action.WARN)
+        if k.c.geofence != FenceBreach()
+        else Action.NONE
+    ),
+    lambda k: (
+        {1: Action.WARN, 3: Action.RETURN}.get(k.p.com_fltt_low_act, Action.NONE)
+        if k.c.battery_low_remaining_time
+        else Action.NONE
+    ),
+    lambda k: Action.WARN if k.c.battery_unhealthy else Action.NONE,
+    _low_battery,
+    lambda k: (
+        (Action.WARN if k.p.cbrk_flightterm == 121212 else Action.TERMINATE)
+        if k.c.fd_critical_failure
+        else Action.NONE
+    ),
+    lambda k: (
+        {0: Action.WARN, 1: Action.RETURN, 2: Action.LAND}.get(k.p.com_imb_prop_act, Action.NONE)
+        if k.c.fd_imbalanced_prop
+        else Action.NONE
+    ),
+    lambda k: (
+        {1: Action.HOLD, 2: Action.LAND, 3: Action.RETURN, 4: Action.TERMINATE}.get(
+            k.p.com_act_fail_act, Action.WARN
+        )
+        if k.c.fd_motor_failure
+        else Action.NONE
+    ),
+    _unflyable,
+]
+
+_CHAIN = [
+    (Action.FALLBACK_POSITION, Mode.POSITION),
+    (Action.FALLBACK_ALTITUDE, Mode.ALTITUDE),
+    (Action.FALLBACK_STABILIZED, Mode.STABILIZED),
+    (Action.HOLD, Mode.HOLD),
+    (Action.RETURN, Mode.RETURN),
+    (Action.LAND, Mode.LAND),
+    (Action.DESCEND, Mode.DESCEND),
+]
+
+
+def second_opinion(k: Known) -> Action:
+    """What flies at last: the worst that applies, as far down the chain as it must go."""
+    worst = max(rule(k) for rule in RULES)
+    if Action.WARN < worst < Action.DISARM:
+        worst = next(
+            (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), Action.TERMINATE
+        )
+    if k.mode in (Mode.LAND, Mode.RETURN) and worst is Action.RETURN and _flies(k.mode, k.c):
+        return Action.WARN
+    return worst
+
+
+CONDITIONS = st.builds(
+    Conditions,
+    **{
+        name: st.sampled_from([False, False, False, True])
+        for name, default in Conditions()._asdict().items()
+        if isinstance(default, bool)
+    },
+    battery_warning=st.sampled_from(BatteryWarning),
+    geofence=st.sampled_from([FenceBreach(), FenceBreach(), FenceBreach(distance=True)]),
+)
+OPTIONS = st.builds(
+    Settings,
+    com_act_fail_act=st.integers(0, 4),
+    com_fltt_low_act=st.integers(0, 3),
+    com_imb_prop_act=st.integers(-1, 2),
+    com_low_bat_act=st.integers(0, 3),
+    com_obl_rc_act=st.integers(0, 7),
+    com_pos_low_act=st.integers(0, 5),
+    com_posctl_navl=st.integers(0, 1),
+    com_rc_in_mode=st.integers(0, 4),
+    com_rcl_except=st.integers(0, 7),
+    com_wind_max_act=st.integers(0, 5),
+    cbrk_flightterm=st.sampled_from([0, 121212]),
+    gf_action=st.integers(0, 5),
+    nav_dll_act=st.sampled_from([0, 1, 2, 3, 5, 6]),
+    nav_rcl_act=st.sampled_from([1, 2, 3, 5, 6]),
+    com_fail_act_t=st.just(5.0),
+    com_lkdown_tko=st.just(3.0),
+    com_spoolup_time=st.just(1.0),
+)
+
+
+@settings(max_examples=600)
+@given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
+def test_what_flies_in_the_end_is_what_the_rules_say(
+    conditions: Conditions, options: Settings, mode: Mode
+) -> None:
+    machine = Machine(mode, options)
+    machine.step(LONG_ARMED_US)
+    machine.conditions = conditions
+    machine.step()
+    machine.step(6 * S)  # after the wait in Hold
+    assert machine.action() is second_opinion(Known(conditions, options, mode))
+
+
+@given(CONDITIONS, OPTIONS, st.sampled_from(Mode), st.integers(1, 5_900))
+def test_the_wait_only_ever_holds(
+    conditions: Conditions, options: Settings, mode: Mode, later_ms: int
+) -> None:
+    """Until COM_FAIL_ACT_T is over, the vehicle holds, or does at once what ends it."""
+    machine = Machine(mode, options)
+    machine.step(LONG_ARMED_US)
+    machine.conditions = conditions
+    machine.step()
+    machine.step(later_ms * MS)
+    final = second_opinion(Known(conditions, options, mode))
+    assert machine.action() in (final, Action.HOLD)
+    if machine.action() is not final:
+        assert later_ms < 5_000
+        assert _flies(Mode.HOLD, conditions)
+        assert final not in (Action.DISARM, Action.TERMINATE)
+
+
+@given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
+def test_disarmed_nothing_acts_and_nothing_is_said(
+    conditions: Conditions, options: Settings, mode: Mode
+) -> None:
+    machine = Machine(mode, options)
+    machine.armed = False
+    machine.conditions = conditions
+    machine.step()
+    assert machine.action() is Action.NONE
+    assert machine.texts == []
+
+
+@given(CONDITIONS, OPTIONS, st.sampled_from(Mode))
+def test_answers_are_none_for_a_vehicle_that_lacks_nothing(
+    conditions: Conditions, options: Settings, mode: Mode
+) -> None:
+    assert answers(Situation(0, FINE, options, mode)) == []
+    found = answers(Situation(0, conditions, options, mode))
+    assert len({trigger for trigger, _ in found}) == len(found), "one answer a trigger"
