@@ -67,7 +67,8 @@ def test_nothing_else_is_inside(unpacked: Path) -> None:
     (metadata,) = (top for top in tops if top.endswith(".dist-info"))
     assert tops == {"airl_mav", "companion", "firmware_sim", metadata}
     suffixes = {Path(name).suffix for name in files(unpacked) if not name.startswith(metadata)}
-    assert suffixes <= {".py", ".toml", ".j2", ".js", ".md", ".onnx", ".json", ".typed"}
+    known = {".py", ".toml", ".csv", ".xml", ".j2", ".js", ".md", ".onnx", ".json", ".typed"}
+    assert suffixes <= known
 
 
 def test_entry_points_exist(unpacked: Path) -> None:
