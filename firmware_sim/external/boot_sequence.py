@@ -14,6 +14,7 @@ from firmware_sim.external.airframe_check import GROUND_LOSS, differences
 from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -119,8 +120,13 @@ class ExternalFlightStack:
         self.filenos = observer.filenos
         self.receive = observer.receive
         self.send = observer.send
-        self.log_to: Callable[[TlogWriter | None], None] = observer.log_to
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
+
+    def log_to(self, tlog: TlogWriter | None) -> None:
+        """Write the observer's link to a tlog; the firmware's own log of the flight goes beside."""
+        self._observer.log_to(tlog)
+        if tlog is not None:
+            self._launcher.flight_log = tlog.path.with_suffix(ULOG_SUFFIX)
 
     def strangers(self) -> tuple[str, ...]:
         """Return nobody: the firmware has links of its own, into which only it looks."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from airl_mav.core.log_file import PARTIAL_SUFFIX
 from firmware_sim.external.airframe_check import Airframe
 from firmware_sim.external.bridge import Bridge, no_process
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
 
 
 class Launcher:
@@ -43,6 +46,8 @@ class Launcher:
         self._open_bridge = bridge
         self._program, self._folders = program, folders
         self._timeout_s = timeout_s
+        self.flight_log: Path | None = None
+        """Where the log that it writes of this flight goes once it has ended; None = nowhere."""
         self._bridge: Bridge | None = None
         self._child: FirmwareProcess | None = None
 
@@ -95,6 +100,20 @@ class Launcher:
         child, self._child = self._child, None
         if child is not None:
             child.stop()
+            self._keep_flight_log()
+
+    def _keep_flight_log(self) -> None:
+        path, self.flight_log = self.flight_log, None
+        written = None if self._folders is None else self._folders.newest(ULOG_SUFFIX)
+        if path is None or written is None:
+            return
+        partial = path.with_name(path.name + PARTIAL_SUFFIX)
+        try:
+            shutil.copyfile(written, partial)
+            partial.replace(path)
+        except OSError:
+            # A full disk: the flight counts without this log.
+            partial.unlink(missing_ok=True)
 
     def close(self) -> None:
         """End it for good: nothing temporary is left."""

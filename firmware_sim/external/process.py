@@ -82,6 +82,11 @@ class WorkingFolders:
                 self._path.mkdir()
                 return self._path
 
+    def newest(self, suffix: str) -> Path | None:
+        """Return the file with a suffix that was written last in the present folder, if any."""
+        found = self._path.rglob(f"*{suffix}")
+        return max(found, key=lambda path: path.stat().st_mtime_ns, default=None)
+
     def close(self) -> None:
         """Remove what is temporary; harmless when called again."""
         if self._temporary:

@@ -8,8 +8,9 @@ import signal
 import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from pymavlink import mavparm
@@ -26,6 +27,7 @@ from airl_mav.scenario.model import LevelName
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.external.airframe_check import (
+    SITL_OUTPUT,
     Airframe,
     ardupilot_airframe,
     differences,
@@ -33,7 +35,9 @@ from firmware_sim.external.airframe_check import (
 )
 from firmware_sim.external.ardupilot.program import PARAMETERS, Links, find_arducopter
 from firmware_sim.external.ardupilot.program import start as start_arducopter
+from firmware_sim.external.bridge import Bridge
 from firmware_sim.external.heartbeat_modes import flight_of
+from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders
@@ -455,6 +459,39 @@ def test_folders_of_flights_are_new_each_time(tmp_path: Path) -> None:
     assert not folder.exists()
     temporary.close()
     assert not temporary.log.parent.exists()
+
+
+class LoggingFirmware:
+    """A bridge to a program that has connected once its log is there."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def wait_connected(self, _timeout_s: float, _alive: Callable[[], None]) -> None:
+        wait_until(lambda: any(self._folder.rglob("b.ulg")), "its log")
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def test_a_firmwares_own_log_is_kept_when_its_flight_has_ended(tmp_path: Path) -> None:
+    script = (
+        "mkdir -p log/day; echo old > log/a.ulg; sleep 0.02; echo whole > log/day/new;"
+        " mv log/day/new log/day/b.ulg; exec sleep 60"
+    )
+    launcher = Launcher(
+        px4_airframe(quad(), SITL_OUTPUT),
+        lambda: cast(Bridge, LoggingFirmware(tmp_path / "kept")),
+        20.0,
+        program=lambda _: StartCommand(["/bin/sh", "-c", script], {}),
+        folders=WorkingFolders("px4", tmp_path / "kept", None),
+    )
+    launcher.launch()
+    launcher.flight_log = tmp_path / "flight-000.ulg"
+    assert not launcher.flight_log.exists()
+    launcher.close()
+    assert (tmp_path / "flight-000.ulg").read_text() == "whole\n"
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_ardupilot_is_started_with_its_parameters_in_a_file(tmp_path: Path) -> None:
