@@ -11,48 +11,49 @@ from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
-from airl_mav.core.constants import TICK_HZ, TICK_S, US_PER_S
-from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
+from airl_mav.core.constants import TICK_HZ, TICK_S
+from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
     WITH_STICKS,
-    Arming,
     AutopilotState,
-    CommanderStatus,
-    Landed,
     Message,
     Mode,
     Result,
     Setpoint,
     Severity,
 )
-from firmware_sim.autopilot.commander import READINESS, Ask, Event, Flight, Phase, transition
-from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.commander import (
+    READINESS,
+    Ask,
+    Event,
+    Flight,
+    Phase,
+)
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
-from firmware_sim.autopilot.failsafes.conditions import FenceBreach
-from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
+from firmware_sim.autopilot.failsafes.framework import Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.flight_commander import Commanded, FlightCommander
 from firmware_sim.autopilot.guidance import Guidance
+from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
-from firmware_sim.autopilot.modes.interface import here
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
+from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
+from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
-from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
-
-REFUSAL_US = 2 * US_PER_S
-"""A setpoint that was refused within this time explains the loss of offboard [µs]."""
 
 
 class BuiltinAutopilot:
@@ -80,24 +81,21 @@ class BuiltinAutopilot:
         self._land_detector = LandDetector(value)
         self._controller = Controller(Gains.from_parameters(value), TICK_S)
         parameters.on_change(self._parameters_changed)
-        self.flight = Flight()
-        """The commander's state."""
-        self._status = _status(self.flight)
         self._messages: list[Message] = []
-        self._refusal = ("", 0)
-        """Why a setpoint was refused last, and when [µs]."""
         self._demand: AnyDemand | None = None
         """What is being flown; None = the motors are stopped."""
         self._motors = _STILL
-        self.sample: SensorSample | None = None
-        """The newest tick's sensors; None before the first."""
-        self._mag = np.zeros(3)
-        self._pressure_hpa = math.nan
-        self._gps: GpsFix | None = None
-        self._home: Geodetic | None = None
-        self._armed_us = self._takeoff_us = 0
-        self._home_is_chosen = False
-        """Whether a client or a mission has placed home: arming does not move it."""
+        self._newest = NewestSensors()
+        self._home = Home(self.estimator, self._guidance)
+        self._whereabouts = Whereabouts(self.estimator, self._newest, self._home, value)
+        self._commander = FlightCommander(
+            Commanded(
+                self.supervisor, self._guidance, self._navigator, self._auto_disarm, self._home
+            ),
+            self._newest,
+            self._state,
+            self._say,
+        )
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
         """What makes parts fail at a client's word; set by whoever simulates them."""
@@ -115,28 +113,20 @@ class BuiltinAutopilot:
         """Take one tick's sensors and return the motor commands until the next."""
         time_us, supervisor, sensors = sample.time_us, self.supervisor, self.supervisor.sensors
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
-        self.sample, self._snapshot = sample, None
-        if sample.mag is not None:
-            self._mag = sample.mag
-            sensors.mag.take(sample)
-        if sample.pressure_hpa is not None:
-            self._pressure_hpa = sample.pressure_hpa
-            sensors.baro.take(sample)
-        if sample.gps is not None:
-            self._gps = sample.gps
-            sensors.gps.take(sample)
-        if self._home is None and self.estimator.origin is not None:
-            self._set_home()
+        self._snapshot = None
+        self._newest.take(sample)
+        sensors.take(sample)
+        if self._home.place is None:
+            self._home.set_here()
         readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
-            self._handle(readiness)
+            self._commander.handle(readiness)
         idle = self._demand is None
         if time_us >= supervisor.next_us:
-            self._look()
-            self._obey(NO_INTERVENTION)
+            self._commander.look()
         due = self._auto_disarm.event(self.flight, time_us, idle=idle)
         if due is not None:
-            self._handle(due)
+            self._commander.handle(due)
         if time_us >= self._navigator.due_us:
             self._navigate()
         if self._manual_control.was_heard:
@@ -152,46 +142,20 @@ class BuiltinAutopilot:
 
     def _navigate(self) -> None:
         situation, flight = self._situation(), self.flight
-        if situation is None:
-            return
-        navigator, context = self._navigator, self._guidance.context
-        armed = flight.phase >= _GROUND
-        navigator.step(situation, flight.mode, self._fenced_place, armed=armed)
-        context.triplet, context.mission_over = navigator.triplet, navigator.mission_over
-        reports = self.supervisor.watch.reports
-        reports.fence = FenceBreach(*navigator.fence.status.breached)
-        reports.mission_missing = not navigator.mission.valid
-        reports.mission_finished = navigator.mission_over
-
-    def _fenced_place(self) -> Geodetic:
-        """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS."""
-        origin = self.estimator.origin
-        by_gps = self.parameters.value("GF_SOURCE") > 0.0 or origin is None
-        if self._gps is not None and by_gps:
-            return self._gps.position
-        if origin is None:
-            raise RuntimeError("no fix yet: the vehicle is nowhere on the globe")
-        return local_to_geodetic(self._state[P:V], origin)
+        if situation is not None:
+            armed = flight.phase >= _GROUND
+            place = self._whereabouts.fenced_place
+            self._navigator.step(situation, flight.mode, place, armed=armed)
+            self._navigator.tell(self._guidance.context, self.supervisor.watch.reports)
 
     def _return_place(self) -> Place:
         """Return where Return goes: home, or what RTL_TYPE prefers."""
         context, now = self._guidance.context, self._situation()
-        if now is not None:
-            goal = self._navigator.return_to(
-                now.home, local_to_geodetic(self._state[P:V], now.origin)
-            )
-            if goal != now.home:
-                return Place(now.local(goal), context.home_yaw)
-        return Place(context.home, context.home_yaw)
+        home = Place(context.home, context.home_yaw)
+        return home if now is None else self._navigator.return_place(now, home)
 
     def _situation(self) -> Situation | None:
-        """Return what missions go by; None before the first fix."""
-        sample, home, origin = self.sample, self._home, self.estimator.origin
-        if sample is None or home is None or origin is None:
-            return None
-        place = here(self._state)
-        landed = self.flight.phase is not _AIR
-        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin)
+        return self._whereabouts.situation(landed=self.flight.phase is not _AIR)
 
     def _detect_ground(self, time_us: int) -> None:
         phase = self.flight.phase
@@ -200,101 +164,25 @@ class BuiltinAutopilot:
             if self._land_detector.landed(
                 self._state, time_us, control.thrust, descending=control.descending
             ):
-                self._handle(Event.LANDED)
+                self._commander.handle(Event.LANDED)
             elif self._guidance.is_done(self._state):
-                self._handle(Event.MODE_DONE)
+                self._commander.handle(Event.MODE_DONE)
         elif phase is _GROUND and self._land_detector.lifted(self._state, self._controller.thrust):
-            self._handle(Event.LIFTED)
+            self._commander.handle(Event.LIFTED)
 
-    # --- commander
+    # --- texts
 
-    def _handle(self, event: Ask | Event, request: Request | None = None) -> Result:
-        step = transition(self.flight, event)
-        if step.text is not None:
-            self._say(step.text)
-        flown = self.flight.mode
-        asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
-        if asked and step.flight.phase >= _GROUND:
-            # A failsafe may insist, or yield to the user.
-            self._become(step.flight, step.flight.mode)
-            self._obey(Intervention(mode_chosen=True), flown, request)
-        else:
-            self._become(step.flight, flown, request if asked else None)
-        return step.result
-
-    def _become(self, flight: Flight, flown: Mode, request: Request | None = None) -> None:
-        """Take a new state; `flown` is the mode that guidance is in, `request` the user's."""
-        before = self.flight
-        self.flight, self._status = flight, _status(flight)
-        self._snapshot = None
-        if flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
-            self._explain_loss()
-        if self.sample is None:
-            return
-        if flight.mode is not flown or request is not None:
-            self._navigator.due_us = 0
-            self._guidance.enter(flight.mode, self._state, request)
-        if flight.phase is not before.phase:
-            self._note_times(flight.phase)
-            self.supervisor.next_us = 0
-        if before.phase < _GROUND <= flight.phase:
-            self._auto_disarm.armed()
-            if not self._home_is_chosen:
-                self._set_home()
-            self._guidance.enter(flight.mode, self._state)
-
-    def _look(self) -> None:
-        if self.sample is not None:
-            self._say_all(self.supervisor.look(self.sample, self.flight))
-
-    def _obey(
-        self,
-        intervention: Intervention,
-        flown: Mode | None = None,
-        request: Request | None = None,
-    ) -> None:
-        """Do what the failsafes decide; see `_become`."""
-        flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
-        decision = self.supervisor.decide(self._now_us, self.flight, intervention)
-        if decision is None:
-            return
-        if decision.text is not None:
-            self._say(decision.text)
-        flight = decision.flight
-        request = request if flight.mode is asked else None
-        if flight != self.flight or flight.mode is not flown or request is not None:
-            self._become(flight, flown, request)
-        if decision.disarm:
-            self._handle(Event.FAILSAFE_DISARM)
-
-    def _note_times(self, phase: Phase) -> None:
-        """Note when it was armed and took off, and forget both once it is disarmed."""
-        now_us = self._now_us
-        if phase < _GROUND:
-            self._armed_us = self._takeoff_us = 0
-        elif self._armed_us == 0:
-            self._armed_us = now_us
-        if phase is _AIR and self._takeoff_us == 0:
-            self._takeoff_us = now_us
-
-    def _explain_loss(self) -> None:
-        """Say which setpoints were refused lately, if any."""
-        reason, refused_us = self._refusal
-        if reason and self._now_us - refused_us <= REFUSAL_US:
-            self._say(Message(Severity.WARNING, f"Offboard setpoints refused: {reason}"))
+    def _look_anew(self, mode: Mode) -> None:
+        """Look, and act on it, before a client's wish for a mode is answered."""
+        if mode is Mode.MISSION:
+            valid = self._navigator.mission_is_valid(self._situation())
+            self.supervisor.watch.reports.mission_missing = not valid
+        self._commander.look()
 
     def _say(self, message: Message) -> None:
         self._messages.append(message)
         if self.on_message is not None:
             self.on_message(message)
-
-    def _set_home(self) -> None:
-        origin = self.estimator.origin
-        if origin is not None:
-            self._home = local_to_geodetic(self._state[P:V], origin)
-            self._guidance.at_home(self._state)
-            self._guidance.context.home_amsl_m = self._home.altitude_m
-            self._snapshot = None
 
     def _parameters_changed(self) -> None:
         self._controller.set_gains(Gains.from_parameters(self.parameters.value))
@@ -304,6 +192,16 @@ class BuiltinAutopilot:
     def _say_all(self, messages: Sequence[Message]) -> None:
         for message in messages:
             self._say(message)
+
+    @property
+    def flight(self) -> Flight:
+        """The commander's state."""
+        return self._commander.flight
+
+    @property
+    def sample(self) -> SensorSample | None:
+        """The newest tick's sensors; None before the first."""
+        return self._newest.sample
 
     @property
     def _now_us(self) -> int:
@@ -340,36 +238,24 @@ class BuiltinAutopilot:
         """Ask to arm. PX4 runs its checks although a client asks by force, and so do we."""
         del force
         if self.sample is None or self.flight.phase >= _GROUND:
-            return self._handle(Event.ARM)
-        if self.flight.mode is Mode.MISSION:
-            valid = self._navigator.mission_is_valid(self._situation())
-            self.supervisor.watch.reports.mission_missing = not valid
-        self._look()
-        self._obey(NO_INTERVENTION)
+            return self._commander.handle(Event.ARM)
+        self._look_anew(self.flight.mode)
         refusals = self.supervisor.refusals(self.sample, self.flight)
         self._say_all(refusals)
-        return self._handle(Event.ARM_UNREADY if refusals else Event.ARM)
+        return self._commander.handle(Event.ARM_UNREADY if refusals else Event.ARM)
 
     def terminate(self) -> Result:
         """Ask to stop the motors for good (MAV_CMD_DO_FLIGHTTERMINATION)."""
-        return self._handle(Ask(Mode.TERMINATION))
+        return self._commander.handle(Ask(Mode.TERMINATION))
 
     def disarm(self, *, force: bool) -> Result:
         """Ask to disarm; force = kill, also in the air."""
-        return self._handle(Event.KILL if force else Event.DISARM)
+        return self._commander.handle(Event.KILL if force else Event.DISARM)
 
     def takeoff(self, altitude_m: float | None) -> Result:
         """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
-        context, height = self._guidance.context, self._guidance.context.height(self._state)
-        if altitude_m is None:
-            default = self.parameters["MIS_TAKEOFF_ALT"]
-            self._say(Message(Severity.INFO, f"Using default takeoff altitude: {default:.1f} m"))
-            # In flight, PX4 climbs from where the vehicle is.
-            altitude_m = default + (height if self.flight.phase is _AIR else 0.0)
-        if altitude_m < (height if self.flight.phase is _AIR else 0.0):
-            self._say(Message(Severity.CRITICAL, "Already higher than takeoff altitude"))
-            altitude_m = height if self.flight.phase is _AIR else 0.0
-        context.takeoff_altitude_m = altitude_m
+        flying = self.flight.phase is _AIR
+        self._guidance.take_off_to(altitude_m, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
 
     def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
@@ -379,15 +265,11 @@ class BuiltinAutopilot:
         return self._ask(mode, request)
 
     def _ask(self, mode: Mode, request: Request | None = None) -> Result:
-        if mode is Mode.MISSION:
-            valid = self._navigator.mission_is_valid(self._situation())
-            self.supervisor.watch.reports.mission_missing = not valid
-        self._look()
-        self._obey(NO_INTERVENTION)
+        self._look_anew(mode)
         available = self.supervisor.available(mode)
         if mode in WITH_STICKS:
             available = available and self._manual_control.sticks(self._now_us) is not None
-        return self._handle(Ask(mode, available), request)
+        return self._commander.handle(Ask(mode, available), request)
 
     def change_speed(self, speed_m_s: float) -> None:
         """Set the horizontal speed of the present automatic mode [m/s]."""
@@ -395,11 +277,7 @@ class BuiltinAutopilot:
 
     def set_home_here(self) -> Result:
         """Make the present position home."""
-        if self.estimator.origin is None:
-            return Result.TEMPORARILY_REJECTED
-        self._set_home()
-        self._home_is_chosen = False
-        return Result.ACCEPTED
+        return self.set_home(None)
 
     def start_mission(self, index: int) -> Result:
         """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
@@ -408,7 +286,7 @@ class BuiltinAutopilot:
             return Result.DENIED
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
-        self._handle(Ask(Mode.MISSION))
+        self._commander.handle(Ask(Mode.MISSION))
         if self.flight.phase < _GROUND and self.arm(force=False) is not Result.ACCEPTED:
             return Result.TEMPORARILY_REJECTED
         if index >= 0:
@@ -423,15 +301,9 @@ class BuiltinAutopilot:
 
     def set_home(self, place: Geodetic | None) -> Result:
         """Move home; None = to the present place."""
-        origin = self.estimator.origin
-        if place is None or origin is None:
-            return self.set_home_here()
-        self._home, self._home_is_chosen = place, True
-        north, east, down = geodetic_to_local(place, origin).tolist()
-        self._guidance.context.home = north, east, down
-        self._guidance.context.home_amsl_m = place.altitude_m
+        done = self._home.set_here() if place is None else self._home.set_to(place)
         self._snapshot = None
-        return Result.ACCEPTED
+        return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
 
     def look_at(self, place: Geodetic | None) -> None:
         """Turn to a place while a mission is flown; None = to none."""
@@ -460,7 +332,7 @@ class BuiltinAutopilot:
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         """Note why an offboard setpoint was refused: the failsafe that follows names it."""
-        self._refusal = reason, time_us
+        self._commander.refusal = reason, time_us
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         """Hand over the pilot's sticks, received at `time_us` of simulated time."""
@@ -470,10 +342,10 @@ class BuiltinAutopilot:
         bit = 2 if flown is Mode.OFFBOARD else 1
         takes_over = moved and override & bit and flown not in WITH_STICKS
         if takes_over and self.flight.failsafe:
-            self._obey(Intervention(sticks_moved=True))
+            self._commander.obey(Intervention(sticks_moved=True))
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
-            self._handle(Ask(Mode.POSITION))
+            self._commander.handle(Ask(Mode.POSITION))
             self._say(Message(Severity.INFO, "Pilot took over using sticks"))
 
     def follow(self, target: FollowedTarget) -> None:
@@ -486,7 +358,8 @@ class BuiltinAutopilot:
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick. Raises RuntimeError before the first."""
-        if self._snapshot is not None:
+        status = self._commander.status
+        if self._snapshot is not None and self._snapshot.status is status:
             return self._snapshot
         sample, demand = self.sample, self._demand
         if sample is None:
@@ -501,7 +374,7 @@ class BuiltinAutopilot:
         self._snapshot = AutopilotState(
             time_us=sample.time_us,
             estimate=estimate,
-            status=self._status,
+            status=status,
             setpoint=setpoint,
             attitude_setpoint=attitude,
             rate_setpoint=rates,
@@ -509,30 +382,17 @@ class BuiltinAutopilot:
             motors=self._motors,
             accel=sample.accel,
             gyro=sample.gyro,
-            mag=self._mag,
-            pressure_hpa=self._pressure_hpa,
+            mag=self._newest.mag,
+            pressure_hpa=self._newest.pressure_hpa,
             temperature_c=sample.temperature_c,
             battery=sample.battery,
-            gps=self._gps,
-            home=self._home,
+            gps=self._newest.gps,
+            home=self._home.place,
             origin=self.estimator.origin,
             orbit=self._guidance.context.orbit if self.flight.mode is Mode.ORBIT else None,
-            armed_us=self._armed_us,
-            takeoff_us=self._takeoff_us,
+            armed_us=self._commander.armed_us,
+            takeoff_us=self._commander.takeoff_us,
             mission=progress(self.plans),
             fence=self._navigator.fence.status,
         )
         return self._snapshot
-
-
-def _status(flight: Flight) -> CommanderStatus:
-    arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
-    if flight.phase is not Phase.AIR:
-        landed = Landed.ON_GROUND
-    elif flight.mode is Mode.TAKEOFF:
-        landed = Landed.TAKEOFF
-    elif flight.mode is Mode.LAND:
-        landed = Landed.LANDING
-    else:
-        landed = Landed.IN_AIR
-    return CommanderStatus(arming, flight.mode, flight.intended, landed, flight.failsafe)

@@ -11,7 +11,16 @@ from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, auto
 from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import MODE_NAMES, Message, Mode, Result, Severity
+from firmware_sim.autopilot.autopilot_state import (
+    MODE_NAMES,
+    Arming,
+    CommanderStatus,
+    Landed,
+    Message,
+    Mode,
+    Result,
+    Severity,
+)
 
 
 class Phase(IntEnum):
@@ -218,3 +227,17 @@ def transition(flight: Flight, event: Ask | Event) -> Step:
         mode = flight.after_disarm
         moved = replace(moved, mode=mode, intended=mode, failsafe=False)
     return Step(moved, row.result, row.text)
+
+
+def status_of(flight: Flight) -> CommanderStatus:
+    """Return what is reported of a state."""
+    arming = (Arming.BOOT, Arming.STANDBY, Arming.ARMED, Arming.ARMED)[flight.phase]
+    if flight.phase is not Phase.AIR:
+        landed = Landed.ON_GROUND
+    elif flight.mode is Mode.TAKEOFF:
+        landed = Landed.TAKEOFF
+    elif flight.mode is Mode.LAND:
+        landed = Landed.LANDING
+    else:
+        landed = Landed.IN_AIR
+    return CommanderStatus(arming, flight.mode, flight.intended, landed, flight.failsafe)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.autopilot_state import Message, Mode
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.modes import MODES
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
@@ -51,6 +51,23 @@ class Guidance:
         """Make the present position home: the ground under the vehicle at arming."""
         self.context.home, self.context.home_yaw = here(state)
         self._spool_since_us = None
+
+    def take_off_to(self, altitude_m: float | None, state: Vector, *, flying: bool) -> None:
+        """Set the height above home that the next take-off climbs to [m].
+
+        None = MIS_TAKEOFF_ALT; in flight, PX4 climbs that much from where the vehicle is.
+        """
+        context = self.context
+        height = context.height(state) if flying else 0.0
+        if altitude_m is None:
+            default = context.value("MIS_TAKEOFF_ALT")
+            text = f"Using default takeoff altitude: {default:.1f} m"
+            context.say(Message(Severity.INFO, text))
+            altitude_m = default + height
+        if altitude_m < height:
+            context.say(Message(Severity.CRITICAL, "Already higher than takeoff altitude"))
+            altitude_m = height
+        context.takeoff_altitude_m = altitude_m
 
     def is_done(self, state: Vector) -> bool:
         """Return whether the present mode has reached its end."""

@@ -111,6 +111,15 @@ class SensorMonitor:
         self.distrusted = False
         """Whether a sensor repeats itself, so that `trusted` leaves something out."""
 
+    def take(self, sample: SensorSample) -> None:
+        """Take a tick's sample: which of the slower sensors have measured."""
+        if sample.mag is not None:
+            self.mag.take(sample)
+        if sample.pressure_hpa is not None:
+            self.baro.take(sample)
+        if sample.gps is not None:
+            self.gps.take(sample)
+
     def judge(self, sample: SensorSample, *, flying: bool) -> list[Message]:
         """Look at the inertial sensors too, and return what has failed since the last call."""
         now_us = sample.time_us

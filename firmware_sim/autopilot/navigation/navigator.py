@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from airl_mav.core.frames import Geodetic
+import numpy as np
+
+from airl_mav.core.frames import Geodetic, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.failsafes.conditions import FenceBreach
+from firmware_sim.autopilot.failsafes.watch import Reports
+from firmware_sim.autopilot.modes.interface import FlightContext
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
 from firmware_sim.autopilot.navigation.fence_monitor import FenceMonitor
@@ -13,6 +18,7 @@ from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.rally import destination
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
+from firmware_sim.autopilot.requests import Place
 
 
 class Navigator:
@@ -45,9 +51,18 @@ class Navigator:
             self.mission.review(situation)
         return self.mission.valid
 
-    def return_to(self, home: Geodetic, here: Geodetic) -> Geodetic:
-        """Return where Return goes from here; its altitude is the ground's."""
-        return destination(self._plans, home, here, round(self._value("RTL_TYPE")))
+    def return_place(self, situation: Situation, home: Place) -> Place:
+        """Return where Return goes: home, or what RTL_TYPE prefers; its height is the ground's."""
+        here = local_to_geodetic(np.array(situation.position), situation.origin)
+        goal = destination(self._plans, situation.home, here, round(self._value("RTL_TYPE")))
+        return home if goal == situation.home else Place(situation.local(goal), home.yaw)
+
+    def tell(self, context: FlightContext, reports: Reports) -> None:
+        """Tell the modes what to fly, and the failsafes what is wrong."""
+        context.triplet, context.mission_over = self.triplet, self.mission_over
+        reports.fence = FenceBreach(*self.fence.status.breached)
+        reports.mission_missing = not self.mission.valid
+        reports.mission_finished = self.mission_over
 
     def step(
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool

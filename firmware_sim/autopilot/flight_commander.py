@@ -1,0 +1,145 @@
+"""The commander at work: what its table, the user and the failsafes decide is carried out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.auto_disarm import AutoDisarm
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.commander import Ask, Event, Flight, Phase, status_of, transition
+from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
+from firmware_sim.autopilot.failsafes.supervisor import Supervisor
+from firmware_sim.autopilot.guidance import Guidance
+from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.navigation.navigator import Navigator
+from firmware_sim.autopilot.newest_sensors import NewestSensors
+from firmware_sim.autopilot.requests import Request
+
+_GROUND, _AIR = Phase.GROUND, Phase.AIR
+
+REFUSAL_US = 2 * US_PER_S
+"""A setpoint that was refused within this time explains the loss of offboard [µs]."""
+
+
+class Commanded(NamedTuple):
+    """Who carries out what the commander decides."""
+
+    supervisor: Supervisor
+    guidance: Guidance
+    navigator: Navigator
+    auto_disarm: AutoDisarm
+    home: Home
+
+
+class FlightCommander:
+    """Holds the commander's state, and moves it by events."""
+
+    def __init__(
+        self,
+        commanded: Commanded,
+        newest: NewestSensors,
+        state: Vector,
+        say: Callable[[Message], None],
+    ) -> None:
+        """Boot.
+
+        Args:
+            commanded: Who carries out what is decided.
+            newest: Tells the time.
+            state: The estimator's nominal state (`error_state`), updated in place.
+            say: Tells the operators something.
+        """
+        self._commanded, self._newest, self._state, self._say = commanded, newest, state, say
+        self.flight = Flight()
+        self.status = status_of(self.flight)
+        """What is reported of `flight`; made anew with every change."""
+        self.refusal = ("", 0)
+        """Why an offboard setpoint was refused last, and when [µs]."""
+        self.armed_us = self.takeoff_us = 0
+        """When it was armed and took off; 0 while it is disarmed."""
+
+    @property
+    def _now_us(self) -> int:
+        sample = self._newest.sample
+        return 0 if sample is None else sample.time_us
+
+    def look(self) -> None:
+        """Let the failsafes look, and do what they decide."""
+        sample = self._newest.sample
+        if sample is not None:
+            for text in self._commanded.supervisor.look(sample, self.flight):
+                self._say(text)
+        self.obey(NO_INTERVENTION)
+
+    def handle(self, event: Ask | Event, request: Request | None = None) -> Result:
+        """Carry out an event; `request` is what a user wants beyond a mode's name."""
+        step = transition(self.flight, event)
+        if step.text is not None:
+            self._say(step.text)
+        flown = self.flight.mode
+        asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
+        if asked and step.flight.phase >= _GROUND:
+            # A failsafe may insist, or yield to the user.
+            self._become(step.flight, step.flight.mode)
+            self.obey(Intervention(mode_chosen=True), flown, request)
+        else:
+            self._become(step.flight, flown, request if asked else None)
+        return step.result
+
+    def _become(self, flight: Flight, flown: Mode, request: Request | None = None) -> None:
+        """Take a new state; `flown` is the mode that guidance is in, `request` the user's."""
+        before = self.flight
+        self.flight, self.status = flight, status_of(flight)
+        if flight.failsafe and before.mode is Mode.OFFBOARD and not before.failsafe:
+            self._explain_loss()
+        if self._newest.sample is None:
+            return
+        if flight.mode is not flown or request is not None:
+            self._commanded.navigator.due_us = 0
+            self._commanded.guidance.enter(flight.mode, self._state, request)
+        if flight.phase is not before.phase:
+            self._note_times(flight.phase)
+            self._commanded.supervisor.next_us = 0
+        if before.phase < _GROUND <= flight.phase:
+            self._commanded.auto_disarm.armed()
+            self._commanded.home.armed()
+            self._commanded.guidance.enter(flight.mode, self._state)
+
+    def obey(
+        self,
+        intervention: Intervention,
+        flown: Mode | None = None,
+        request: Request | None = None,
+    ) -> None:
+        """Do what the failsafes decide; see `_become`."""
+        flown, asked = self.flight.mode if flown is None else flown, self.flight.mode
+        decision = self._commanded.supervisor.decide(self._now_us, self.flight, intervention)
+        if decision is None:
+            return
+        if decision.text is not None:
+            self._say(decision.text)
+        flight = decision.flight
+        request = request if flight.mode is asked else None
+        if flight != self.flight or flight.mode is not flown or request is not None:
+            self._become(flight, flown, request)
+        if decision.disarm:
+            self.handle(Event.FAILSAFE_DISARM)
+
+    def _note_times(self, phase: Phase) -> None:
+        """Note when it was armed and took off, and forget both once it is disarmed."""
+        now_us = self._now_us
+        if phase < _GROUND:
+            self.armed_us = self.takeoff_us = 0
+        elif self.armed_us == 0:
+            self.armed_us = now_us
+        if phase is _AIR and self.takeoff_us == 0:
+            self.takeoff_us = now_us
+
+    def _explain_loss(self) -> None:
+        """Say which setpoints were refused lately, if any."""
+        reason, refused_us = self.refusal
+        if reason and self._now_us - refused_us <= REFUSAL_US:
+            self._say(Message(Severity.WARNING, f"Offboard setpoints refused: {reason}"))

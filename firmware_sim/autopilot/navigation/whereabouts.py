@@ -1,0 +1,48 @@
+"""Where the vehicle is, as missions, the geofence and Return ask for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from airl_mav.core.frames import Geodetic, local_to_geodetic
+from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.modes.interface import here
+from firmware_sim.autopilot.navigation.flown_item import Situation
+from firmware_sim.autopilot.newest_sensors import NewestSensors
+
+
+class Whereabouts:
+    """Puts together what the estimator, the sensors and home know."""
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        sensors: NewestSensors,
+        home: Home,
+        value: Callable[[str], float],
+    ) -> None:
+        """Take what knows it, and a lookup of PX4 parameter names."""
+        self._estimator, self._sensors, self._home = estimator, sensors, home
+        self._value = value
+
+    def situation(self, *, landed: bool) -> Situation | None:
+        """Return what missions go by; None before the first fix."""
+        sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
+        if sample is None or home is None or origin is None:
+            return None
+        place = here(self._estimator.state)
+        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin)
+
+    def fenced_place(self) -> Geodetic:
+        """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS.
+
+        Raises RuntimeError before the first fix.
+        """
+        origin, gps = self._estimator.origin, self._sensors.gps
+        if gps is not None and (self._value("GF_SOURCE") > 0.0 or origin is None):
+            return gps.position
+        if origin is None:
+            raise RuntimeError("no fix yet: the vehicle is nowhere on the globe")
+        return local_to_geodetic(self._estimator.state[P:V], origin)
