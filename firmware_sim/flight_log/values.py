@@ -13,13 +13,21 @@ from firmware_sim.flight_log.ulog import Values
 from firmware_sim.interfaces import SensorSample, Truth
 
 NAVIGATION_STATES: dict[Mode, int] = {
+    Mode.MANUAL: 0,
+    Mode.ALTITUDE: 1,
     Mode.POSITION: 2,
     Mode.MISSION: 3,
     Mode.HOLD: 4,
     Mode.RETURN: 5,
+    Mode.ACRO: 10,
+    Mode.DESCEND: 12,
+    Mode.TERMINATION: 13,
     Mode.OFFBOARD: 14,
+    Mode.STABILIZED: 15,
     Mode.TAKEOFF: 17,
     Mode.LAND: 18,
+    Mode.FOLLOW: 19,
+    Mode.ORBIT: 21,
 }
 """VehicleStatus.nav_state (NAVIGATION_STATE_*) of each mode."""
 
