@@ -65,7 +65,7 @@ def build_firmware(
     log: Path | None = None,
     recording: bool = True,
     parameters_file: Path | None = None,
-    devices: Sequence[LinkConfig] = (),
+    bind_devices: Callable[[], Sequence[LinkConfig]] = tuple,
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
@@ -81,7 +81,7 @@ def build_firmware(
         parameters_file: Where the built-in autopilot keeps the parameters that users set; None: it
             forgets them.
         recording: Whether episodes are recorded, to be saved; without, they may last for ever.
-        devices: More links of the built-in flight controller.
+        bind_devices: Binds more links of the built-in flight controller, after the others.
 
     Raises:
         UsageError: A port is taken, an address unusable, or real firmware is not there.
@@ -106,6 +106,12 @@ def build_firmware(
         links = ends()
         if link_fails(aircraft.faults):
             failing = FailingEndpoint(links.api, pacing.clock)
+        try:
+            devices = bind_devices()
+        except UsageError:
+            links.api.close()
+            links.gcs.close()
+            raise
         server = udp_server(
             links, unix_us(), pacing.clock, signing, onboard=failing, devices=devices
         )

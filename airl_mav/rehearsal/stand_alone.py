@@ -55,16 +55,13 @@ def fly_vehicle(
     listener = listener or Listener()
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
-    devices: list[LinkConfig] = []
-    if asked.firmware == "builtin":
+    ports: list[str] = []
+
+    def bind_devices() -> list[LinkConfig]:
         insecure = asked.insecure or asked.signing_key is not None
-        devices = bind_device_links(
-            asked.bind,
-            asked.companion_host,
-            asked.real.instance,
-            insecure=insecure,
-            say=listener.say,
-        )
+        host, instance = asked.companion_host, asked.real.instance
+        return bind_device_links(asked.bind, host, instance, insecure=insecure, say=ports.append)
+
     firmware = build_firmware(
         asked,
         vehicle,
@@ -77,7 +74,7 @@ def fly_vehicle(
         # It may fly for days, and nobody collects what would be recorded.
         recording=False,
         parameters_file=asked.parameters_file,
-        devices=devices,
+        bind_devices=bind_devices,
     )
     with closing(firmware):
         firmware.on_message = listener.text
@@ -87,6 +84,8 @@ def fly_vehicle(
             listener.waiting(hint)
         firmware.load(episode, asked.tlog, unix_us())
         listener.ready(firmware.camera_endpoint, goal)
+        for line in ports:
+            listener.say(line)
         fly(firmware, stop, asked.duration, listener.say)
 
 

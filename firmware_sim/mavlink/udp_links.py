@@ -100,6 +100,10 @@ def bind_device_links(
         except PortTakenError:
             say(f"UDP port {local} is taken: no {link.__name__.replace('_', ' ')}")
             continue
+        except Exception:
+            for bound in links:
+                bound.endpoint.close()
+            raise
         links.append(link(end))
         say(f"{links[-1].name:<17} UDP port {remote} (from {local})")
     return links
