@@ -150,7 +150,7 @@ def test_one_episode_after_the_other(flight: Flight, peer: HitlPeer) -> None:
 def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
     flight: Flight, peer: HitlPeer
 ) -> None:
-    peer.parameters = partial(Parameters, quad().parameters)  # no CA_ROTOR among them
+    peer.parameters = partial(Parameters, quad().parameters)  # no HIL_ACT_FUNC among them
     stack = ExternalFlightStack(flight.launcher, flight.observer, 2.0)
     flight.simulation.close()
     firmware = stack.boot(SETUP)
@@ -161,5 +161,5 @@ def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
         simulation.tick()
         return simulation.time_us
 
-    with pytest.raises(FirmwareMissingError, match=r"the parameters .*CA_AIRFRAME"):
+    with pytest.raises(FirmwareMissingError, match=r"the parameters .*HIL_ACT_FUNC1"):
         stack.connect(tick)

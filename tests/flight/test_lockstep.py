@@ -36,6 +36,7 @@ from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import BodyVelocity
 from companion.mission import fly_mission
+from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit
 from tests.support.lockstep_kit import BEGINS, SEED, demo_scenario
@@ -301,7 +302,7 @@ def test_offboard_loss_comes_one_second_after_the_last_setpoint() -> None:
         assert simulation.recorder is not None
         last_us = int(simulation.recorder.setpoints.arrays()["accepted_us"][-1])
     assert len(told) == 1
-    assert US_PER_S < told[0] - last_us <= US_PER_S + 2 * TICK_US
+    assert US_PER_S < told[0] - last_us <= US_PER_S + LOOK_US + 2 * TICK_US
 
 
 # --- what goes wrong

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -191,6 +192,25 @@ def test_offboard_flight(tmp_path: Path) -> None:
         assert math.dist(c.gps(), (10.0, -3.0)) < 1.5
 
 
+@contextmanager
+def pilot(sticks: ManualControl) -> Iterator[Callable[[float], None]]:
+    """Hold the sticks, and yield what moves the pitch stick; a pilot who lets go is a lost link."""
+    pitch, over = [0.0], threading.Event()
+
+    def hold() -> None:
+        while not over.wait(0.02):
+            sticks.set_manual_control_input(pitch[0], 0.0, 0.5, 0.0)
+
+    sticks.set_manual_control_input(0.0, 0.0, 0.5, 0.0)
+    holder = threading.Thread(target=hold)
+    holder.start()
+    try:
+        yield lambda value: pitch.__setitem__(0, value)
+    finally:
+        over.set()
+        holder.join()
+
+
 def test_going_places_with_every_plugin(tmp_path: Path) -> None:
     """The part of the long walk over a real PX4 that goes places: same calls, same outcomes."""
     with client(tmp_path) as c:
@@ -241,19 +261,6 @@ def test_going_places_with_every_plugin(tmp_path: Path) -> None:
         c.until(lambda: math.hypot(*c.velocity()) < 0.3, "a stand")
         offboard.stop()
 
-        sticks: ManualControl = c.plugin(ManualControl)
-        sticks.set_manual_control_input(0.0, 0.0, 0.5, 0.0)
-        sticks.start_position_control()
-        mode(FlightMode.POSCTL)
-
-        def pulled() -> bool:
-            sticks.set_manual_control_input(-0.6, 0.0, 0.5, 0.0)
-            return c.velocity()[0] < -0.5
-
-        c.until(pulled, "backwards")
-        action.hold()
-        mode(FlightMode.HOLD)
-
         follow: FollowMe = c.plugin(FollowMe)
         target = TargetLocation(*at(14.0, 0.0), home.absolute_altitude_m, 0.0, 0.0, 0.0)
         assert failure(lambda: follow.set_target_location(target)) == "NOT_ACTIVE"
@@ -261,8 +268,15 @@ def test_going_places_with_every_plugin(tmp_path: Path) -> None:
         mode(FlightMode.FOLLOW_ME)
         follow.stop()
         mode(FlightMode.HOLD)
-        action.return_to_launch()
-        mode(FlightMode.RETURN_TO_LAUNCH)
+
+        sticks: ManualControl = c.plugin(ManualControl)
+        with pilot(sticks) as pull:
+            sticks.start_position_control()
+            mode(FlightMode.POSCTL)
+            pull(-0.6)
+            c.until(lambda: c.velocity()[0] < -0.5, "backwards")
+            action.return_to_launch()
+            mode(FlightMode.RETURN_TO_LAUNCH)
 
 
 def test_refusals_in_the_air_and_hold(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -110,8 +110,15 @@ class FakeChild:
 
     stage: Stage
 
-    def __init__(self, name: str, *arguments: Any, keeps: Sequence[int]) -> None:
+    def __init__(
+        self,
+        name: str,
+        *arguments: Any,
+        keeps: Sequence[int],
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
         assert keeps == (7,)
+        assert (name == COMPANION) == bool(environment)
         self.name, self.ending, self.stopped, self.log = name, False, 0, Path(f"{name}.log")
         self.requests: list[Any] = []
         stage = self.stage

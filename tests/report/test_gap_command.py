@@ -544,7 +544,7 @@ def test_a_missing_mitigated_policy_is_one_clear_line() -> None:
     assert gap_experiment._mitigated("none") is None
 
 
-def _unknown(name: str) -> PolicyInfo:
+def _unknown(name: str, **_: object) -> PolicyInfo:
     raise UsageError(f"--policy {name!r}: no such policy; known: greedy")
 
 

@@ -11,7 +11,10 @@ from airl_mav.core.clock import SimClock, WallClock
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(
-    p for top in ("airl_mav", "firmware_sim", "companion") for p in (ROOT / top).rglob("*.py")
+    p
+    for top in ("airl_mav", "firmware_sim", "companion")
+    for p in (ROOT / top).rglob("*.py")
+    if "__pycache__" not in p.parts  # what is generated there is pymavlink's
 )
 CLOCK = ROOT / "airl_mav" / "core" / "clock.py"
 CLOCK_CALLS = {"os.times", "asyncio.sleep", "loop.time", "datetime.now", "date.today"}
