@@ -15,6 +15,10 @@ comma := ,
 # environment, says which of them.
 INTERPRETER := $(shell PYTHON='$(PYTHON)' scripts/find-python)
 
+# Containers often set it: every process would then compile every module that it imports, of the
+# installed packages too, where one process could have kept what it compiled.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 
 .PHONY: help
