@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from airl_mav.arena.footprints import Floats, bounding_boxes, outside_all
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
@@ -71,7 +71,7 @@ def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: 
         rows = _window(north, boxes.center[i, 0], reach[0])
         columns = _window(east, boxes.center[i, 1], reach[1])
         free[rows, columns] &= _distance(obstacles, i, north[rows], east[columns]) > margin
-    label, _ = ndimage.label(free)
+    label, _ = scipy.ndimage.label(free)
     start = label[-south, -west]
     end = label[round(float(goal[0]) / cell) - south, round(float(goal[1]) / cell) - west]
     return bool(start != 0 and start == end)

@@ -13,9 +13,8 @@ from contextlib import suppress
 from functools import cache
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import brentq
 
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import UsageError
@@ -97,7 +96,8 @@ class Braking(ProfileModel):
         top = self.fastest_m_s
         if self.stopping_m(top, reaction_s) <= room_m:
             return top
-        return float(brentq(lambda v: self.stopping_m(v, reaction_s) - room_m, 0.0, top))
+        found = scipy.optimize.brentq(lambda v: self.stopping_m(v, reaction_s) - room_m, 0.0, top)
+        return float(found)
 
     def distance_from_m(self, speed_m_s: float) -> float:
         """Return the way from a true speed to a stand [m]; beyond what was flown, as v² has it."""
@@ -106,11 +106,13 @@ class Braking(ProfileModel):
         return float(np.interp(speed_m_s, flown, distance)) * beyond
 
     @property
-    def _curves(self) -> tuple[PchipInterpolator, PchipInterpolator]:
+    def _curves(
+        self,
+    ) -> tuple[scipy.interpolate.PchipInterpolator, scipy.interpolate.PchipInterpolator]:
         at = np.array([0.0, *self.commanded_m_s])
         return (
-            PchipInterpolator(at, [0.0, *self.flown_m_s]),
-            PchipInterpolator(at, [0.0, *self.distance_m]),
+            scipy.interpolate.PchipInterpolator(at, [0.0, *self.flown_m_s]),
+            scipy.interpolate.PchipInterpolator(at, [0.0, *self.distance_m]),
         )
 
 

@@ -12,7 +12,6 @@ from airl_mav.flight.statistics import Aggregate, aggregate
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo, load
-from airl_mav.report.run_report import write_report
 
 
 @dataclass(frozen=True)
@@ -79,6 +78,9 @@ class Run:
         Raises:
             UsageError: No episode was finished, or a profile of the run cannot be found any more.
         """
+        # Here: matplotlib is half a second that a run without a page need not wait for.
+        from airl_mav.report.run_report import write_report
+
         return write_report(self.path)
 
 

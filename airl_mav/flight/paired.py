@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, stats
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
@@ -150,14 +150,14 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     if n == 0:
         return NO_ESTIMATE
     value = (gained - lost) / n
-    z = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
+    z = float(scipy.stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
 
     def end(limit: float) -> float:
         # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
         if value == limit:
             return limit
         low, high = sorted((value, limit))
-        found = optimize.brentq(
+        found = scipy.optimize.brentq(
             lambda difference: _score(difference, gained, lost, n) + limit * z,
             low,
             high,
@@ -209,7 +209,7 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
         return Estimate(value, None, None, 1)
     if np.ptp(second / first) <= SAME_RATIO:
         return Estimate(value, value, value, n)
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         (first, second),
         _percent,
         paired=True,

@@ -15,7 +15,7 @@ from enum import Enum
 from functools import cache
 
 import numpy as np
-from scipy import stats
+import scipy
 
 ALPHA = 0.05
 """Greatest probability of a false verdict over all looks: half of it for "meets" where the rate is
@@ -87,7 +87,7 @@ def plan_looks(
     error_few = error_many = 0.0
     for flights in looks:
         step = flights - before
-        new = stats.binom.pmf(np.arange(step + 1), step, 1.0 - threshold)
+        new = scipy.stats.binom.pmf(np.arange(step + 1), step, 1.0 - threshold)
         undecided, before = np.convolve(undecided, new), flights
         left_few = spent(flights) - error_few
         left_many = spent(flights) - error_many

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
@@ -86,7 +86,7 @@ def wilson(successes: int, n: int) -> Estimate:
     """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927)."""
     if n == 0:
         return NO_ESTIMATE
-    interval = stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
+    interval = scipy.stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
     return Estimate(successes / n, float(interval.low), float(interval.high), n)
 
 
@@ -103,7 +103,7 @@ def bootstrap_mean(values: ArrayLike) -> Estimate:
         return Estimate(mean, None, None, 1)
     if np.ptp(data) == 0.0:
         return Estimate(mean, mean, mean, data.size)
-    interval = stats.bootstrap(
+    interval = scipy.stats.bootstrap(
         (data,),
         np.mean,
         confidence_level=CONFIDENCE,
@@ -126,7 +126,7 @@ def median_of(values: ArrayLike) -> Estimate:
     if not n:
         return NO_ESTIMATE
     # The greatest number of values that may be left out on either side.
-    out = int(stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1
+    out = int(scipy.stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1
     middle = float(np.median(data))
     if out < 0:
         return Estimate(middle, None, None, n)

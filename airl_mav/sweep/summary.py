@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from pydantic import TypeAdapter
-from scipy import stats
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import write_json
@@ -142,7 +142,8 @@ def over_seeds(results: Sequence[TrialResult]) -> Estimate:
     assert flights.low is not None and flights.high is not None  # noqa: S101 (n > 0)
     mean, low, high = float(rates.mean()), flights.low, flights.high
     if rates.size > 1:
-        reach = float(stats.t.ppf((1.0 + CONFIDENCE) / 2.0, rates.size - 1) * stats.sem(rates))
+        quantile = scipy.stats.t.ppf((1.0 + CONFIDENCE) / 2.0, rates.size - 1)
+        reach = float(quantile * scipy.stats.sem(rates))
         low, high = min(low, max(mean - reach, 0.0)), max(high, min(mean + reach, 1.0))
     return Estimate(mean, low, high, rates.size)
 
