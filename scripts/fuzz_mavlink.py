@@ -3,33 +3,39 @@
     python scripts/fuzz_mavlink.py --frames 10000000
 
 Flies the built-in flight controller, one short flight after the other, while both links are fed as
-much as a client may send. Every message that a service reads is drawn, with values from the ends of
-their types, and with commands, parameters and addressees that exist. It ends at the first exception
-or motor command that is no number in 0..1, and names the flight, which `--first` flies again.
+much as a client may send, and logs are written. Every message that a service reads is drawn, with
+values from the ends of their types, and with commands, parameters, files, shell words and
+addressees that exist. It ends at the first exception or motor command that is no number in 0..1,
+and names the flight, which `--first` flies again.
 """
 
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator
+import struct
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import tyro
 
-from airl_mav.core.clock import SimClock, WallClock
+from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.parameters import SPECS
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import Encoder, Layout, dialect, message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.services import HANDLERS
 from firmware_sim.mavlink.services.commands import ACTIONS
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.pacing import Unpaced
+from firmware_sim.simulation import EpisodeSetup
 
 FRAMES_PER_TICK = 8
 """On each link: what one client may send."""
@@ -39,127 +45,217 @@ CLIMB_TICKS = 500
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 1e-30, 47.4, 8.5)
 
+PARAMETERS = tuple(spec.name.encode() for spec in SPECS)
+
+KNOWN: Mapping[str, tuple[int, ...]] = {
+    "target_system": (1, 1, 1, 1, 1, 1, 1, 1, 1, 0),
+    "target_component": (1, 1, 1, 1, 1, 1, 1, 1, 1, 0),
+    "command": tuple(ACTIONS),
+    "param_type": (6, 9),
+    "device": (10,),
+    "flags": (0, 2, 6),
+    "count": (0, 1, 2, 5, 70, 90, 255),
+    "frame": (0, 2, 3, 5, 6, 10, 11),
+    "coordinate_frame": (1, 5, 6, 7, 8, 9, 11, 12),
+    "type_mask": (0, 0x9C7, 0x5C7, 0x9F8, 0xDC7, 0xFFF, 0x7, 0x38, 0x1C0),
+}
+"""What fields hold that mean something, beside small numbers."""
+
+FTP_HEADER = struct.Struct("<HBBBBBxI")
+PATHS = (
+    b"", b"/", b".", b"..", b"/etc", b"etc/extras/parameters.json.xz", b"../../etc/passwd", b"a",
+    b"a/b", b"a/../..", b"/a" * 100, b"\xff\xfe", b"x" * 239,
+)  # fmt: skip
+WORDS = (
+    b"param", b"show", b"*", b"MPC_*", b"?" * 20, b"*a" * 20, b"listener", b"vehicle_status",
+    b"commander", b"status", b"ver", b"all", b"help", b"uptime", b"reboot", b"\n", b"\r", b"\xff",
+)  # fmt: skip
+
+_BLOCK = 8_192
+_T = TypeVar("_T")
+
+
+class Dice:
+    """Draws of a seeded generator, taken from it in blocks: one by one costs ten times as much."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self._left: list[float] = []
+
+    def random(self) -> float:
+        """Return a number in [0, 1)."""
+        if not self._left:
+            self._left = self.rng.random(_BLOCK).tolist()
+        return self._left.pop()
+
+    def below(self, end: int) -> int:
+        """Return a whole number from 0 to `end` - 1."""
+        return int(self.random() * end)
+
+    def one_of(self, choices: Sequence[_T]) -> _T:
+        """Return one of some things."""
+        return choices[self.below(len(choices))]
+
+    def bytes(self, longest: int, shortest: int = 0) -> bytes:
+        """Return random bytes."""
+        return self.rng.bytes(shortest + self.below(longest - shortest + 1))
+
 
 class Fuzzer:
     """Draws what a hostile or broken client may send."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self._dice = dice = Dice(rng)
         # A key that is set refuses all that comes after it.
         names = [name for name in HANDLERS if name != "SETUP_SIGNING"]
-        self._kinds = [dialect.mavlink_map[message_id(name)] for name in names]
-        self._layouts = [Layout(kind) for kind in self._kinds]
+        self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice) for name in names]
         self._encoders = [Encoder(245, 190), Encoder(1, 191), Encoder(0, 0), Encoder(255, 255)]
-        self._commands = list(ACTIONS)
-        self._names = [spec.name.encode() for spec in SPECS]
 
     def frame(self) -> bytes:
         """Return random bytes, a damaged frame, or a valid one."""
-        rng = self._rng
-        chance = rng.random()
+        dice = self._dice
+        chance = dice.random()
         if chance < 0.05:
-            return bytes(rng.bytes(int(rng.integers(1, 400))))
+            return dice.bytes(400, 1)
         frame = self._valid()
         if chance < 0.15:
             damaged = bytearray(frame)
-            for _ in range(int(rng.integers(1, 6))):
-                damaged[rng.integers(len(damaged))] = rng.integers(256)
-            return bytes(damaged[: rng.integers(1, len(damaged) + 1)])
+            for _ in range(1 + dice.below(5)):
+                damaged[dice.below(len(damaged))] = dice.below(256)
+            return bytes(damaged[: 1 + dice.below(len(damaged))])
         return frame
 
     def _valid(self) -> bytes:
-        rng = self._rng
-        n = int(rng.integers(len(self._kinds)))
-        kind, shape = self._kinds[n], self._layouts[n]
-        encoder = self._encoders[0 if rng.random() < 0.9 else rng.integers(len(self._encoders))]
-        return encoder.frame(shape, shape.payload(list(self._values(kind))))
+        dice = self._dice
+        kind = dice.one_of(self._kinds)
+        encoder = self._encoders[0] if dice.random() < 0.9 else dice.one_of(self._encoders)
+        return encoder.frame(kind.layout, kind.layout.payload(kind.values()))
 
-    def _values(self, kind: Any) -> Iterator[Any]:
+
+class _Kind:
+    """One message: its layout, and what draws its fields."""
+
+    def __init__(self, kind: Any, dice: Dice) -> None:
+        self.layout = Layout(kind)
         lengths = dict(zip(kind.ordered_fieldnames, kind.lengths, strict=True))
-        for name, of in zip(kind.fieldnames, kind.fieldtypes, strict=True):
-            for _ in range(lengths[name]):
-                yield self._value(name, of)
+        self._fields = [
+            _drawn(kind.msgname, name, of, lengths[name], dice)
+            for name, of in zip(kind.fieldnames, kind.fieldtypes, strict=True)
+        ]
 
-    def _value(self, name: str, of: str) -> Any:
-        rng = self._rng
-        sensible = rng.random() < 0.8
-        if of == "char":
-            if name == "param_id" and sensible:
-                return self._names[rng.integers(len(self._names))]
-            return bytes(rng.bytes(int(rng.integers(0, 20))))
-        if of in ("float", "double"):
-            return self._real()
-        if sensible:
-            if name in ("target_system", "target_component"):
-                return int(rng.random() < 0.9)
-            if name == "command":
-                return int(self._commands[rng.integers(len(self._commands))])
-            if name in ("param_type",):
-                return (6, 9)[rng.integers(2)]
-            return int(rng.integers(0, 12))
-        bits = int("".join(c for c in of if c.isdigit()))
-        low, high = (0, 2**bits - 1) if of[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-        ends = (low, high, low + 1, high - 1)
-        if rng.random() < 0.5:
-            return ends[rng.integers(4)]
-        return low + int.from_bytes(rng.bytes(bits // 8), "little")
+    def values(self) -> list[Any]:
+        """Return a value for each slot of the message."""
+        return [value for draw in self._fields for value in draw()]
 
-    def _real(self) -> float:
-        rng = self._rng
-        chance = rng.random()
-        if chance < 0.4:
-            return float(FLOATS[rng.integers(len(FLOATS))])
-        if chance < 0.7:
-            return float(rng.integers(0, 12))
-        return float(np.float32(rng.normal() * 10.0 ** rng.integers(-6, 7)))
+
+def _drawn(
+    message: str, name: str, of: str, length: int, dice: Dice
+) -> Callable[[], Iterable[Any]]:
+    """Return what draws one field of a message."""
+    special = {
+        ("FILE_TRANSFER_PROTOCOL", "payload"): _ftp_request,
+        ("SERIAL_CONTROL", "data"): _typed,
+    }.get((message, name))
+    if special is not None:
+        return lambda: special(dice) if dice.random() < 0.8 else dice.bytes(length, length)
+    if of == "char":
+        names = PARAMETERS if name == "param_id" else (b"",)
+        return lambda: (dice.one_of(names) if dice.random() < 0.8 else dice.bytes(20),)
+    if of in ("float", "double"):
+        return lambda: [_real(dice) for _ in range(length)]
+    if of == "uint8_t" and length > 1:
+        return lambda: dice.bytes(length, length)
+    whole = _whole(name, of)
+    return lambda: [whole(dice) for _ in range(length)]
+
+
+def _real(dice: Dice) -> float:
+    chance = dice.random()
+    if chance < 0.4:
+        return dice.one_of(FLOATS)
+    if chance < 0.7:
+        return float(dice.below(12))
+    return float(np.float32((dice.random() - 0.5) * 10.0 ** (dice.below(13) - 6)))
+
+
+def _whole(name: str, of: str) -> Callable[[Dice], int]:
+    """Return what draws a whole number: one that exists, an end of the type, or any."""
+    bits = int("".join(c for c in of if c.isdigit()))
+    low, high = (0, 2**bits - 1) if of[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    ends = (low, high, low + 1, high - 1)
+    known = [n for n in KNOWN.get(name, range(12)) if low <= n <= high]
+
+    def draw(dice: Dice) -> int:
+        chance = dice.random()
+        if chance < 0.8:
+            return dice.one_of(known)
+        return dice.one_of(ends) if chance < 0.9 else low + dice.below(2**bits)
+
+    return draw
+
+
+def _ftp_request(dice: Dice) -> bytes:
+    """Return a request of MAVLink FTP: real operations, on files that are there and elsewhere."""
+    path = dice.one_of(PATHS)
+    data = dice.one_of((path, path + b"\0" + dice.one_of(PATHS), dice.bytes(239)))
+    size = min(len(data), 255) if dice.random() < 0.7 else dice.below(256)
+    offset = dice.one_of((0, 0, 1, 239, 2**31, 2**32 - 1))
+    sequence, session = dice.below(2**16), dice.one_of((0, 0, 0, 1))
+    header = FTP_HEADER.pack(sequence, session, dice.below(18), size, 0, 0, offset)
+    return (header + data)[:251].ljust(251, b"\0")
+
+
+def _typed(dice: Dice) -> bytes:
+    """Return what somebody may type into the shell."""
+    words = [dice.one_of(WORDS) for _ in range(1 + dice.below(12))]
+    return b" ".join(words)[:70].ljust(70, b"\n")
 
 
 def fly(seed: int, frames: int) -> int:
     """Fly once with so many hostile frames; return how many of them took effect.
 
-    Raises AssertionError for a motor command that is no number in 0..1, and whatever else breaks.
+    The vehicle keeps its logs, which clients may list and download.
+
+    Raises:
+        AssertionError: A motor command is no number in 0..1, or the vehicle is nowhere.
+        Exception: Whatever else breaks.
     """
-    rng = np.random.default_rng(seed)
-    fuzzer = Fuzzer(rng)
-    sim = Simulation(
-        EpisodeSetup(load_vehicle("quad"), None, seed),
-        start_us=0,
-        clock=SimClock(),
-        recording=False,
-    )
-    autopilot = sim.autopilot
-    assert isinstance(autopilot, BuiltinAutopilot)
+    fuzzer = Fuzzer(np.random.default_rng(seed))
+    setup = EpisodeSetup(load_vehicle("quad"), None, seed)
     ends = MemoryEndpoint(), MemoryEndpoint()
-    server = MavlinkServer([onboard_link(ends[0]), gcs_link(ends[1])], autopilot, boot_unix_us=0)
-    effective = 0
+    server = MavlinkServer([onboard_link(ends[0]), gcs_link(ends[1])], boot_unix_us=0)
+    stack = BuiltinFlightStack(server)
+    with tempfile.TemporaryDirectory() as folder:
+        firmware = Firmware(stack, None, Unpaced(), recording=False)
+        try:
+            firmware.load(setup, Path(folder, "flight-001.tlog"), 0)
+            simulation = firmware.simulation
+            assert simulation is not None
+            autopilot = simulation.autopilot
+            assert isinstance(autopilot, BuiltinAutopilot)
 
-    def tick() -> None:
-        nonlocal effective
-        effective += server.receive(sim.time_us)
-        sim.tick()
-        server.send(sim.time_us)
-        for end in ends:
-            end.outbox.clear()
+            def ticks(number: int) -> None:
+                for _ in range(number):
+                    firmware.step()
+                    for end in ends:
+                        end.outbox.clear()
 
-    try:
-        for _ in range(BOOT_TICKS):
-            tick()
-        autopilot.arm(force=True)
-        autopilot.takeoff(3.0)
-        for _ in range(CLIMB_TICKS):
-            tick()
-        effective = 0
-        for _ in range(-(-frames // (2 * FRAMES_PER_TICK))):
-            for end in ends:
-                end.inbox.extend(fuzzer.frame() for _ in range(FRAMES_PER_TICK))
-            tick()
-            motors = np.array(autopilot.state().motors)
-            assert np.isfinite(motors).all(), motors
-            assert motors.min() >= 0.0, motors
-            assert motors.max() <= 1.0, motors
-    finally:
-        sim.close()
-    return effective
+            ticks(BOOT_TICKS)
+            autopilot.arm(force=True)
+            autopilot.takeoff(3.0)
+            ticks(CLIMB_TICKS)
+            quiet = sum(link.rx - link.ignored for link in server.counters().values())
+            for _ in range(-(-frames // (2 * FRAMES_PER_TICK))):
+                for end in ends:
+                    end.inbox.extend(fuzzer.frame() for _ in range(FRAMES_PER_TICK))
+                ticks(1)
+                motors = autopilot.state().motors
+                assert all(0.0 <= motor <= 1.0 for motor in motors), motors
+            truth = simulation.plant.truth()
+            assert np.isfinite(truth.position).all(), truth
+            return sum(link.rx - link.ignored for link in server.counters().values()) - quiet
+        finally:
+            firmware.close()
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,11 @@ class Client:
     components: set[tuple[int, int]] = field(default_factory=set)
     """System and component ids of who has been heard from its side."""
 
+    def close(self) -> None:
+        """Release what is held for it."""
+        if self.context is not None:
+            self.context.close()
+
     def hear(self, message: WireMessage) -> None:
         """Note whose message has come from this client."""
         if len(self.components) < MAX_COMPONENTS:
@@ -169,7 +174,14 @@ class Clients:
         for peer, client in tuple(self._clients.items()):
             if peer is not None and now_us - client.heard_us >= silent_us:
                 self._gone += client.link.counters
+                client.close()
                 del self._clients[peer]
+
+    def close(self) -> None:
+        """Close the endpoint, and release what is held for the clients."""
+        for client in self:
+            client.close()
+        self.endpoint.close()
 
     def _meet(
         self, peer: Peer, chunk: bytes, now_us: int

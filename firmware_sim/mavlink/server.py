@@ -200,7 +200,7 @@ class MavlinkServer:
         if self._stored is not None:
             self._stored.save()
         for clients in self._links:
-            clients.endpoint.close()
+            clients.close()
         self._storage.close()
 
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
@@ -229,6 +229,7 @@ class MavlinkServer:
 
     def _connect(self, client: Client, port: AutopilotPort) -> None:
         client.link.identify(self._system_id)
+        client.close()
         client.context = Context(
             client.link,
             port,

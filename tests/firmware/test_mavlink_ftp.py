@@ -57,6 +57,9 @@ class Card:
         self.client = RawClient(self.endpoint)
         self.sequence = 0
 
+    def close(self) -> None:
+        self.server.close()
+
     def tick(self) -> None:
         self.server.receive(self.autopilot.time_us)
         self.autopilot.step()
@@ -92,7 +95,8 @@ def card(tmp_path: Path) -> Iterator[Card]:
     folder = tmp_path / "card"
     folder.mkdir()
     (tmp_path / "secret.txt").write_text("secret")
-    yield Card(folder)
+    with closing(Card(folder)) as card:
+        yield card
 
 
 def nak(code: int) -> tuple[int, bytes]:
@@ -292,11 +296,11 @@ def test_nobody_fills_the_disk(card: Card, monkeypatch: pytest.MonkeyPatch) -> N
 def test_no_request_raises_or_gets_out(body: bytes) -> None:
     with TemporaryDirectory() as folder:
         (Path(folder) / "card").mkdir()
-        card = Card(Path(folder) / "card")
-        for opcode in (None, *range(17)):
-            raw = bytearray(body.ljust(251, b"\0"))
-            if opcode is not None:
-                raw[3] = opcode
-            card.client.send(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, list(raw)))
-            card.tick()
+        with closing(Card(Path(folder) / "card")) as card:
+            for opcode in (None, *range(17)):
+                raw = bytearray(body.ljust(251, b"\0"))
+                if opcode is not None:
+                    raw[3] = opcode
+                card.client.send(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, list(raw)))
+                card.tick()
         assert [p.name for p in Path(folder).iterdir()] == ["card"]

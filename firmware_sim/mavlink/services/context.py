@@ -59,6 +59,10 @@ class Context:
     refusals: set[str] = field(default_factory=set)
     """Why setpoints have been refused since the last one that was accepted."""
 
+    def close(self) -> None:
+        """Release what is held for the client: it has gone, or another autopilot comes."""
+        self.ftp.session.close()
+
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:
     """Return whether a message is addressed to this vehicle, its autopilot or all components."""

@@ -56,10 +56,6 @@ class Session:
     size: int = 0
     """Of the file when it was opened [bytes]."""
 
-    def __del__(self) -> None:
-        """Close the file of a client that is forgotten."""
-        self.close()
-
     def opened(self, request: Request) -> BinaryIO:
         """Return the open file. Raises RefusedError when there is none."""
         if request.session != 0 or self.file is None:
