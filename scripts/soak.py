@@ -37,7 +37,7 @@ SETTLED_S = HOUR_S
 
 ALTITUDE_M = 30.0
 RADIUS_M = 15.0
-SILENT_S = 60.0
+SILENT_S = 300.0
 """Nobody answers: the soak has failed [wall s]."""
 
 Said = Any
