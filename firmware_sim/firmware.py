@@ -204,6 +204,9 @@ class Firmware:
         self._sockets: Sequence[int] = ()
         self._tlog: TlogWriter | None = None
         self._flight_log: FlightLog | None = None
+        self._log_folder: LogFolder | None = None
+        self._stop_listening: Callable[[], None] = lambda: None
+        """Ends that the log hears of changed parameters."""
 
     @property
     def camera_endpoint(self) -> str:
@@ -280,8 +283,8 @@ class Firmware:
             self._flight_log = log = FlightLog(
                 path, internals.parameters, now_us, start_unix_us - now_us
             )
-            internals.parameters.on_change(log.parameters_changed)
-            internals.logs = LogFolder(path.parent, log)
+            self._stop_listening = internals.parameters.on_change(log.parameters_changed)
+            internals.logs = self._log_folder = LogFolder(path.parent, log)
 
     def _hear(self, message: Message) -> None:
         if self._flight_log is not None and self.simulation is not None:
@@ -335,6 +338,7 @@ class Firmware:
 
     def _close_logs(self) -> None:
         if self._flight_log is not None:
+            self._stop_listening()
             self._flight_log.close()
             self._flight_log = None
         if self._tlog is not None:
@@ -345,6 +349,9 @@ class Firmware:
     def discard(self) -> None:
         """Forget the episode."""
         self._close_logs()
+        if self._log_folder is not None:
+            self._log_folder.close()
+            self._log_folder = None
         if self.simulation is not None:
             if self.epoch_ns is not None:
                 gc.unfreeze()

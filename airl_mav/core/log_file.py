@@ -35,6 +35,11 @@ class LogFile:
         return self._written + len(self._buffer)
 
     @property
+    def written_bytes(self) -> int:
+        """Size of what stands in the file by now."""
+        return self._written
+
+    @property
     def closed(self) -> bool:
         """Whether the log is complete."""
         return self._file.closed

@@ -69,9 +69,10 @@ class Parameters:
             for name, value in keeper.read().items():
                 self._store(name, value)
 
-    def on_change(self, listener: Callable[[], None]) -> None:
-        """Call `listener` after every change."""
+    def on_change(self, listener: Callable[[], None]) -> Callable[[], None]:
+        """Call `listener` after every change; return what ends that, to be called once."""
         self._listeners.append(listener)
+        return lambda: self._listeners.remove(listener)
 
     def take_texts(self) -> list[Message]:
         """Return what is to be told of values that are not flown as stored, since the last call.

@@ -78,6 +78,11 @@ class FlightLog:
         return self._writer.size_bytes
 
     @property
+    def written_bytes(self) -> int:
+        """Size of what stands in the file by now."""
+        return self._writer.written_bytes
+
+    @property
     def closed(self) -> bool:
         """Whether the log is complete."""
         return self._writer.closed

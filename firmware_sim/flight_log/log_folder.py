@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.port import LogEntry, OpenLog
@@ -12,19 +14,29 @@ from firmware_sim.flight_log.flight_log import FlightLog
 ULOG_SUFFIX = ".ulg"
 """Of a vehicle's own log."""
 
+OPEN_FILES = 8
+"""Logs that are kept open for those who download them, in every tick a little."""
+
 
 class LogFolder:
-    """Complete logs by their names, then the one that is being written. Implements `LogStore`."""
+    """Complete logs by their names, then the one that is being written. Implements `LogStore`.
+
+    What is in the folder is looked at again when the folder has changed.
+    """
 
     def __init__(self, folder: Path, current: FlightLog) -> None:
         """Take the folder, and the log that is being written in it."""
         self._folder = folder
         self._current = current
+        self._complete: Sequence[Path] = ()
+        self._seen: tuple[int, bool] | None = None
+        """When the folder was last changed [ns], and whether the log was closed: of `_complete`."""
+        self._files: OrderedDict[Path, BinaryIO] = OrderedDict()
+        """The one that was read last at the end."""
 
     def entries(self) -> Sequence[LogEntry]:
         """Return the logs, the one that is being written last."""
-        found = [(path.stat(), path) for path in self._complete()]
-        entries = [LogEntry(int(stat.st_mtime), stat.st_size) for stat, _ in found]
+        entries = [_entry(path) for path in self._completed()]
         if not self._current.closed:
             began_s = self._current.began_unix_us // US_PER_S
             entries.append(LogEntry(began_s, self._current.size_bytes))
@@ -32,25 +44,55 @@ class LogFolder:
 
     def read(self, number: int, offset: int, count: int) -> bytes:
         """Return up to `count` bytes of a log, fewer at its end; none when there is no such log."""
-        complete = self._complete()
+        complete = self._completed()
         if 0 <= number < len(complete):
             path = complete[number]
         elif number == len(complete) and not self._current.closed:
             path = self._current.partial_path
-            if offset + count > path.stat().st_size:
+            if offset + count > self._current.written_bytes:
                 self._current.flush()
         else:
             return b""
-        with path.open("rb") as file:
+        try:
+            file = self._opened(path)
             file.seek(offset)
             return file.read(count)
+        except OSError:
+            return b""  # somebody has removed it
 
     def open_log(self) -> OpenLog | None:
         """Return the log that is being written, None when there is none."""
         log = self._current
         if log.closed:
             return None
-        return OpenLog(len(self._complete()), log.head_bytes, log.size_bytes)
+        return OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
 
-    def _complete(self) -> list[Path]:
-        return sorted(self._folder.glob(f"*{ULOG_SUFFIX}"))
+    def close(self) -> None:
+        """Close what is open for downloads; harmless when called again."""
+        while self._files:
+            self._files.popitem()[1].close()
+
+    def _completed(self) -> Sequence[Path]:
+        seen = self._folder.stat().st_mtime_ns, self._current.closed
+        if seen != self._seen:
+            self.close()
+            self._seen = seen
+            self._complete = sorted(self._folder.glob(f"*{ULOG_SUFFIX}"))
+        return self._complete
+
+    def _opened(self, path: Path) -> BinaryIO:
+        file = self._files.get(path)
+        if file is None:
+            if len(self._files) >= OPEN_FILES:
+                self._files.popitem(last=False)[1].close()
+            file = self._files[path] = path.open("rb", buffering=0)
+        self._files.move_to_end(path)
+        return file
+
+
+def _entry(path: Path) -> LogEntry:
+    try:
+        stat = path.stat()
+    except OSError:
+        return LogEntry(0, 0)  # somebody removes it just now
+    return LogEntry(int(stat.st_mtime), stat.st_size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import closing
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,18 @@ from airl_mav import Scenario, load_run, rehearse
 from airl_mav.core.constants import TICK_US
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import parameter_values
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.flight_log.flight_log import GRID_US
 from firmware_sim.flight_log.topics import TOPICS
 from firmware_sim.flight_log.ulog import Topic, UlogWriter
 from firmware_sim.flight_log.values import NAVIGATION_STATES
+from firmware_sim.mavlink.endpoint import MemoryEndpoint
+from firmware_sim.mavlink.link import onboard_link
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.pacing import Unpaced
+from firmware_sim.simulation import EpisodeSetup
 
 ANSWER = Topic("answer", ("float[3] xyz", "int16_t number", "bool right", "double exact"))
 
@@ -86,6 +93,26 @@ def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
 
 def test_every_mode_has_its_number() -> None:
     assert set(NAVIGATION_STATES) == set(Mode)
+
+
+def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Path) -> None:
+    firmware = Firmware(
+        BuiltinFlightStack(MavlinkServer([onboard_link(MemoryEndpoint())], boot_unix_us=0)),
+        None,
+        Unpaced(),
+    )
+    with closing(firmware):
+        setup = EpisodeSetup(load_vehicle("quad"), None, 1)
+        firmware.load(setup, tmp_path / "flight-001.tlog", 0)
+        firmware.step()
+        firmware.save(tmp_path / "flight-001.npz")
+        assert firmware.simulation is not None
+        internals = firmware.simulation.autopilot.internals
+        assert internals is not None
+        for tick in range(300):  # more than a second: what a log takes would be written
+            internals.parameters.set("MPC_XY_VEL_MAX", 5.0 + tick % 2)
+            firmware.step()
+    assert ULog(str(tmp_path / "flight-001.ulg")).changed_parameters == []
 
 
 def test_intervals_are_met_by_the_grid() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ class LoggedAutopilot(KinematicAutopilot):
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self.log = FlightLog(folder / "flight-007.ulg", self.parameters, 0, BOOT_UNIX_US)
-        self.logs = LogFolder(folder, self.log)
+        self.folder = self.logs = LogFolder(folder, self.log)
 
     def step(self) -> None:
         super().step()
@@ -57,6 +58,7 @@ def autopilot(tmp_path: Path) -> Iterator[LoggedAutopilot]:
     vehicle = LoggedAutopilot(tmp_path)
     yield vehicle
     vehicle.log.close()
+    vehicle.folder.close()
 
 
 @pytest.fixture
@@ -134,6 +136,35 @@ def test_the_log_that_is_written_is_downloaded(
     read = ULog(str(tmp_path / "part.log"))
     assert not read.file_corruption
     assert len(read.get_dataset("sensor_combined").data["timestamp"]) > 250
+
+
+def test_a_log_that_is_removed_meanwhile_ends_there(rig: Rig, tmp_path: Path) -> None:
+    old = tmp_path / "flight-003.ulg"
+    old.write_bytes(bytes(10_000))
+    rig.client.send(dialect.MAVLink_log_request_data_message(*TARGET, 0, 0, WHOLE))
+    rig.bench.tick()
+    old.unlink()
+    (tmp_path / "flight-004.ulg").symlink_to("nowhere")
+    rig.bench.run(0.1)
+    assert rig.client.received("LOG_DATA")[-1].count == 0
+    rig.client.send(dialect.MAVLink_log_request_list_message(*TARGET, 0, 0xFFFF))
+    rig.bench.run(0.1)
+    assert [entry.size for entry in rig.client.received("LOG_ENTRY")][:1] == [0]
+
+
+def test_a_folder_is_looked_at_only_when_it_has_changed(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = Counter[Path]()
+    glob = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda path, *w: looked.update([path]) or glob(path, *w))
+    assert len(download(rig, 0)) == 768
+    rig.client.send(dialect.MAVLink_log_request_list_message(*TARGET, 0, 0xFFFF))
+    rig.bench.run(0.1)
+    assert looked[tmp_path] == 1
+    (tmp_path / "flight-001.ulg").write_bytes(b"another")
+    assert download(rig, 0) == b"another"
+    assert looked[tmp_path] == 2
 
 
 def test_a_download_ends_on_request(rig: Rig) -> None:

@@ -11,7 +11,7 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.services.ftp_session import FtpClient
-from firmware_sim.mavlink.services.log_transfer import LogDownload, LogStream
+from firmware_sim.mavlink.services.log_transfer import LogDownload, LogListing, LogStream
 from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.services.shell_session import Shell
@@ -50,8 +50,8 @@ class Context:
     """The client's part in the shell."""
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
     """The vehicle's, the same for all clients."""
-    log_listing: range = range(0)
-    """Numbers of the logs whose entries are still to be sent."""
+    log_listing: LogListing | None = None
+    """The entries of logs that are still to be sent."""
     log_download: LogDownload | None = None
     """The part of a log that is still to be sent."""
     log_stream: LogStream | None = None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+
+from firmware_sim.autopilot.port import LogEntry
 
 PIECE_BYTES = 249
 """LOGGING_DATA.data."""
@@ -14,6 +16,16 @@ NO_MESSAGE = 255
 _HEAD_BYTES = 16
 """The magic, version and time with which a ULog file begins: no message."""
 _MESSAGE_HEAD_BYTES = 3
+
+
+@dataclass(slots=True)
+class LogListing:
+    """Entries of logs: what is still to be sent of them."""
+
+    entries: Sequence[LogEntry]
+    """Of all logs, as they were when the client asked."""
+    number: int
+    last: int
 
 
 @dataclass(slots=True)

@@ -13,6 +13,7 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.log_transfer import (
     PIECE_BYTES,
     LogDownload,
+    LogListing,
     LogStream,
     Piece,
 )
@@ -32,8 +33,8 @@ _ACK_TRIES = 50
 
 def send_pending(context: Context) -> None:
     """Send the next of what a client is getting; call once per tick."""
-    if context.log_listing:
-        _send_entries(context)
+    if context.log_listing is not None:
+        _send_entries(context, context.log_listing)
     if context.log_download is not None:
         _send_data(context, context.log_download)
     if context.log_stream is not None:
@@ -45,12 +46,14 @@ def send_pending(context: Context) -> None:
 
 def handle_list(message: WireMessage, context: Context) -> bool:
     """Begin to send the entries from `start` to `end`."""
-    total = len(context.port.logs.entries())
+    entries = context.port.logs.entries()
+    total = len(entries)
     if total == 0:
         number, size, utc_s, last = 0, 0, 0, 0
         context.link.send(dialect.MAVLink_log_entry_message(number, 0, last, utc_s, size))
         return True
-    context.log_listing = range(min(message.start, total - 1), min(message.end, total - 1) + 1)
+    first, last = (min(number, total - 1) for number in (message.start, message.end))
+    context.log_listing = LogListing(entries, first, last)
     return True
 
 
@@ -63,7 +66,7 @@ def handle_data(message: WireMessage, context: Context) -> bool:
 
 def handle_end(_message: WireMessage, context: Context) -> bool:
     """Stop sending."""
-    context.log_listing, context.log_download = range(0), None
+    context.log_listing = context.log_download = None
     return True
 
 
@@ -73,18 +76,18 @@ def handle_erase(_message: WireMessage, context: Context) -> bool:
     return True
 
 
-def _send_entries(context: Context) -> None:
-    entries = context.port.logs.entries()
-    now, rest = context.log_listing[:ENTRIES_PER_TICK], context.log_listing[ENTRIES_PER_TICK:]
-    context.log_listing = rest
-    for number in now:
-        if number < len(entries):
-            entry, total = entries[number], len(entries)
-            context.link.send(
-                dialect.MAVLink_log_entry_message(
-                    number, total, total - 1, entry.utc_s, entry.size_bytes
-                )
+def _send_entries(context: Context, listing: LogListing) -> None:
+    entries, total = listing.entries, len(listing.entries)
+    for number in range(listing.number, min(listing.number + ENTRIES_PER_TICK, listing.last + 1)):
+        entry = entries[number]
+        context.link.send(
+            dialect.MAVLink_log_entry_message(
+                number, total, total - 1, entry.utc_s, entry.size_bytes
             )
+        )
+    listing.number += ENTRIES_PER_TICK
+    if listing.number > listing.last:
+        context.log_listing = None
 
 
 def _send_data(context: Context, download: LogDownload) -> None:
