@@ -50,7 +50,8 @@ class SigningProxy:
         """Bind, and begin.
 
         Args:
-            url: Where the flight controller sends to: udpin://HOST:PORT.
+            url: Where the flight controller sends to: udpin://HOST:PORT; without a host only
+                this machine can reach it (0.0.0.0: all that are on its networks).
             key: File of the signing key.
 
         Raises:
@@ -64,7 +65,7 @@ class SigningProxy:
         self._outer = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inner = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._outer.bind((found["host"] or "0.0.0.0", int(found["port"])))  # noqa: S104
+            self._outer.bind((found["host"] or LOOPBACK, int(found["port"])))
             self._inner.bind((LOOPBACK, 0))
             # Where MAVSDK will listen: it replies to who sends to it.
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

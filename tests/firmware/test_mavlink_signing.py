@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from contextlib import closing
@@ -22,7 +23,14 @@ from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from tests.support.kinematic_autopilot import KinematicAutopilot
-from tests.support.mavlink_clients import BOOT_UNIX_US, Companion, RawClient, Rig, _new_mavsdk
+from tests.support.mavlink_clients import (
+    BOOT_UNIX_US,
+    Companion,
+    RawClient,
+    Rig,
+    _new_mavsdk,
+    wait_for,
+)
 from tests.support.ports import free_ports
 
 KEY = bytes(range(7, 39))
@@ -188,6 +196,7 @@ def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
         assert mavsdk.add_any_connection(proxy.url) == 0
         companion = Companion(mavsdk)
         try:
+            wait_for(lambda: flying.autopilot.arming is Arming.STANDBY)
             companion.plugin(Action).arm()
             assert flying.autopilot.arming is Arming.ARMED
         finally:
@@ -197,6 +206,15 @@ def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
         assert (counters.refused, proxy.refused) == (0, 0)
 
 
+def test_a_proxy_without_a_host_is_on_this_machine_alone(key: Path) -> None:
+    (api,), _ = free_ports(1, 0)
+    with (
+        closing(SigningProxy(f"udpin://:{api}", key)),
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as beside,
+    ):
+        beside.bind(("127.0.0.2", api))  # which all interfaces would hold
+
+
 def test_mavsdk_without_the_proxy_is_not_obeyed(key: Path) -> None:
     (api,), _ = free_ports(1, 0)
     with closing(Flying(key, api)) as flying:
@@ -204,6 +222,7 @@ def test_mavsdk_without_the_proxy_is_not_obeyed(key: Path) -> None:
         assert mavsdk.add_any_connection(f"udpin://{LOOPBACK}:{api}") == 0
         companion = Companion(mavsdk)
         try:
+            wait_for(lambda: flying.autopilot.arming is Arming.STANDBY)
             with pytest.raises(Exception, match="TIMEOUT"):
                 companion.plugin(Action).arm()
             assert flying.autopilot.arming is Arming.STANDBY
