@@ -76,8 +76,8 @@ class Client:
         """Simulated time of the newest message [s]."""
         self.altitude_m = 0.0
         """Above home."""
-        self.home: tuple[int, int] | None = None
-        """Latitude and longitude [1e-7 deg]."""
+        self.home: tuple[int, int, int] | None = None
+        """Latitude and longitude [1e-7 deg], altitude [mm]."""
         self.heard = time.monotonic()
         self._turn = 0
 
@@ -109,7 +109,7 @@ class Client:
             self.boot_s = message.time_boot_ms / 1e3
             self.altitude_m = message.relative_alt / 1e3
         elif kind == "HOME_POSITION" and self.home is None:
-            self.home = message.latitude, message.longitude
+            self.home = message.latitude, message.longitude, message.altitude
         elif kind == "MISSION_REQUEST_INT":
             self._send_item(message.seq)
 
@@ -140,24 +140,28 @@ class Client:
         elif self.home is not None:
             self._go_on(*self.home)
 
-    def _go_on(self, latitude: int, longitude: int) -> None:
-        if self.altitude_m < ALTITUDE_M - 1.0:
+    def _go_on(self, latitude: int, longitude: int, altitude_mm: int) -> None:
+        above_sea_m = altitude_mm / 1e3 + ALTITUDE_M
+        if self.altitude_m < 0.5 * ALTITUDE_M:
             self.command(400, 1.0)
-            self.command(22)
+            self.command(
+                22, math.nan, math.nan, math.nan, math.nan, math.nan, math.nan, above_sea_m
+            )
+            return
         angle = self._turn * 2.4
         metres = RADIUS_M / 1.113e-2  # 1e-7 deg of latitude
         east = metres / math.cos(math.radians(latitude / 1e7))
         self.send(
             dialect.MAVLink_command_int_message(
-                *(*self._ids, 6, dialect.MAV_CMD_DO_REPOSITION, 0, 0, -1.0, 1.0, 0.0, math.nan),
+                *(*self._ids, 5, dialect.MAV_CMD_DO_REPOSITION, 0, 0, -1.0, 1.0, 0.0, math.nan),
                 latitude + int(metres * math.cos(angle)),
                 longitude + int(east * math.sin(angle)),
-                ALTITUDE_M,
+                above_sea_m,
             )
         )
 
     def _send_item(self, sequence: int) -> None:
-        latitude, longitude = self.home or (473977430, 85455940)
+        latitude, longitude, _ = self.home or (473977430, 85455940, 0)
         self.send(
             dialect.MAVLink_mission_item_int_message(
                 *(*self._ids, sequence, 6, 16, 0, 1, 0.0, 1.0, 0.0, math.nan),
