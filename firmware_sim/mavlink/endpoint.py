@@ -153,7 +153,7 @@ class UdpPeer:
             self.send_errors += 1
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send each frame as a datagram of its own."""
+        """Send each frame as a datagram of its own, as PX4: some clients decode no other."""
         for frame in frames:
             self.send(frame)
 
@@ -197,7 +197,6 @@ class UdpEndpoint:
             UsageError: An address is unusable, taken, or reachable from outside without
                 `insecure`.
         """
-        self.send_errors = 0
         local = _usable(local, local_option, lowest_port=0, insecure=insecure)
         if remote is not None:
             remote = _usable(remote, remote_option, lowest_port=1, insecure=insecure)
@@ -217,13 +216,23 @@ class UdpEndpoint:
             kind = PortTakenError if error.errno == errno.EADDRINUSE else UsageError
             raise kind(f"{where} {problem}: choose another with {local_option}") from error
         self.local: Address = self._socket.getsockname()
+        self._preset = None if remote is None else UdpPeer(self._socket, remote)
+        self._learned: UdpPeer | None = None
+        self._lost = 0
+        """Datagrams that could not be sent to peers before the newest."""
+
+    @property
+    def send_errors(self) -> int:
+        """Datagrams that could not be sent."""
+        return self._lost + sum(end.send_errors for end in self._ends())
 
     def receive(self) -> list[bytes]:
         """Return the datagrams that have arrived, oldest first, and note their sender."""
         chunks: list[bytes] = []
         for peer, data in self.arrivals():
-            if peer not in (None, self.peer) and data and data[0] in _MARKERS:
-                self.peer = peer
+            if peer is not None and peer != self.peer and data and data[0] in _MARKERS:
+                self._lost += 0 if self._learned is None else self._learned.send_errors
+                self.peer, self._learned = peer, UdpPeer(self._socket, peer)
             chunks.append(data)
         return chunks
 
@@ -245,18 +254,16 @@ class UdpEndpoint:
 
     def send(self, data: bytes) -> None:
         """Send one frame to the preset remote and to the learned peer."""
-        for address in (self._remote, self.peer):
-            if address is None:
-                continue
-            try:
-                self._socket.sendto(data, address)
-            except OSError:
-                self.send_errors += 1
+        for end in self._ends():
+            end.send(data)
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
-        """Send each frame as a datagram of its own."""
-        for frame in frames:
-            self.send(frame)
+        """Send frames to both."""
+        for end in self._ends():
+            end.send_streams(frames)
+
+    def _ends(self) -> Iterator[UdpPeer]:
+        return (end for end in (self._preset, self._learned) if end is not None)
 
     def fileno(self) -> int | None:
         """Return the socket's descriptor, None once closed."""
