@@ -38,8 +38,10 @@ __all__ = [
     "dialect",
     "layout",
     "message_id",
+    "message_name",
     "param_value",
     "payload",
+    "trimmed",
 ]
 
 WireMessage: TypeAlias = dialect.MAVLink_message
@@ -78,6 +80,12 @@ def message_id(name: str) -> int:
     return number
 
 
+def message_name(number: int) -> str | None:
+    """Return the name of a message id, such as "ATTITUDE"; None when unknown."""
+    kind = dialect.mavlink_map.get(number)
+    return None if kind is None else str(kind.msgname)
+
+
 def payload(message: WireMessage) -> bytes:
     """Return the payload of a received message as sent: without trailing zeros (MAVLink 2)."""
     frame: bytearray = message.get_msgbuf()
@@ -85,33 +93,16 @@ def payload(message: WireMessage) -> bytes:
     return bytes(frame[start : start + frame[1]])
 
 
-class _ParamValue(dialect.MAVLink_param_value_message):  # type: ignore[misc]
-    """PARAM_VALUE whose four value bytes are sent as given.
+def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> bytes:
+    """Return the payload of a PARAM_VALUE.
 
     An INT32 parameter travels as the bytes of a float (PX4's bytewise encoding). Integers whose
     bits form a signalling NaN would change on their way through a Python float.
-    """
-
-    raw_value: bytes
-
-    def pack(self, mav: dialect.MAVLink, force_mavlink1: bool = False) -> bytes:
-        """Return the frame."""
-        body = _PARAM_VALUE.pack(
-            self.raw_value, self.param_count, self.param_index, self._param_id_raw, self.param_type
-        )
-        frame: bytes = self._pack(mav, self.crc_extra, body, force_mavlink1=force_mavlink1)
-        return frame
-
-
-def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> WireMessage:
-    """Return a PARAM_VALUE.
 
     The name has at most 16 characters; `raw` is the value's four bytes, little endian, and `kind`
     their MAV_PARAM_TYPE; `count` is the number of parameters; index 65535 = it has none.
     """
-    message = _ParamValue(name.encode("ascii"), 0.0, kind, count, index)
-    message.raw_value = raw
-    return message
+    return _PARAM_VALUE.pack(raw, count, index, name.encode("ascii"), kind)
 
 
 class Layout:
@@ -144,8 +135,12 @@ class Layout:
         except KeyError:
             counts = sorted(self._packers)
             raise struct.error(f"{len(values)} values, expected {counts}") from None
-        packed = pack(*values) if sort is None else pack(*sort(values))
-        return packed.rstrip(b"\0") or b"\0"
+        return trimmed(pack(*values) if sort is None else pack(*sort(values)))
+
+
+def trimmed(payload: bytes) -> bytes:
+    """Return a payload without its trailing zeros, which MAVLink 2 does not send."""
+    return payload.rstrip(b"\0") or b"\0"
 
 
 @functools.cache

@@ -16,6 +16,7 @@ from firmware_sim.mavlink.codec import (
     Values,
     WireMessage,
     layout,
+    trimmed,
 )
 from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
 from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
@@ -99,7 +100,7 @@ class Link:
     """Receives and sends the messages of one client.
 
     Telemetry (`stream`, `stream_due`, then `flush` at the end of the tick) and answers to requests
-    (`send`, `send_stream`) share one sequence, in the order of sending, unless
+    (`send`, `send_payload`, `send_stream`) share one sequence, in the order of sending, unless
     `LinkConfig.separate_replies` is set.
     """
 
@@ -125,8 +126,8 @@ class Link:
         self.scheduler = StreamScheduler(
             names, {name: interval_us(hz) for name, hz in config.rates_hz.items()}
         )
-        self.tap: Callable[[bytes], None] | None = None
-        """Called with every frame of both directions, if set."""
+        self.tap: Callable[[Sequence[bytes]], None] | None = None
+        """Called with the frames of both directions, if set."""
         self.ignored = 0
         self.endpoint = config.endpoint if endpoint is None else endpoint
         self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
@@ -144,6 +145,11 @@ class Link:
         self._tx = 0
         self._refused = 0
         self._unsendable = 0
+
+    @property
+    def sent(self) -> int:
+        """Frames sent."""
+        return self._tx
 
     @property
     def counters(self) -> LinkCounters:
@@ -182,9 +188,8 @@ class Link:
     def note(self, messages: Sequence[WireMessage]) -> None:
         """Count and log messages from this client."""
         self._rx += len(messages)
-        if self.tap is not None:
-            for message in messages:
-                self.tap(bytes(message.get_msgbuf()))
+        if self.tap is not None and messages:
+            self.tap([bytes(message.get_msgbuf()) for message in messages])
 
     # --- answers
 
@@ -193,6 +198,10 @@ class Link:
         frame = self._packed(self._reply_encoder, message)
         if frame is not None:
             self._reply(frame)
+
+    def send_payload(self, name: str, payload: bytes) -> None:
+        """Send a message by its name and its whole payload."""
+        self._reply(self._reply_encoder.frame(layout(name), trimmed(payload)))
 
     def send_stream(self, name: str, state: AutopilotState) -> bool:
         """Send one of the streamed messages now; return whether there was something to send."""
@@ -210,7 +219,7 @@ class Link:
         self.endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
-            self.tap(frame)
+            self.tap((frame,))
 
     def _reply(self, frame: bytes) -> None:
         if self._reply_encoder is self._stream_encoder:
@@ -219,7 +228,7 @@ class Link:
         self.endpoint.send(frame)
         self._tx += 1
         if self.tap is not None:
-            self.tap(frame)
+            self.tap((frame,))
 
     # --- telemetry
 
@@ -257,8 +266,7 @@ class Link:
         self.endpoint.send_streams(frames)
         self._tx += len(frames)
         if self.tap is not None:
-            for frame in frames:
-                self.tap(frame)
+            self.tap(frames)
 
     def _signed(self, frame: bytes) -> bytes:
         return frame if self._signing is None else self._signing.sign(frame, self._link_id)

@@ -31,6 +31,10 @@ from firmware_sim.storage import Storage
 _DISCARD_CALLS = 4
 """Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
 
+PIECES_PER_TICK = 32
+"""Messages of lists and files that all clients together get per tick: 8,000 a second. One client
+gets less in its turn; many share it, and a tick stays a tick."""
+
 FORGET_EVERY_US = US_PER_S
 """Silent clients are looked for so often [µs]."""
 
@@ -78,6 +82,8 @@ class MavlinkServer:
         self._system_id = SYSTEM_ID
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        self._first_in_turn = 0
+        """Place of the client that is the next to get what it gets piece by piece."""
         self._senders = Senders()
         self.strangers = self._senders.strangers
         # The same functions on every link: what two links send in one tick is built once.
@@ -144,6 +150,7 @@ class MavlinkServer:
         if sample is not None:
             self._vibration.update(sample)
         texts = port.take_messages()
+        self._send_pending(now_us)
         state: AutopilotState | None = None
         payloads: Payloads = {}
         for clients in self._links:
@@ -161,9 +168,6 @@ class MavlinkServer:
                     if state.origin is not None and state.origin != client.announced_origin:
                         client.announced_origin = state.origin
                         link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
-                if client.context is not None:
-                    client.context.now_us = now_us
-                    send_pending(client.context)
                 if state is not None:
                     link.stream_due(due, state, payloads)
                 link.flush()
@@ -173,6 +177,27 @@ class MavlinkServer:
                 clients.forget_silent(now_us)
             if self._stored is not None:
                 self._stored.save_due()
+
+    def _send_pending(self, now_us: int) -> None:
+        """Send clients what is next of what they get piece by piece.
+
+        Who comes too late for this tick is first in the next.
+        """
+        clients = list(self._all())
+        first = self._first_in_turn
+        sent = 0
+        for turn in range(len(clients)):
+            place = (first + turn) % len(clients)
+            if sent >= PIECES_PER_TICK:
+                self._first_in_turn = place
+                return
+            context, link = clients[place].context, clients[place].link
+            if context is None:
+                continue
+            context.now_us = now_us
+            before = link.sent
+            send_pending(context)
+            sent += link.sent - before
 
     def log_to(self, tlog: TlogWriter | None, link: str = "onboard") -> None:
         """Write both directions of a link's preset remote to a tlog from now on; None ends it.
@@ -276,9 +301,9 @@ class MavlinkServer:
                     client.link.send(chunk)
         self._texts.clear()
 
-    def _broadcast(self, message: WireMessage) -> None:
+    def _broadcast(self, name: str, payload: bytes) -> None:
         for client in self._all():
-            client.link.send(message)
+            client.link.send_payload(name, payload)
 
     def _all(self) -> Iterator[Client]:
         return chain.from_iterable(self._links)

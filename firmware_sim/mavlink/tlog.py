@@ -34,6 +34,7 @@ class TlogWriter(LogFile):
         path = self.path.with_name(f"{self.path.stem}.{name}{self.path.suffix}")
         return TlogWriter(path, self._start_unix_us)
 
-    def write(self, time_us: int, frame: bytes) -> None:
-        """Add one frame, sent or received at simulated `time_us` [µs]."""
-        self.add(time_us, _TIME.pack(self._start_unix_us + time_us & ~_LINK_BITS), frame)
+    def write(self, time_us: int, *frames: bytes) -> None:
+        """Add frames, sent or received at simulated `time_us` [µs]."""
+        stamp = _TIME.pack(self._start_unix_us + time_us & ~_LINK_BITS)
+        self.add(time_us, *(part for frame in frames for part in (stamp, frame)))

@@ -59,4 +59,4 @@ class TrafficLog:
 
     def _tap(self, client: Client, tlog: TlogWriter) -> None:
         self._logged[client] = tlog
-        client.link.tap = lambda frame: tlog.write(self._now_us(), frame)
+        client.link.tap = lambda frames: tlog.write(self._now_us(), *frames)

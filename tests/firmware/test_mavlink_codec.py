@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega
 from pymavlink.dialects.v20 import common as dialect
 
-from firmware_sim.mavlink.codec import Decoder, Encoder, message_id, param_value, payload
+from firmware_sim.mavlink.codec import (
+    Decoder,
+    Encoder,
+    layout,
+    message_id,
+    param_value,
+    payload,
+    trimmed,
+)
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from tests.support.mavlink_clients import RawClient
 
@@ -167,7 +175,9 @@ def test_payload_of_both_versions() -> None:
 @given(value=st.integers(-(2**31), 2**31 - 1))
 def test_integer_parameters_keep_all_their_bits(value: int) -> None:
     raw = struct.pack("<i", value)
-    frame = Encoder().pack(param_value("SYS_AUTOSTART", raw, 6, 900, 12))
+    frame = Encoder().frame(
+        layout("PARAM_VALUE"), trimmed(param_value("SYS_AUTOSTART", raw, 6, 900, 12))
+    )
     (message,) = dialect.MAVLink(None).parse_buffer(frame)
     # MAVLink 2 cuts trailing zeros of the payload, never here: the type is the last byte.
     assert frame[10:14] == raw

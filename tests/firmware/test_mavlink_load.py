@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
 
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import TICK_US, US_PER_S
+from firmware_sim.flight_log.flight_log import FlightLog
+from firmware_sim.flight_log.log_folder import LogFolder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
-from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.mavlink.server import PIECES_PER_TICK, MavlinkServer
+from firmware_sim.mavlink.services.logs import PACKETS_PER_TICK
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.memory_hub import MemoryHub
 
@@ -19,12 +24,13 @@ SECONDS = 3
 EVERY = 5
 """Ticks between two commands of a client: 50 Hz."""
 
-ACK, PARAM, ATTITUDE = (
+ACK, PARAM, ATTITUDE, LOG_DATA = (
     number.to_bytes(3, "little")
     for number in (
         dialect.MAVLINK_MSG_ID_COMMAND_ACK,
         dialect.MAVLINK_MSG_ID_PARAM_VALUE,
         dialect.MAVLINK_MSG_ID_ATTITUDE,
+        dialect.MAVLINK_MSG_ID_LOG_DATA,
     )
 )
 
@@ -65,3 +71,30 @@ def test_twenty_clients_at_50_hz_with_parameter_downloads() -> None:
     counters = server.counters()["gcs"]
     assert answered == sent == CLIENTS * ticks // EVERY
     assert (counters.dropped, counters.malformed, counters.send_errors) == (0, 0, 0)
+
+
+def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path) -> None:
+    (tmp_path / "flight-000.ulg").write_bytes(bytes(range(1, 256)) * 2_000)
+    hub, autopilot = MemoryHub(), KinematicAutopilot()
+    log = FlightLog(tmp_path / "flight-001.ulg", autopilot.parameters, 0, 0)
+    autopilot.logs = folder = LogFolder(tmp_path, log)
+    server = MavlinkServer([gcs_link(hub)], autopilot, boot_unix_us=0)
+    clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]
+    got = [0] * CLIENTS
+    with closing(log), closing(folder):
+        for client in clients:
+            client.send(dialect.MAVLink_log_request_data_message(1, 1, 0, 0, 0xFFFF_FFFF))
+        for _ in range(100):
+            server.receive(autopilot.time_us)
+            autopilot.step()
+            server.send(autopilot.time_us)
+            in_tick = 0
+            for n, client in enumerate(clients):
+                frames = [frame for frame in client.endpoint.take() if frame[7:10] == LOG_DATA]
+                for frame in frames:
+                    offset = int.from_bytes(frame[10:14], "little")
+                    assert offset == 90 * got[n]  # whole, and in order
+                    got[n] += 1
+                in_tick += len(frames)
+            assert PIECES_PER_TICK <= in_tick < PIECES_PER_TICK + PACKETS_PER_TICK
+    assert max(got) - min(got) <= PACKETS_PER_TICK

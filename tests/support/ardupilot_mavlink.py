@@ -138,7 +138,7 @@ class Manners:
             self.copter.inner,
             self.copter.time_us,
             lambda _: None,
-            lambda _: None,
+            lambda *_: None,
             Signing(lambda: 0),
         )
         kind = message.get_type()

@@ -32,8 +32,8 @@ class Context:
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
     """Sends a text to the operators: to all clients of all links."""
-    broadcast: Callable[[WireMessage], None]
-    """Sends a message to all clients of all links."""
+    broadcast: Callable[[str, bytes], None]
+    """Sends a message, by its name and payload, to all clients of all links."""
     signing: Signing
     """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID

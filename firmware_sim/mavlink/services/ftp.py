@@ -10,7 +10,7 @@ import errno
 import struct
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, read_at
@@ -120,4 +120,4 @@ def _packed(sequence: int, kind: int, opcode: int, offset: int, data: bytes) -> 
 
 def _send(body: bytes, asker: tuple[int, int], context: Context) -> None:
     network = 0
-    context.link.send(dialect.MAVLink_file_transfer_protocol_message(network, *asker, list(body)))
+    context.link.send_payload("FILE_TRANSFER_PROTOCOL", bytes((network, *asker)) + body)

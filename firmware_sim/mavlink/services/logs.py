@@ -6,6 +6,8 @@ LOGGING_DATA(_ACKED), as PX4 1.16 answers them (mavlink_log_handler.cpp, mavlink
 
 from __future__ import annotations
 
+import struct
+
 from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.command import Action, Command
@@ -26,6 +28,8 @@ PIECES_PER_TICK = 2
 
 _PACKET_BYTES = 90
 """LOG_DATA.data."""
+_LOG_DATA = struct.Struct(f"<IHB{_PACKET_BYTES}s")
+"""As it is on the wire: offset, number, count, data."""
 _ACK_TIMEOUT_US = 50_000
 _ACK_TRIES = 50
 """ulog_stream_ack: ACK_TIMEOUT, ACK_MAX_TRIES."""
@@ -96,13 +100,8 @@ def _send_data(context: Context, download: LogDownload) -> None:
     # A packet that is not full tells the client that the log ends.
     for at in range(0, max(len(data), 1), _PACKET_BYTES):
         part = data[at : at + _PACKET_BYTES]
-        context.link.send(
-            dialect.MAVLink_log_data_message(
-                download.number,
-                download.offset + at,
-                len(part),
-                part.ljust(_PACKET_BYTES, b"\0"),
-            )
+        context.link.send_payload(
+            "LOG_DATA", _LOG_DATA.pack(download.offset + at, download.number, len(part), part)
         )
     download.offset += len(data)
     if len(data) < wanted or download.offset >= download.end:

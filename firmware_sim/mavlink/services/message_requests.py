@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.mavlink.codec import dialect, message_id
+from firmware_sim.mavlink.codec import dialect, message_name
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.command import Action, Command
@@ -122,7 +122,8 @@ def send_stream(name: str, context: Context) -> Result:
 
 def _stream_name(number: int | None, context: Context) -> str | None:
     """Return the stream with a message id, None when there is none."""
-    return next((name for name in context.link.builders if message_id(name) == number), None)
+    name = None if number is None else message_name(number)
+    return name if name in context.link.builders else None
 
 
 def _send_interval(number: int, context: Context) -> Result:

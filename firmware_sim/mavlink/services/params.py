@@ -28,13 +28,13 @@ def send_pending(context: Context) -> None:
     store = context.port.parameters
     for _ in range(PARAMETERS_PER_TICK):
         if context.next_parameter < 0:
-            context.link.send(_hash_message(store))
+            context.link.send_payload(*_hash_message(store))
         else:
             parameter = store.by_index(context.next_parameter)
             if parameter is None:
                 context.next_parameter = None
                 return
-            context.link.send(_value_message(parameter, len(store)))
+            context.link.send_payload(*_value_message(parameter, len(store)))
         context.next_parameter += 1
 
 
@@ -50,13 +50,13 @@ def handle_read(message: WireMessage, context: Context) -> bool:
     store = context.port.parameters
     index: int = message.param_index
     if index < 0 and message.param_id == HASH_NAME:
-        context.link.send(_hash_message(store))
+        context.link.send_payload(*_hash_message(store))
         return True
     parameter = store.by_index(index) if index >= 0 else store.by_name(message.param_id)
     if parameter is None:
         _send_error(message, index, dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST, context)
     else:
-        context.link.send(_value_message(parameter, len(store)))
+        context.link.send_payload(*_value_message(parameter, len(store)))
     return True
 
 
@@ -76,7 +76,7 @@ def handle_set(message: WireMessage, context: Context) -> bool:
     elif (stored := store.set(present.name, value)) is None:
         error = dialect.MAV_PARAM_ERROR_DOES_NOT_EXIST
     else:
-        context.broadcast(_value_message(stored, len(store)))
+        context.broadcast(*_value_message(stored, len(store)))
         return True
     _send_error(message, -1, error, context)
     return True
@@ -108,14 +108,17 @@ def _received_value(message: WireMessage) -> int | float:
     return value
 
 
-def _value_message(parameter: ParameterValue, count: int) -> WireMessage:
+def _value_message(parameter: ParameterValue, count: int) -> tuple[str, bytes]:
+    """Return name and payload of the message."""
     value = parameter.value
-    return param_value(parameter.name, _encoded(value), _kind(value), count, parameter.index)
+    body = param_value(parameter.name, _encoded(value), _kind(value), count, parameter.index)
+    return "PARAM_VALUE", body
 
 
-def _hash_message(store: ParameterStore) -> WireMessage:
+def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
     digest = struct.pack("<I", parameter_hash(store))
-    return param_value(HASH_NAME, digest, dialect.MAV_PARAM_TYPE_UINT32, len(store), _NO_INDEX)
+    kind = dialect.MAV_PARAM_TYPE_UINT32
+    return "PARAM_VALUE", param_value(HASH_NAME, digest, kind, len(store), _NO_INDEX)
 
 
 def parameter_hash(store: ParameterStore) -> int:

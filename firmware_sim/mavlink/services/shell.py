@@ -5,6 +5,8 @@ Source: PX4 1.16, MavlinkReceiver::handle_message_serial_control, and what its s
 
 from __future__ import annotations
 
+import struct
+
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.shell_commands import run
@@ -15,6 +17,10 @@ DATA_BYTES = 70
 """Most text in one message."""
 
 MESSAGES_PER_TICK = 10
+
+_SERIAL_CONTROL = struct.Struct(f"<IHBBB{DATA_BYTES}s")
+"""As it is on the wire: rate, timeout, device, flags, count, data."""
+_SHELL = dialect.SERIAL_CONTROL_DEV_SHELL, dialect.SERIAL_CONTROL_FLAG_REPLY
 
 _LONGEST_LINE = 256
 """What is typed beyond this before the line ends is dropped [bytes]."""
@@ -53,10 +59,6 @@ def send_pending(context: Context) -> None:
         part = bytes(output[:DATA_BYTES])
         del output[:DATA_BYTES]
         no_timeout = no_rate = 0
-        context.link.send(
-            dialect.MAVLink_serial_control_message(
-                dialect.SERIAL_CONTROL_DEV_SHELL,
-                dialect.SERIAL_CONTROL_FLAG_REPLY,
-                *(no_timeout, no_rate, len(part), list(part.ljust(DATA_BYTES, b"\0"))),
-            )
+        context.link.send_payload(
+            "SERIAL_CONTROL", _SERIAL_CONTROL.pack(no_rate, no_timeout, *_SHELL, len(part), part)
         )
