@@ -82,12 +82,18 @@ def patient_reference(folder: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(400)
-def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "steps",
+    [("north-2", "yaw-90"), pytest.param(STEP_NAMES, marks=pytest.mark.nightly)],
+    ids=["two steps", "all steps"],
+)
+def test_the_built_in_firmware_conforms_to_px4(steps: tuple[str, ...], tmp_path: Path) -> None:
+    """Steps are held to PX4's in simulated time by tests/flight/test_step_response.py, too."""
     out = tmp_path / "result.json"
-    reference = ["--reference", str(patient_reference(tmp_path))]
+    options = ["--reference", str(patient_reference(tmp_path)), "--steps", *steps]
     with (
         firmware(tmp_path, QUIET) as ports,
-        conformance(tmp_path, *connect(ports), *reference, "--out", str(out)) as command,
+        conformance(tmp_path, *connect(ports), *options, "--out", str(out)) as command,
     ):
         status = command.wait()
         text = command.text()
@@ -95,13 +101,16 @@ def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
     assert re.search(r"^CONFORMS to PX4: \d+ passed, 0 failed, 0 not applicable$", text, re.M)
     checks = checks_of(out)
     assert {check["outcome"] for check in checks.values()} == {"pass"}
-    assert {f"step {name}" for name in STEP_NAMES} < set(checks)
+    assert {f"step {name}" for name in steps} < set(checks)
     # By PX4's own ways, not just anyhow.
     assert "refused" in checks["frame 9 BODY_OFFSET_NED"]["finding"]
     assert "Failsafe activated" in checks["offboard loss"]["finding"]
     assert "TEMPORARILY_REJECTED" in checks["disarming in the air"]["finding"]
     # The table has both columns.
     data = json.loads(out.read_text(encoding="utf-8"))
+    assert [step["name"] for step in data["steps"]] == [
+        each for each in STEP_NAMES if each in steps
+    ]
     for step in data["steps"]:
         stored = data["reference"]["steps"][step["name"]]
         rise_ms = f"{1e3 * step['median']['rise_s']:.0f}"
@@ -111,6 +120,7 @@ def test_the_built_in_firmware_conforms_to_px4(tmp_path: Path) -> None:
     assert len(data["transcript"]) > 100
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)

@@ -148,7 +148,10 @@ def load(loops: int) -> Iterator[None]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("who", "loops"), [("firmware", 0), ("companion", 2)])
+@pytest.mark.parametrize(
+    ("who", "loops"),
+    [("firmware", 0), pytest.param("companion", 2, marks=pytest.mark.nightly)],
+)
 def test_stopped_and_loaded_processes_fly_the_same(
     who: str, loops: int, reference: Reference, tmp_path: Path
 ) -> None:

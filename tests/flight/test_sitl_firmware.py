@@ -175,6 +175,7 @@ def test_a_rehearsal_with_ardupilot(tmp_path: Path) -> None:
     assert "Starting sketch" in (tmp_path / "run" / "autopilot.log").read_text(encoding="utf-8")
 
 
+@pytest.mark.nightly
 def test_a_rehearsal_with_a_board(tmp_path: Path) -> None:
     """Over a pseudo-terminal, at a board's own pace; its frame is checked, and told to differ."""
     ports = choose_ports()
