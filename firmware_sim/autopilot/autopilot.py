@@ -112,10 +112,10 @@ class BuiltinAutopilot:
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Take one tick's sensors and return the motor commands until the next."""
         time_us, supervisor, sensors = sample.time_us, self.supervisor, self.supervisor.sensors
+        sensors.take(sample)
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._snapshot = None
         self._newest.take(sample)
-        sensors.take(sample)
         if self._home.place is None:
             self._home.set_here()
         readiness = READINESS[self.flight.phase][self.estimator.healthy]

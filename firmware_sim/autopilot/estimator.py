@@ -19,6 +19,7 @@ from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Estimate
+from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.interfaces import GpsFix, SensorSample
 
@@ -61,6 +62,10 @@ class ErrorFilter(Protocol):
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Move nominal state and covariance by one tick's IMU sample, each (3,) FRD."""
+        ...
+
+    def restart(self, covariance: Vector) -> None:
+        """Go on from another covariance (16, 16): what was known is so no longer."""
         ...
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
@@ -128,6 +133,10 @@ class Estimator:
         self._gps_vertical = Measurement("gps_vertical", 3, _selecting(es.POS + 2, es.VEL + 2))
         self._baro = Measurement("baro", 1, _selecting(es.BARO) - _selecting(es.POS + 2))
         self._heading = Measurement("heading", 2, np.zeros((1, es.N_STATES)))
+        self.consistency = Consistency()
+        """Sees inertial sensors that have gone wrong."""
+        self.compass = Compass()
+        """Whether the compass is believed."""
 
     def step(self, sample: SensorSample) -> None:
         """Take one tick's sensors."""
@@ -166,17 +175,22 @@ class Estimator:
 
     # --- what is known (PX4: EKF2's dead reckoning)
 
-    def knows_position(self, now_us: int) -> bool:
+    def knows_position(self, now_us: int, *, flying: bool = True) -> bool:
         """Return whether horizontal position and velocity are valid.
 
-        Without GPS they are for EKF2_NOAID_TOUT: that long the vehicle flies by dead reckoning.
+        Without GPS they are for EKF2_NOAID_TOUT: that long the vehicle flies by dead reckoning. On
+        the ground, where the biases have hardly been learnt, nobody begins a flight so.
         """
-        return self.origin is not None and self._recent(self._gps_horizontal, now_us)
+        longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
+        return self.origin is not None and self._recent(self._gps_horizontal, now_us, longest_us)
 
     def knows_height(self, now_us: int) -> bool:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
-        recent = self._recent(self._baro, now_us) or self._recent(self._gps_vertical, now_us)
-        return self.origin is not None and recent
+        longest_us = self._value("EKF2_NOAID_TOUT")
+        return self.origin is not None and (
+            self._recent(self._baro, now_us, longest_us)
+            or self._recent(self._gps_vertical, now_us, longest_us)
+        )
 
     def fuses_gps(self, now_us: int) -> bool:
         """Return whether GPS has been fused lately."""
@@ -189,10 +203,10 @@ class Estimator:
         v_north, v_east = self.state[es.SIGMA + 3 : es.SIGMA + 5].tolist()
         return math.hypot(north, east), math.hypot(v_north, v_east)
 
-    def _recent(self, m: Measurement, now_us: int) -> bool:
+    def _recent(self, m: Measurement, now_us: int, longest_us: float) -> bool:
         """Return whether it was fused lately; right after alignment all are."""
         since = self._aligned_us if m.fused_us is None else m.fused_us
-        return since is not None and now_us - since <= self._value("EKF2_NOAID_TOUT")
+        return since is not None and now_us - since <= longest_us
 
     # --- start
 
@@ -251,6 +265,7 @@ class Estimator:
     def _fuse_gps(self, fix: GpsFix, origin: Geodetic) -> None:
         measured, state, value = geodetic_to_local(fix.position, origin), self.state, self._value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
+        r_v = self._check_velocity(fix.velocity_ned, r_v)
         m = self._gps_horizontal
         m.innovation[:2] = measured[:2] - state[es.P : es.P + 2]
         m.innovation[2:] = fix.velocity_ned[:2] - state[es.V : es.V + 2]
@@ -275,6 +290,38 @@ class Estimator:
         observable = es.observe_heading(
             self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
         )
-        if observable:
-            m.variance[0] = self._value("EKF2_HEAD_NOISE") ** 2
-            self._fuse(m)
+        innovation = m.innovation.item(0)
+        if not (observable and self.compass.admits(innovation)):
+            return
+        m.variance[0] = self._value("EKF2_HEAD_NOISE") ** 2
+        self._fuse(m)
+        ratio = self.state.item(m.slot)
+        self.compass.tested(innovation, ratio, self._time_us)
+        deviations = math.copysign(es.GATE * ratio, innovation)
+        restart = self.consistency.heading(deviations, self._time_us, within=ratio <= 1.0)
+        self._restart(restart)
+
+    # --- inertial sensors that have gone wrong
+
+    def _check_velocity(self, measured: Vector, variance: float) -> float:
+        """Restart the filter where it must; return the variance of the measured velocity."""
+        excess = self.consistency.velocity_excess
+        innovation = measured - self.state[es.V : es.Q]
+        sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
+        self._restart(self.consistency.velocity(innovation, sigma, self._time_us))
+        return variance * excess
+
+    def _restart(self, restart: Restart | None) -> None:
+        """Let the filter learn anew what inertial sensors make wrong; None = it goes on."""
+        if restart is None:
+            return
+        variances = self.filter.covariance.diagonal().copy()
+        for first, sigma in (
+            (es.VEL, restart.velocity_m_s),
+            (es.ATT, restart.attitude_rad),
+            (es.GYRO, restart.gyro_bias_rad_s),
+            (es.ACC, restart.accel_bias_m_s2),
+        ):
+            block = variances[first : first + 3]
+            np.maximum(block, sigma**2, out=block)
+        self.filter.restart(np.diag(variances))

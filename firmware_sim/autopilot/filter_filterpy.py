@@ -33,6 +33,10 @@ class FilterpyFilter:
         propagate(state, gyro, accel, self._ekf.F, TICK_S)
         self._ekf.predict()
 
+    def restart(self, covariance: Vector) -> None:
+        """Go on from another covariance (16, 16)."""
+        self._ekf.P = covariance.copy()
+
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate."""
         ekf = self._ekf

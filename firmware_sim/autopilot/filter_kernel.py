@@ -119,6 +119,10 @@ class KernelFilter:
         """Move the nominal state, updated in place, and the covariance by one tick."""
         _predict(state, self.covariance, self._noise, self._transition, gyro, accel, TICK_S)
 
+    def restart(self, covariance: Vector) -> None:
+        """Go on from another covariance (16, 16)."""
+        self.covariance = covariance.copy()
+
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate."""
         ratio: float = _fuse(state, self.covariance, innovation, h, variance)

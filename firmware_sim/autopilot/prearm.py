@@ -66,6 +66,8 @@ class Readiness(NamedTuple):
     settings: ArmingSettings
     converged: bool = True
     """The estimator knows well enough where the vehicle is and how it points."""
+    compass_agrees: bool = True
+    """The estimator has not given up the compass."""
     gyro: bool = True
     """Whether its data are valid, as of all sensors here."""
     accel: bool = True
@@ -181,6 +183,11 @@ CHECKS: tuple[Check, ...] = (
         lambda r: not r.converged and not r.armed,
         "Preflight Fail: ekf2 missing data",
         said=False,
+    ),
+    Check(
+        Part.ESTIMATOR,
+        lambda r: not r.compass_agrees and not r.armed,
+        "Preflight Fail: heading estimate not stable",
     ),
     Check(
         Part.SYSTEM,

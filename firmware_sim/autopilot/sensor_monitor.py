@@ -2,6 +2,9 @@
 
 Source: PX4 1.16, DataValidator and the preflight checks of each sensor. PX4 goes on with a sensor
 that repeats itself; here the estimator is spared it, as a real sensor's noise never repeats.
+
+In flight no sensor repeats itself, not even a perfect one. At rest a perfect one does: whether a
+sensor has noise is learnt at rest, from its first second.
 """
 
 from __future__ import annotations
@@ -16,6 +19,10 @@ from firmware_sim.interfaces import SensorSample
 
 NO_DATA_US = US_PER_S
 """A sensor that has been silent for so long has no valid data [µs]."""
+
+
+LEARN_US = US_PER_S
+"""A sensor that never repeated itself for so long, at rest, has noise [µs]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +64,13 @@ class SensorWatch:
         """Begin without a sample."""
         self.kind = kind
         self._value: Any = None
+        self._first_us: int | None = None
         self._seen_us: int | None = None
         self._changed_us = 0
+        self._noisy: bool | None = None
+        """Whether its samples differ at rest, too; None = not known yet."""
+        self.repeats = False
+        """Whether its newest sample is exactly the one before."""
         self.failed = ""
         """Why it has failed: TIMEOUT or STALE; empty = it has not."""
 
@@ -70,20 +82,31 @@ class SensorWatch:
     def take(self, sample: SensorSample) -> None:
         """Take a sample in which it has measured."""
         value, now_us = self.kind.read(sample), sample.time_us
-        if value != self._value:
+        self.repeats = value == self._value
+        if not self.repeats:
             self._value, self._changed_us = value, now_us
+        if self._noisy is None:
+            self._learn(now_us)
         self._seen_us = now_us
+
+    def _learn(self, now_us: int) -> None:
+        if self.repeats:
+            self._noisy = False
+        elif self._first_us is None:
+            self._first_us = now_us
+        elif now_us - self._first_us >= LEARN_US:
+            self._noisy = True
 
     def judge(self, now_us: int, *, flying: bool) -> Message | None:
         """Return a text when it fails now. Standing still, a perfect sensor may repeat itself."""
         if self._seen_us is None:
             return None
-        if not flying:
+        if not (flying or self._noisy):
             self._changed_us = self._seen_us
         before = self.failed
         if now_us - self._seen_us > self.kind.timeout_us:
             self.failed = "TIMEOUT"
-        elif flying and now_us - self._changed_us > self.kind.stale_us:
+        elif now_us - self._changed_us > self.kind.stale_us:
             self.failed = "STALE"
         else:
             self.failed = ""
@@ -109,30 +132,40 @@ class SensorMonitor:
         self.mag, self.baro, self.gps = SensorWatch(MAG), SensorWatch(BARO), SensorWatch(GPS)
         self.all = (self.gyro, self.accel, self.mag, self.baro, self.gps)
         self.distrusted = False
-        """Whether a sensor repeats itself, so that `trusted` leaves something out."""
+        """Whether `trusted` leaves something out of the newest sample."""
+        self._flying = False
 
     def take(self, sample: SensorSample) -> None:
         """Take a tick's sample: which of the slower sensors have measured."""
+        self.distrusted = False
         if sample.mag is not None:
-            self.mag.take(sample)
+            self._take(self.mag, sample)
         if sample.pressure_hpa is not None:
-            self.baro.take(sample)
+            self._take(self.baro, sample)
         if sample.gps is not None:
-            self.gps.take(sample)
+            self._take(self.gps, sample)
+
+    def _take(self, watch: SensorWatch, sample: SensorSample) -> None:
+        watch.take(sample)
+        if self._doubtful(watch):
+            self.distrusted = True
+
+    def _doubtful(self, watch: SensorWatch) -> bool:
+        """Return whether its newest sample must not be fused: not even the first repetition."""
+        return watch.failed == "STALE" or (watch.repeats and self._flying)
 
     def judge(self, sample: SensorSample, *, flying: bool) -> list[Message]:
         """Look at the inertial sensors too, and return what has failed since the last call."""
-        now_us = sample.time_us
+        now_us, self._flying = sample.time_us, flying
         self.gyro.take(sample)
         self.accel.take(sample)
         texts = [watch.judge(now_us, flying=flying) for watch in self.all]
-        self.distrusted = any(w.failed == "STALE" for w in (self.mag, self.baro, self.gps))
         return [text for text in texts if text is not None]
 
     def trusted(self, sample: SensorSample) -> SensorSample:
         """Return a sample without what must not be fused."""
         return sample._replace(
-            mag=None if self.mag.failed else sample.mag,
-            pressure_hpa=None if self.baro.failed else sample.pressure_hpa,
-            gps=None if self.gps.failed else sample.gps,
+            mag=None if self._doubtful(self.mag) else sample.mag,
+            pressure_hpa=None if self._doubtful(self.baro) else sample.pressure_hpa,
+            gps=None if self._doubtful(self.gps) else sample.gps,
         )

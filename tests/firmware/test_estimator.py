@@ -248,6 +248,9 @@ class Witness:
     def predict(self, *_: np.ndarray) -> None:
         pass
 
+    def restart(self, covariance: np.ndarray) -> None:
+        self.covariance = covariance
+
     def fuse(
         self, _state: np.ndarray, innovation: np.ndarray, h: np.ndarray, _variance: np.ndarray
     ) -> float:
@@ -330,6 +333,7 @@ def test_transition_matrix(seed: int) -> None:
 class Log:
     innovations: dict[str, list[tuple[np.ndarray, np.ndarray]]]
     nees: np.ndarray  # (n, 5) of position, velocity, attitude, gyro bias, accel bias; 1 = ideal
+    restarts: int
 
 
 def wander(rig: Rig, seconds: float, seed: int) -> Log:
@@ -368,7 +372,7 @@ def wander(rig: Rig, seconds: float, seed: int) -> Log:
         p = estimator.filter.covariance
         blocks = [p[i : i + 3, i : i + 3] for i in range(0, 15, 3)]
         nees.append([x @ np.linalg.solve(b, x) / 3 for x, b in zip(errors, blocks, strict=True)])
-    return Log(log, np.array(nees))
+    return Log(log, np.array(nees), estimator.consistency.restarts)
 
 
 SEEDS = (0, 1)
@@ -425,6 +429,7 @@ def test_nis_is_never_optimistic(logs: list[Log], name: str) -> None:
         nis = np.einsum("ni,nij,nj->n", i, np.linalg.inv(s), i)
         freedom = i.size
         assert nis.sum() < chi2.ppf(0.999, freedom)
+        assert log.restarts == 0, "healthy sensors are never taken for failed ones"
         assert np.all(np.abs(i) < GATE * np.sqrt(np.einsum("nii->ni", s)))
 
 

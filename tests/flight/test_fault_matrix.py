@@ -13,6 +13,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
 from airl_mav.experiments.fault_matrix import Cell, cell_text, fly_matrix, markdown
 from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES
+from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
 from tests.support.flight_rig import quad
 
@@ -35,6 +36,30 @@ def test_what_a_quadrotor_survives_and_what_not() -> None:
     assert motor.end in FALLS
     assert motor.touchdown_m_s is not None
     assert motor.touchdown_m_s > 2.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "phase", "end"),
+    [
+        ("accel bias 0.5,0.5,0.5m/s2", "hold", "landed"),
+        ("accel bias 0,0,-3m/s2", "climb", "landed"),
+        ("gyro bias 2,2,2deg/s", "landing", "landed"),
+        ("gyro bias 0,0,8deg/s", "hold", "landed"),
+        ("gps stuck", "climb", "landed"),
+        ("gps noise 5x", "ground", "landed"),
+        # What is wrong before take-off keeps the vehicle on the ground.
+        ("accel off", "ground", "not armed"),
+        ("mag bias 0.1,0.1,0gauss", "ground", "not armed"),
+        ("gps off", "ground", "not armed"),
+    ],
+)
+def test_the_estimator_copes_with_sensors_that_fail(fault: str, phase: Phase, end: str) -> None:
+    flown = fly_fault(quad(), fault, phase, 2)
+    assert flown.end == end, flown
+    assert (flown.touchdown_m_s or 0.0) < 1.0
+    assert flown.farthest_m < 10.0
+    told = any(text.startswith("Estimator biases reset") for text in flown.said)
+    assert told is ("bias" in fault and end == "landed"), flown.said
 
 
 def flight(end: str, touchdown_m_s: float | None = None) -> FaultFlight:

@@ -118,6 +118,7 @@ class Supervisor:
             self.conditions,
             self._arming,
             converged=self._estimator.healthy,
+            compass_agrees=not self._estimator.compass.given_up,
             gyro=sensors.gyro.has_data(now_us),
             accel=sensors.accel.has_data(now_us),
             mag=sensors.mag.has_data(now_us),

@@ -88,6 +88,8 @@ class Watch:
         self._takeoff_us: int | None = None
         self._local, self._relaxed, self._velocity = Validity(), Validity(), Validity()
         self._gps_fused = False
+        self._restarts = 0
+        self._compass_given_up = False
 
     def read_parameters(self) -> None:
         """Read the parameters anew."""
@@ -133,7 +135,7 @@ class Watch:
         elif not armed:
             self._takeoff_us = None
         accuracy, speed_accuracy = estimator.accuracy()
-        position = estimator.knows_position(now_us)
+        position = estimator.knows_position(now_us, flying=phase is _AIR)
         needed = p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf
         if estimator.origin is not None:
             for validity, sigma, limit in (
@@ -194,6 +196,16 @@ class Watch:
                 texts.append(Message(Severity.INFO, "GNSS data fusion started"))
             elif phase >= _GROUND:
                 texts.append(Message(Severity.WARNING, "GNSS data fusion stopped"))
+        estimator = self._estimator
+        if estimator.consistency.restarts != self._restarts:
+            self._restarts = estimator.consistency.restarts
+            text = "Estimator biases reset: IMU and GNSS disagree"
+            texts.append(Message(Severity.WARNING, text))
+        if estimator.compass.given_up is not self._compass_given_up:
+            given_up = self._compass_given_up = estimator.compass.given_up
+            if given_up and phase >= _GROUND:
+                text = "Compass needs calibration - Land now!"
+                texts.append(Message(Severity.CRITICAL, text))
         return texts
 
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
