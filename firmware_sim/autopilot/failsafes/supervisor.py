@@ -1,6 +1,6 @@
 """Puts the failsafes together for one vehicle: look, decide, tell.
 
-It looks at 50 Hz and whenever the user does something; the state machine runs only when something
+It looks at 10 Hz, as PX4's commander, and whenever the user does something; the state machine runs only when something
 has changed or a delay is running.
 """
 
@@ -29,7 +29,7 @@ from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.prearm import ArmingSettings, Check, Readiness
 from firmware_sim.interfaces import SensorSample
 
-LOOK_US = 20_000
+LOOK_US = 100_000
 """Time between two looks [µs]."""
 
 CHECK_US = 100_000
