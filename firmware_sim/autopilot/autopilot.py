@@ -394,5 +394,6 @@ class BuiltinAutopilot:
             takeoff_us=self._commander.takeoff_us,
             mission=progress(self.plans),
             fence=self._navigator.fence.status,
+            health=self.supervisor.health(sample.time_us),
         )
         return self._snapshot

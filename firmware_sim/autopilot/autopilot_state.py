@@ -212,6 +212,30 @@ class OrbitStatus(NamedTuple):
     """Local NED [m]."""
 
 
+class Health(NamedTuple):
+    """What can be believed and used, as sensors, estimator and pre-arm checks have it."""
+
+    gyro: bool = True
+    accel: bool = True
+    mag: bool = True
+    baro: bool = True
+    gps: bool = True
+    attitude: bool = True
+    velocity: bool = True
+    """Horizontal, of the estimate."""
+    position: bool = True
+    """Horizontal, of the estimate."""
+    altitude: bool = True
+    accel_error: bool = False
+    """Inertial data disagreed with the GPS lately."""
+    battery: bool = True
+    armable: bool = True
+    """No check keeps the vehicle from arming in its mode."""
+
+
+ALL_HEALTHY = Health()
+
+
 class AutopilotState(NamedTuple):
     """One consistent snapshot after a tick."""
 
@@ -247,3 +271,4 @@ class AutopilotState(NamedTuple):
     fence: FenceStatus = NO_BREACH
     orbit: OrbitStatus | None = None
     """In Orbit mode."""
+    health: Health = ALL_HEALTHY

@@ -42,6 +42,9 @@ _NEEDED = ("gps", "mag", "pressure_hpa")
 GPS_GONE_US = 1_000_000
 """GPS that was not fused for so long no longer aids the filter (EKF2: its data are late)."""
 
+PROBATION_US = 10 * US_PER_S
+"""Inertial sensors that were wrong are doubted for so long (EKF2: BADACC_PROBATION) [µs]."""
+
 BIAS_STEP_S = 0.01
 """PX4's filter runs at 100 Hz; its bias process noises (EKF2_*_B_NOISE) are per such a step [s]."""
 
@@ -196,6 +199,11 @@ class Estimator:
         """Return whether GPS has been fused lately."""
         fused = self._gps_horizontal.fused_us
         return fused is not None and now_us - fused <= GPS_GONE_US
+
+    def doubts_inertial(self, now_us: int) -> bool:
+        """Return whether inertial data disagreed with the GPS lately."""
+        restarted = self.consistency.restarted_us
+        return restarted is not None and now_us - restarted < PROBATION_US
 
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""

@@ -339,16 +339,11 @@ def failing(readiness: Readiness) -> tuple[Check, ...]:
     return tuple(check for check in CHECKS if check.fails(readiness))
 
 
+def blocking(checks: tuple[Check, ...], readiness: Readiness) -> tuple[Check, ...]:
+    """Return those of the failing checks that keep the vehicle from arming in its mode."""
+    return tuple(check for check in checks if check.blocks is None or check.blocks(readiness))
+
+
 def can_arm(readiness: Readiness) -> tuple[Check, ...]:
     """Return the checks that keep the vehicle from arming in a mode; none = it may."""
-    return tuple(
-        check for check in failing(readiness) if check.blocks is None or check.blocks(readiness)
-    )
-
-
-def unhealthy(checks: tuple[Check, ...]) -> Part:
-    """Return the parts that fail in these checks."""
-    parts = Part(0)
-    for check in checks:
-        parts |= check.part
-    return parts
+    return blocking(failing(readiness), readiness)

@@ -8,8 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint, Severity
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.interfaces import ActuatorControls, SensorSample
 from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 

@@ -13,7 +13,14 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, TICK_US, US_PER_S
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode, Setpoint
+from firmware_sim.autopilot.autopilot_state import (
+    Arming,
+    AutopilotState,
+    Health,
+    Landed,
+    Mode,
+    Setpoint,
+)
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.px4_custom_mode import (
     base_mode,
@@ -22,7 +29,7 @@ from firmware_sim.mavlink.px4_custom_mode import (
     system_status,
 )
 from firmware_sim.mavlink.scheduler import OFF, StreamScheduler
-from firmware_sim.mavlink.streams import units
+from firmware_sim.mavlink.streams import status, units
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
 
@@ -319,6 +326,61 @@ def test_estimator_status() -> None:
     assert message.pos_horiz_accuracy == pytest.approx(math.hypot(0.01, 0.02))
     assert message.pos_vert_accuracy == pytest.approx(0.03)
     assert newest(KinematicAutopilot(), "ESTIMATOR_STATUS").flags == 0
+
+
+def healthy_sensors(state: AutopilotState) -> int:
+    return int(status.sys_status(state)[2])
+
+
+def estimator_flags(state: AutopilotState) -> int:
+    return int(status.estimator_status(state)[1])
+
+
+@pytest.mark.parametrize(
+    ("lost", "sensor", "estimator"),
+    [
+        ({"gyro": False}, 0x1, 0),
+        ({"accel": False}, 0x2, 0),
+        ({"mag": False}, 0x4, 0),
+        ({"baro": False}, 0x8, 0),
+        ({"gps": False}, 0x20, 0),
+        ({"attitude": False}, 0x20_0000, 1),
+        ({"battery": False}, 0x200_0000, 0),
+        ({"velocity": False}, 0, 2),
+        ({"altitude": False}, 0, 4 | 32),
+        ({"position": False}, 0, 8 | 16 | 256 | 512),
+    ],
+)
+def test_what_has_failed_clears_its_bits(
+    lost: dict[str, bool], sensor: int, estimator: int
+) -> None:
+    state = flown().state()
+    failed = state._replace(health=Health(**lost))
+    assert healthy_sensors(state) & ~healthy_sensors(failed) == sensor
+    assert estimator_flags(state) & ~estimator_flags(failed) == estimator
+
+
+def test_the_prearm_bit_is_that_of_the_checks_until_armed() -> None:
+    state = flown().state()
+    for arming, armable, shown in (
+        (Arming.BOOT, True, False),
+        (Arming.STANDBY, True, True),
+        (Arming.STANDBY, False, False),
+        (Arming.ARMED, False, True),
+    ):
+        changed = state.status._replace(arming=arming)
+        told = state._replace(status=changed, health=Health(armable=armable))
+        assert bool(healthy_sensors(told) & 0x1000_0000) is shown
+
+
+def test_estimator_faults_set_their_bits() -> None:
+    state = flown().state()
+    ratios = np.array([1.5, 0.0, 0.0, 0.0])
+    glitch = state._replace(estimate=state.estimate._replace(innovation_ratio=ratios))
+    assert estimator_flags(glitch) & 0x400
+    doubted = state._replace(health=Health(accel_error=True))
+    assert estimator_flags(doubted) & 0x800
+    assert not estimator_flags(state) & 0xC00
 
 
 def test_motors() -> None:

@@ -1,7 +1,7 @@
 """Puts the failsafes together for one vehicle: look, decide, tell.
 
-It looks at 10 Hz, as PX4's commander, and whenever the user does something; the state machine runs only when something
-has changed or a delay is running.
+It looks at 10 Hz, as PX4's commander, and whenever the user does something; the state machine runs
+only when something has changed or a delay is running.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot import prearm
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import Health, Message, Mode, Setpoint, Severity
 from firmware_sim.autopilot.commander import Flight, Phase
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.failsafes.actions import Action
-from firmware_sim.autopilot.failsafes.conditions import Conditions, Need, lacking
+from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, Need, lacking
 from firmware_sim.autopilot.failsafes.framework import (
     NO_INTERVENTION,
     FailsafeState,
@@ -30,7 +30,7 @@ from firmware_sim.autopilot.prearm import ArmingSettings, Check, Readiness
 from firmware_sim.interfaces import SensorSample
 
 LOOK_US = 100_000
-"""Time between two looks [µs]."""
+"""Time between two looks [µs] (PX4's commander: 10 Hz): a loss is noticed that much later."""
 
 CHECK_US = 100_000
 """Time between two runs of the pre-arm checks [µs] (PX4: 10 Hz)."""
@@ -67,12 +67,15 @@ class Supervisor:
         """What was wrong at the last look."""
         self.failing: tuple[Check, ...] = ()
         """Pre-arm checks that failed at the last look."""
+        self._armable = False
         self._state = FailsafeState()
         self._decided: tuple[object, ...] = ()
         self._told: tuple[Check, ...] | None = None
         """Checks that were told as failing; None: nothing is told before the vehicle is ready."""
         self._told_us = 0
         self._check_us = 0
+        self._checked = Phase.BOOT
+        """Phase of the flight that was checked last."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
@@ -104,9 +107,12 @@ class Supervisor:
         self.next_us = now_us + LOOK_US
         before = self.conditions
         self.conditions, texts = self.watch.look(sample, flight.phase)
-        if now_us >= self._check_us or self.conditions != before:
-            self._check_us = now_us + CHECK_US
-            self.failing = prearm.failing(self.readiness(sample, flight, flight.mode))
+        changed = self.conditions != before or flight.phase is not self._checked
+        if now_us >= self._check_us or changed:
+            self._check_us, self._checked = now_us + CHECK_US, flight.phase
+            readiness = self.readiness(sample, flight, flight.mode)
+            self.failing = prearm.failing(readiness)
+            self._armable = not prearm.blocking(self.failing, readiness)
             texts += self._report(now_us, flight)
         return texts
 
@@ -129,6 +135,25 @@ class Supervisor:
             charge=sample.battery.remaining,
             terminated=flight.mode is Mode.TERMINATION,
             armed=flight.phase >= _GROUND,
+        )
+
+    def health(self, now_us: int) -> Health:
+        """Return what can be believed and used, for clients."""
+        seen, sensors = self.conditions, self.sensors
+        mag, baro, gps = (s.has_data(now_us) for s in (sensors.mag, sensors.baro, sensors.gps))
+        return Health(
+            gyro=not seen.angular_velocity_invalid,
+            accel=sensors.accel.has_data(now_us),
+            mag=mag and not self._estimator.compass.given_up,
+            baro=baro,
+            gps=gps,
+            attitude=not seen.attitude_invalid,
+            velocity=not seen.local_velocity_invalid,
+            position=not seen.local_position_invalid,
+            altitude=not seen.local_altitude_invalid,
+            accel_error=self._estimator.doubts_inertial(now_us),
+            battery=seen.battery_warning < BatteryWarning.CRITICAL and not seen.battery_unhealthy,
+            armable=self._armable,
         )
 
     def _report(self, now_us: int, flight: Flight) -> list[Message]:

@@ -59,30 +59,19 @@ _LANDED = {
 }
 
 _SENSORS_ALWAYS = (
-    dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
-    | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
-    | dialect.MAV_SYS_STATUS_EXTENSION_USED
+    dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS | dialect.MAV_SYS_STATUS_EXTENSION_USED
 )
 _SENSORS_PRESENT = (
     _SENSORS_ALWAYS
+    | dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
     | dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
     | dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
     | dialect.MAV_SYS_STATUS_SENSOR_GPS
     | dialect.MAV_SYS_STATUS_AHRS
+    | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
     | dialect.MAV_SYS_STATUS_PREARM_CHECK
 )
-
-_ESTIMATOR_GOOD = (
-    dialect.ESTIMATOR_ATTITUDE
-    | dialect.ESTIMATOR_VELOCITY_HORIZ
-    | dialect.ESTIMATOR_VELOCITY_VERT
-    | dialect.ESTIMATOR_POS_HORIZ_REL
-    | dialect.ESTIMATOR_POS_VERT_ABS
-    | dialect.ESTIMATOR_PRED_POS_HORIZ_REL
-)
-_ESTIMATOR_GOOD_GLOBAL = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
 
 
 def heartbeat(state: AutopilotState) -> Values:
@@ -105,22 +94,29 @@ def extended_sys_state(state: AutopilotState) -> Values:
 
 def sys_status(state: AutopilotState) -> Values:
     """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%]."""
-    health: int = _SENSORS_ALWAYS
-    if bool(state.mag.any()):
-        health |= dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
-    if state.pressure_hpa > 0.0:
-        health |= dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    if state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX:
-        health |= dialect.MAV_SYS_STATUS_SENSOR_GPS
-    if state.estimate.healthy:
-        health |= dialect.MAV_SYS_STATUS_AHRS
-    if state.status.arming is not Arming.BOOT:
-        health |= dialect.MAV_SYS_STATUS_PREARM_CHECK
+    health = state.health
+    fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
+    bits: int = _SENSORS_ALWAYS
+    for good, bit in (
+        (health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO),
+        (health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL),
+        (health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG),
+        (
+            health.baro and state.pressure_hpa > 0.0,
+            dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
+        ),
+        (health.gps and fixed, dialect.MAV_SYS_STATUS_SENSOR_GPS),
+        (health.attitude and _knows(state), dialect.MAV_SYS_STATUS_AHRS),
+        (health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY),
+        (_may_be_armed(state), dialect.MAV_SYS_STATUS_PREARM_CHECK),
+    ):
+        if good:
+            bits |= bit
     battery = state.battery
     return (
         _SENSORS_PRESENT,
         _SENSORS_PRESENT,
-        health,
+        bits,
         uint16(state.load * 1e3),
         uint16(battery.voltage_v * 1e3),
         int16(battery.current_a * 100.0, unknown=-1),
@@ -132,14 +128,47 @@ def sys_status(state: AutopilotState) -> Values:
 def estimator_status(state: AutopilotState) -> Values:
     """Which outputs are good, innovation test ratios (1 = rejection gate), accuracies [m]."""
     estimate = state.estimate
-    flags: int = 0
-    if estimate.healthy:
-        flags = _ESTIMATOR_GOOD | (_ESTIMATOR_GOOD_GLOBAL if state.origin is not None else 0)
+    flags = _estimator_flags(state) if _knows(state) else 0
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
     airspeed = terrain = math.nan
     ratios = (max(horizontal, vertical), horizontal, height, mag, terrain, airspeed)
     return estimate.time_us, flags, *ratios, math.hypot(north, east), down
+
+
+def _knows(state: AutopilotState) -> bool:
+    """Return whether the estimator has converged; once armed, its health alone counts."""
+    return state.estimate.healthy or state.status.arming is Arming.ARMED
+
+
+def _may_be_armed(state: AutopilotState) -> bool:
+    """Return whether the pre-arm checks pass; armed, they do."""
+    arming = state.status.arming
+    return arming is Arming.ARMED or (state.health.armable and arming is Arming.STANDBY)
+
+
+def _estimator_flags(state: AutopilotState) -> int:
+    """Return the flags of a converged estimator."""
+    health, known = state.health, state.origin is not None
+    flags: int = 0
+    for good, bits in (
+        (health.attitude, dialect.ESTIMATOR_ATTITUDE),
+        (health.velocity, dialect.ESTIMATOR_VELOCITY_HORIZ),
+        (health.altitude, dialect.ESTIMATOR_VELOCITY_VERT | dialect.ESTIMATOR_POS_VERT_ABS),
+        (
+            health.position,
+            dialect.ESTIMATOR_POS_HORIZ_REL | dialect.ESTIMATOR_PRED_POS_HORIZ_REL,
+        ),
+        (
+            health.position and known,
+            dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS,
+        ),
+        (bool(state.estimate.innovation_ratio[0] > 1.0), dialect.ESTIMATOR_GPS_GLITCH),
+        (health.accel_error, dialect.ESTIMATOR_ACCEL_ERROR),
+    ):
+        if good:
+            flags |= bits
+    return flags
 
 
 def mission_current(state: AutopilotState) -> Values:
