@@ -8,11 +8,11 @@ import shutil
 import tempfile
 from pathlib import Path
 
-GREATEST_BYTES = 256 * 1024 * 1024
+GREATEST_BYTES = 64 * 1024 * 1024
 """What clients may store altogether: a stranger cannot fill the disk [bytes]."""
 
-GREATEST_FILES = 10_000
-"""How many files and folders clients may store."""
+GREATEST_FILES = 1_000
+"""How many files and folders clients may store: they are counted and listed within a tick."""
 
 
 class Storage:
@@ -50,9 +50,15 @@ class Storage:
     def check_room(self, more_bytes: int) -> None:
         """Raise OSError (ENOSPC) when clients have stored too much to store this many bytes."""
         used = count = 0
-        for path in self.folder.rglob("*"):
-            count += 1
-            used += path.lstat().st_size
+        folders = [os.fspath(self.folder)]
+        while folders:
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    count += 1
+                    if entry.is_dir(follow_symlinks=False):
+                        folders.append(entry.path)
+                    else:
+                        used += entry.stat(follow_symlinks=False).st_size
         if used + more_bytes > GREATEST_BYTES or count >= GREATEST_FILES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -8,6 +8,7 @@ another.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -16,7 +17,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
 from firmware_sim.mavlink.allowance import Allowance
-from firmware_sim.mavlink.codec import Decoder, WireMessage
+from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
 from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
@@ -59,8 +60,18 @@ class Client:
     allowance: Allowance = field(default_factory=Allowance)
     forwards: Allowance = field(default_factory=lambda: Allowance(FORWARDS_PER_S, FORWARDS_PER_S))
     """What of it is passed on to others."""
+    late: list[str] = field(default_factory=list)
+    """Streams that have found no room in their tick."""
     components: set[tuple[int, int]] = field(default_factory=set)
     """System and component ids of who has been heard from its side."""
+
+    def due(self, now_us: int) -> list[str]:
+        """Return the streams to send now, at simulated time [µs]: first what is late."""
+        due = self.link.scheduler.due(now_us)
+        if self.late:
+            late, self.late = self.late, []
+            due = [*late, *(name for name in due if name not in late)]
+        return due
 
     def close(self) -> None:
         """Release what is held for it."""
@@ -99,6 +110,8 @@ class Clients:
         self._clock = clock
         self._signing = signing
         self._spent_us = 0
+        self._backlog: deque[tuple[Client, WireMessage]] = deque()
+        """What was decoded when the link's share of the tick was spent."""
         self._clients: dict[Peer, Client] = {}
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
         """Reads what nobody known has sent."""
@@ -133,6 +146,7 @@ class Clients:
 
     def restart(self, now_us: int) -> None:
         """Take simulated `now_us` [µs] as the present, whatever it was before."""
+        self._backlog.clear()
         self._strangers.renew()
         for client in self._clients.values():
             client.allowance.renew()
@@ -145,29 +159,37 @@ class Clients:
         What exceeds the allowance of its sender is dropped and counted; when the link's share of
         the tick is spent, the rest waits.
         """
-        clock = self._clock
+        clock, backlog = self._clock, self._backlog
         if clock is not None and self._spent_us >= LISTEN_US:
             return
-        began_us = 0 if clock is None else clock.time_us()
-        spent_us = self._spent_us
-        for peer, chunk in self.endpoint.arrivals():
-            client = self._clients.get(peer)
-            if client is None:
-                client, messages = self._meet(peer, chunk, now_us)
-            elif client.allowance.left(now_us):
-                messages = client.link.decode(chunk)
-                client.allowance.take(max(1, len(messages)), now_us)
+        began_us = 0 if clock is None else clock.time_us() - self._spent_us
+        arrivals = self.endpoint.arrivals()
+        while clock is None or self._spent_us < LISTEN_US:
+            if backlog:
+                yield backlog.popleft()
             else:
-                self._dropped += 1
-                messages = []
-            if client is not None and messages:
-                client.heard_us = now_us
-                for message in messages:
-                    yield client, message
-            if clock is not None:
-                self._spent_us = spent_us + clock.time_us() - began_us
-                if self._spent_us >= LISTEN_US:
+                arrived = next(arrivals, None)
+                if arrived is None:
                     return
+                backlog.extend(self._heard(*arrived, now_us))
+            if clock is not None:
+                self._spent_us = clock.time_us() - began_us
+
+    def _heard(self, peer: Peer, chunk: bytes, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
+        """Yield what a chunk says, and who has sent it; nothing of what exceeds an allowance."""
+        client = self._clients.get(peer)
+        if client is None:
+            client, messages = self._meet(peer, chunk, now_us)
+        elif client.allowance.left(now_us):
+            messages = client.link.decode(chunk)
+            client.allowance.take(max(1, len(messages)), now_us)
+        else:
+            self._dropped += 1
+            return
+        if client is not None and messages:
+            client.heard_us = now_us
+            for message in messages:
+                yield client, message
 
     def forget_silent(self, now_us: int, silent_us: int = SILENT_US) -> None:
         """Forget who has said nothing for long before simulated `now_us` [µs]."""
@@ -196,6 +218,10 @@ class Clients:
             heard = len(messages)
             messages = [m for m in messages if self._signing.accepts(bytes(m.get_msgbuf()))]
             self._gone += LinkCounters(0, 0, 0, 0, 0, refused=heard - len(messages))
+            if not any(is_signed(m) for m in messages):
+                # What passes unsigned makes nobody a client: else one heartbeat with a false
+                # address would send that address telemetry for minutes.
+                return None, []
         if not messages:
             return None, []
         end = self.endpoint.towards(peer)

@@ -36,6 +36,7 @@ __all__ = [
     "Values",
     "WireMessage",
     "dialect",
+    "is_signed",
     "layout",
     "message_id",
     "message_name",
@@ -60,6 +61,10 @@ _MARKER_V1, _MARKER_V2 = 0xFE, 0xFD
 _HEADER_V1, _HEADER_V2 = 6, 10
 _CHECKSUM, _SIGNATURE = 2, 13
 _FLAG_SIGNED = 0x01
+
+MOST_DAMAGED = 64
+"""Damaged frames in one chunk after which the rest of it is dropped: each costs as much as a valid
+one, and a hostile chunk can seem to begin one at every byte."""
 
 _MARK_V2 = bytes([_MARKER_V2])
 _HEADER_PACK = struct.Struct("<BBBB2s3s").pack
@@ -91,6 +96,12 @@ def payload(message: WireMessage) -> bytes:
     frame: bytearray = message.get_msgbuf()
     start = _HEADER_V2 if frame[0] == _MARKER_V2 else _HEADER_V1
     return bytes(frame[start : start + frame[1]])
+
+
+def is_signed(message: WireMessage) -> bool:
+    """Return whether a received message has a signature, right or wrong."""
+    frame: bytearray = message.get_msgbuf()
+    return frame[0] == _MARKER_V2 and bool(frame[2] & _FLAG_SIGNED)
 
 
 def param_value(name: str, raw: bytes, kind: int, count: int, index: int) -> bytes:
@@ -224,7 +235,7 @@ class Decoder:
         buffer = self._rest + data
         self._rest = b""
         found: list[WireMessage] = []
-        start = 0
+        start = damaged = 0
         while start < len(buffer):
             end = _frame_end(buffer, start)
             if end is not None and end > len(buffer):
@@ -234,6 +245,11 @@ class Decoder:
                     return found
                 end = None
             message = None if end is None else self._decode(buffer, start, end)
+            damaged += end is not None and message is None
+            if damaged > MOST_DAMAGED:
+                self.malformed += not self._in_garbage
+                self._in_garbage = not self._datagrams
+                return found
             if end is None or message is None:
                 self.malformed += not self._in_garbage
                 self._in_garbage = True

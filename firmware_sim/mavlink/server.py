@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 
 from airl_mav.core.clock import Clock
@@ -13,6 +13,7 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
+from firmware_sim.mavlink.complaints import Complaints
 from firmware_sim.mavlink.endpoint import Endpoint, Peer
 from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
@@ -34,6 +35,13 @@ _DISCARD_CALLS = 4
 PIECES_PER_TICK = 32
 """Messages of lists and files that all clients together get per tick: 8,000 a second. One client
 gets less in its turn; many share it, and a tick stays a tick."""
+
+STREAMS_PER_TICK = 256
+"""Streamed messages of all clients together per tick: 64,000 a second, a hundred times what PX4
+sends by default. Who asks for more gets it later: all clients have equal shares then."""
+
+TEXTS_PER_TICK = 8
+"""Texts of services that go to all operators per tick."""
 
 FORGET_EVERY_US = US_PER_S
 """Silent clients are looked for so often [µs]."""
@@ -82,6 +90,7 @@ class MavlinkServer:
         self._system_id = SYSTEM_ID
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        self._complaints = Complaints()
         self._first_in_turn = 0
         """Place of the client that is the next to get what it gets piece by piece."""
         self._senders = Senders()
@@ -112,6 +121,7 @@ class MavlinkServer:
         self._forget_us = 0
         self._system_id = _system_id(port)
         self._senders.forget()
+        self._complaints.restart()
         self._vibration = VibrationMeter()
         self._calibration = RunningCalibration()
         for clients in self._links:
@@ -149,32 +159,36 @@ class MavlinkServer:
         sample = port.sample
         if sample is not None:
             self._vibration.update(sample)
-        texts = port.take_messages()
+        texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
         self._send_pending(now_us)
         state: AutopilotState | None = None
         payloads: Payloads = {}
         for clients in self._links:
             clients.renew()
-            for client in clients:
-                link = client.link
-                for text in texts:
-                    for chunk in client.texts.encode(text):
-                        link.stream(chunk)
-                due = link.scheduler.due(now_us)
-                if due or client.announced_origin is None:
-                    # Not in every tick: the snapshot costs more than asking the schedulers.
-                    if state is None:
-                        state = port.state()
-                    if state.origin is not None and state.origin != client.announced_origin:
-                        client.announced_origin = state.origin
-                        link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
-                if state is not None:
-                    link.stream_due(due, state, payloads)
-                link.flush()
+        due = [(client, client.due(now_us)) for client in self._all()]
+        share = _share([len(names) for _, names in due])
+        for client, names in due:
+            link = client.link
+            for text in texts:
+                for chunk in client.texts.encode(text):
+                    link.stream(chunk)
+            if len(names) > share:
+                names, client.late = names[:share], names[share:]
+            if names or client.announced_origin is None:
+                # Not in every tick: the snapshot costs more than asking the schedulers.
+                if state is None:
+                    state = port.state()
+                if state.origin is not None and state.origin != client.announced_origin:
+                    client.announced_origin = state.origin
+                    link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
+                link.stream_due(names, state, payloads)
+            link.flush()
         if now_us >= self._forget_us:
             self._forget_us = now_us + FORGET_EVERY_US
             for clients in self._links:
                 clients.forget_silent(now_us)
+                for text in self._complaints.due(clients.name, clients.counters, now_us):
+                    _tell(clients, text)
             if self._stored is not None:
                 self._stored.save_due()
 
@@ -259,7 +273,7 @@ class MavlinkServer:
             client.link,
             port,
             self._now_us,
-            self._texts.append,
+            self._announce,
             self._broadcast,
             self._signing,
             self._system_id,
@@ -295,11 +309,14 @@ class MavlinkServer:
 
     def _send_texts(self) -> None:
         """Send the texts of the services to the operators."""
-        for client in self._all():
-            for text in self._texts:
-                for chunk in client.reply_texts.encode(text):
-                    client.link.send(chunk)
+        for text in self._texts:
+            _tell(self._all(), text)
         self._texts.clear()
+
+    def _announce(self, text: Message) -> None:
+        """Tell the operators once a tick: a client that repeats itself must not flood others."""
+        if text not in self._texts and len(self._texts) < TEXTS_PER_TICK:
+            self._texts.append(text)
 
     def _broadcast(self, name: str, payload: bytes) -> None:
         for client in self._all():
@@ -312,6 +329,19 @@ class MavlinkServer:
         if self._port is None:
             return None
         return sensors.battery_status(state, self._port.parameters)
+
+
+def _tell(clients: Iterable[Client], text: Message) -> None:
+    for client in clients:
+        for chunk in client.reply_texts.encode(text):
+            client.link.send(chunk)
+
+
+def _share(asked: Sequence[int]) -> int:
+    """Return how many streamed messages each client may get in a tick, of those it asks for."""
+    if sum(asked) <= STREAMS_PER_TICK:
+        return STREAMS_PER_TICK
+    return max(1, STREAMS_PER_TICK // sum(1 for number in asked if number))
 
 
 def _system_id(port: AutopilotPort) -> int:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from firmware_sim.mavlink.clients import Client
 from firmware_sim.mavlink.tlog import TlogWriter
 
 MAX_LOGS = 16
 """Logs of a flight beside the main one."""
+
+
+MAX_BYTES = 1 << 28
+"""Size at which a log beside the main one ends: hours of telemetry, and a flood fills no disk."""
 
 
 class TrafficLog:
@@ -59,4 +63,11 @@ class TrafficLog:
 
     def _tap(self, client: Client, tlog: TlogWriter) -> None:
         self._logged[client] = tlog
-        client.link.tap = lambda frames: tlog.write(self._now_us(), *frames)
+
+        def write(frames: Sequence[bytes]) -> None:
+            if tlog is not self._main and tlog.size_bytes >= MAX_BYTES:
+                client.link.tap = None
+                return
+            tlog.write(self._now_us(), *frames)
+
+        client.link.tap = write

@@ -61,7 +61,7 @@ class Context:
 
     def close(self) -> None:
         """Release what is held for the client: it has gone, or another autopilot comes."""
-        self.ftp.session.close()
+        self.ftp.close()
 
 
 def for_vehicle(message: WireMessage, context: Context) -> bool:

@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import errno
 import struct
+from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, read_at
-from firmware_sim.mavlink.services.ftp_session import Burst, Code, RefusedError, Request
+from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
+from firmware_sim.mavlink.services.ftp_session import Burst, Code, RefusedError, Request, Summing
 
 _HEADER = struct.Struct("<HBBBBBxI")
 """Sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
 
 _PAYLOAD_BYTES = 251
-_BURST = 15
+_CRC32, _BURST = 14, 15
 _ACK, _NAK = 128, 129
 
 BURST_MESSAGES = 8
@@ -43,6 +44,9 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     if sequence == client.last_sequence:
         _send(client.last_answer, asker, context)
         return True
+    if client.summing is not None and client.summing.sequence == sequence:
+        return True  # asked again, out of impatience
+    client.stop_summing()
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
         client.session.close()
     client.used_us = context.now_us
@@ -55,21 +59,58 @@ def handle_request(message: WireMessage, context: Context) -> bool:
             client.session.opened(request)
             client.burst = Burst((sequence + 1) & 0xFFFF, offset, asker)
             return True
+        if opcode == _CRC32:
+            component_metadata.provide(context.storage)
+            checksum = Checksum(context.storage.path(request.name))
+            client.burst = None
+            client.summing = Summing(sequence, offset, asker, checksum)
+            _sum(client.summing, context)
+            return True
         answer = _carried_out(request, context)
         kind = _ACK
     except (RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
     client.burst = None
-    body = _packed((sequence + 1) & 0xFFFF, kind, opcode, offset, answer)
-    small = len(answer) <= _SMALL_BYTES
-    client.last_sequence, client.last_answer = (sequence, body) if small else (None, b"")
-    _send(body, asker, context)
+    _answer(Answered(sequence, opcode, offset, asker), kind, answer, context)
     return True
 
 
-def send_pending(context: Context) -> None:
-    """Send the next messages of a burst; call once per tick."""
+class Answered(NamedTuple):
+    """What an answer says of its request."""
+
+    sequence: int
+    opcode: int
+    offset: int
+    asker: tuple[int, int]
+
+
+def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> None:
     client = context.ftp
+    sequence = (request.sequence + 1) & 0xFFFF
+    body = _packed(sequence, kind, request.opcode, request.offset, answer)
+    small = len(answer) <= _SMALL_BYTES
+    client.last_sequence, client.last_answer = (request.sequence, body) if small else (None, b"")
+    _send(body, request.asker, context)
+
+
+def _sum(summing: Summing, context: Context) -> None:
+    """Go on with a checksum, and answer when it is known."""
+    kind = _ACK
+    try:
+        answer = summing.sum.go_on()
+    except OSError as error:
+        answer, kind = _error(error), _NAK
+    if answer is not None:
+        context.ftp.stop_summing()
+        asked = Answered(summing.sequence, _CRC32, summing.offset, summing.asker)
+        _answer(asked, kind, answer, context)
+
+
+def send_pending(context: Context) -> None:
+    """Send the next messages of a burst, or go on with a checksum; call once per tick."""
+    client = context.ftp
+    if client.summing is not None:
+        _sum(client.summing, context)
     if client.burst is None:
         return
     for _ in range(BURST_MESSAGES):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -39,29 +39,26 @@ def _list(request: Request, _session: Session, storage: Storage) -> bytes:
     folder = storage.path(request.name)
     if not folder.is_dir():
         raise RefusedError(Code.FILE_NOT_FOUND)
+    with os.scandir(folder) as scanned:
+        entries = sorted(scanned, key=lambda entry: entry.name)
     found = bytearray()
-    for number, entry in enumerate(_entries(folder)):
-        if number < request.offset:
-            continue
-        if len(found) + len(entry) > DATA_BYTES:
+    for entry in entries[request.offset :]:
+        line = _line(entry)
+        if len(found) + len(line) > DATA_BYTES:
             break
-        found += entry
+        found += line
     if not found:
         raise RefusedError(Code.END_OF_FILE)
     return bytes(found)
 
 
-def _entries(folder: Path) -> Iterator[bytes]:
-    for path in sorted(folder.iterdir()):
-        name = os.fsencode(path.name)
-        if path.is_symlink():
-            yield b"S\0"  # skipped, as by PX4
-        elif path.is_dir():
-            yield b"D" + name + b"\0"
-        elif path.is_file():
-            yield b"F" + name + b"\t%d" % path.stat().st_size + b"\0"
-        else:
-            yield b"S\0"
+def _line(entry: os.DirEntry[str]) -> bytes:
+    name = os.fsencode(entry.name)
+    if entry.is_dir(follow_symlinks=False):
+        return b"D" + name + b"\0"
+    if entry.is_file(follow_symlinks=False):
+        return b"F" + name + b"\t%d" % entry.stat().st_size + b"\0"
+    return b"S\0"  # a link, say: skipped, as by PX4
 
 
 def _open_to_read(request: Request, session: Session, storage: Storage) -> bytes:
@@ -127,21 +124,17 @@ def _reset(_request: Request, session: Session, _storage: Storage) -> bytes:
     return b""
 
 
-def _remove_file(request: Request, _session: Session, storage: Storage) -> bytes:
-    _writable(request.name, storage).unlink()
-    return b""
+def _on_path(change: Callable[[Path], object], *, more: bool = False) -> Operation:
+    """Return what changes the file or folder that a request names; `more`: it makes one."""
 
+    def operation(request: Request, _session: Session, storage: Storage) -> bytes:
+        path = _writable(request.name, storage)
+        if more:
+            storage.check_room(0)
+        change(path)
+        return b""
 
-def _make_folder(request: Request, _session: Session, storage: Storage) -> bytes:
-    path = _writable(request.name, storage)
-    storage.check_room(0)
-    path.mkdir()
-    return b""
-
-
-def _remove_folder(request: Request, _session: Session, storage: Storage) -> bytes:
-    _writable(request.name, storage).rmdir()
-    return b""
+    return operation
 
 
 def _truncate(request: Request, _session: Session, storage: Storage) -> bytes:
@@ -163,12 +156,25 @@ def _rename(request: Request, _session: Session, storage: Storage) -> bytes:
     return b""
 
 
-def _crc32(request: Request, _session: Session, storage: Storage) -> bytes:
-    crc = 0
-    with storage.path(request.name).open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            crc = crc32part(chunk, crc)
-    return _SIZE.pack(crc)
+class Checksum:
+    """The CRC-32 of a file, piece by piece: a large file takes longer than a tick."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises OSError."""
+        self._crc = 0
+        self._file = path.open("rb", buffering=0)
+
+    def go_on(self) -> bytes | None:
+        """Read the next piece; return the data of the answer after the last. Raises OSError."""
+        chunk = self._file.read(_CHUNK_BYTES)
+        self._crc = crc32part(chunk, self._crc)
+        if len(chunk) == _CHUNK_BYTES:
+            return None
+        return _SIZE.pack(self._crc)
+
+    def close(self) -> None:
+        """Close the file; harmless when called again."""
+        self._file.close()
 
 
 def _nothing(_request: Request, _session: Session, _storage: Storage) -> bytes:
@@ -198,12 +204,11 @@ OPERATIONS: dict[int, Operation] = {
     5: _read,
     6: _create,
     7: _write,
-    8: _remove_file,
-    9: _make_folder,
-    10: _remove_folder,
+    8: _on_path(Path.unlink),
+    9: _on_path(Path.mkdir, more=True),
+    10: _on_path(Path.rmdir),
     11: _open_existing,
     12: _truncate,
     13: _rename,
-    14: _crc32,
 }
-"""By opcode; burst reads stand in `ftp`."""
+"""By opcode; what takes several ticks (checksums, burst reads) stands in `ftp`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
 
 class Code(IntEnum):
@@ -78,13 +78,47 @@ class Burst:
     asker: tuple[int, int]
 
 
+class Sum(Protocol):
+    """A checksum that is being worked out."""
+
+    def go_on(self) -> bytes | None:
+        """Return the data of the answer, None while it is not known. Raises OSError."""
+        ...
+
+    def close(self) -> None:
+        """Release what is held."""
+        ...
+
+
+@dataclass(slots=True)
+class Summing:
+    """A request for a checksum that is not yet answered."""
+
+    sequence: int
+    offset: int
+    asker: tuple[int, int]
+    sum: Sum
+
+
 @dataclass(slots=True)
 class FtpClient:
     """One client's part in MAVLink FTP."""
 
     session: Session = field(default_factory=Session)
     burst: Burst | None = None
+    summing: Summing | None = None
     used_us: int = 0
     last_sequence: int | None = None
     """Of the request that `last_answer` answered."""
     last_answer: bytes = b""
+
+    def close(self) -> None:
+        """Close what is open."""
+        self.session.close()
+        self.stop_summing()
+
+    def stop_summing(self) -> None:
+        """Forget a checksum that is being worked out, if there is one."""
+        if self.summing is not None:
+            self.summing.sum.close()
+            self.summing = None

@@ -25,7 +25,7 @@ _SHELL = dialect.SERIAL_CONTROL_DEV_SHELL, dialect.SERIAL_CONTROL_FLAG_REPLY
 _LONGEST_LINE = 256
 """What is typed beyond this before the line ends is dropped [bytes]."""
 
-_LONGEST_OUTPUT = 1 << 20
+_LONGEST_OUTPUT = 1 << 17
 """Text that waits to be sent; a client that asks for more before it was sent gets no more."""
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Severity
 from firmware_sim.mavlink.codec import WireMessage
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Context, sender
 
 
 def handle_setup(message: WireMessage, context: Context) -> bool:
@@ -21,4 +21,9 @@ def handle_setup(message: WireMessage, context: Context) -> bool:
     except OSError as error:
         text = f"Signing key not stored: {error.strerror}"
         context.announce(Message(Severity.CRITICAL, text))
+    else:
+        what = "set" if any(key) else "removed"
+        system, component = sender(message)
+        text = f"Signing key {what} by system {system} component {component}"
+        context.announce(Message(Severity.NOTICE, text))
     return True
