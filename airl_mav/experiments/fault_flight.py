@@ -19,7 +19,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase as Commander
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AFTER_S = 0.5
 """A fault begins so long after its phase [s]."""
@@ -70,9 +70,12 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
     """
     words = Fault.model_validate(fault).model_copy(update={"phase": phase, "at_s": AFTER_S})
     setup = EpisodeSetup(vehicle, None, seed, Aircraft(faults=(words,)))
-    simulation = Simulation(setup, start_us=0, clock=SimClock(), recording=False)
+    autopilot = builtin_autopilot(setup)
+    simulation = Simulation(
+        setup, start_us=0, clock=SimClock(), recording=False, autopilot=autopilot
+    )
     try:
-        return _Flight(simulation, fault, phase, seed).fly()
+        return _Flight(simulation, autopilot, fault, phase, seed).fly()
     finally:
         simulation.close()
 
@@ -80,9 +83,15 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
 class _Flight:
     """The parts of one flight."""
 
-    def __init__(self, simulation: Simulation, fault: str, phase: Phase, seed: int) -> None:
-        assert isinstance(simulation.autopilot, BuiltinAutopilot)  # noqa: S101 (made so above)
-        self._simulation, self._autopilot = simulation, simulation.autopilot
+    def __init__(
+        self,
+        simulation: Simulation,
+        autopilot: BuiltinAutopilot,
+        fault: str,
+        phase: Phase,
+        seed: int,
+    ) -> None:
+        self._simulation, self._autopilot = simulation, autopilot
         self._told = fault, phase, seed
         self._said: list[str] = []
         self._streams = False

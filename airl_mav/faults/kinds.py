@@ -203,6 +203,11 @@ KINDS: Mapping[tuple[Part, str], Kind] = {
 """All faults, by part and kind."""
 
 
+def kind_of(part: str, kind: str) -> Kind | None:
+    """Return what the table says of a fault; None for what is none."""
+    return next((what for known, what in KINDS.items() if known == (part, kind)), None)
+
+
 def kinds_of(part: str) -> tuple[str, ...]:
     """Return the names of the ways in which a part can fail; none for what is no part."""
     return tuple(kind for known, kind in KINDS if known == part)

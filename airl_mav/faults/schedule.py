@@ -31,10 +31,16 @@ def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | 
     return begin_us, begin_us + max(1, round(fault.for_s * US_PER_S))
 
 
-def active(faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]) -> tuple[int, ...]:
-    """Return the indices of the faults that act at a time [µs since the start of the episode]."""
+def active(
+    faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]
+) -> dict[int, tuple[int, int]]:
+    """Return the faults that act at a time [µs since the start of the episode].
+
+    Returns:
+        From when to when each of them acts, by its index; see `window_us`.
+    """
     windows = ((i, window_us(fault, entered_us)) for i, fault in enumerate(faults))
-    return tuple(i for i, at in windows if at is not None and at[0] <= time_us < at[1])
+    return {i: at for i, at in windows if at is not None and at[0] <= time_us < at[1]}
 
 
 def next_change_us(faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]) -> int:

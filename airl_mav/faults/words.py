@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
-from airl_mav.faults.kinds import KINDS, MOTORS, Part, Phase, kinds_of
+from airl_mav.faults.kinds import KINDS, MOTORS, Amount, Part, Phase, kind_of, kinds_of
 
 PARTS: tuple[str, ...] = get_args(Part)
 PHASES: tuple[str, ...] = get_args(Phase)
@@ -53,13 +53,16 @@ def read_fault(text: str) -> dict[str, Any]:
     known = kinds_of(part)
     kind = words[1] if len(words) > 1 else ""
     kind = kind if kind in known else KIND_WORDS.get(kind, kind)
-    if kind not in known:
+    about = kind_of(part, kind)
+    if about is None:
         raise ValueError(f"{text!r}: no such fault of {part}; accepted: {', '.join(known)}")
     rest = words[2:]
     cut = next((i for i, word in enumerate(rest) if word in ("at", "for")), len(rest))
     fields: dict[str, Any] = {"part": part, "kind": kind}
     if cut:
-        fields["value"] = _amount("".join(rest[:cut]), part, kind, text)
+        if about.amount is None:
+            raise ValueError(f"{text!r}: {''.join(rest[:cut])!r}: {part} {kind} has no amount")
+        fields["value"] = _amount("".join(rest[:cut]), about.amount, text)
     clauses = rest[cut:]
     while clauses:
         word, said, clauses = clauses[0], clauses[1:2], clauses[2:]
@@ -94,10 +97,7 @@ def _numbers(values: Sequence[float]) -> str:
     return ",".join(f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in values)
 
 
-def _amount(said: str, part: str, kind: str, text: str) -> list[float]:
-    amount = KINDS[part, kind].amount  # type: ignore[index]
-    if amount is None:
-        raise ValueError(f"{text!r}: {said!r}: {part} {kind} has no amount")
+def _amount(said: str, amount: Amount, text: str) -> list[float]:
     found = _AMOUNT.fullmatch(said)
     if found is None or found[2] not in amount.units:
         accepted = ", ".join(unit or "no unit" for unit in amount.units)

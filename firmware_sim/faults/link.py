@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Generic, TypeVar
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -175,8 +176,11 @@ class FailingEndpoint(FailingSender):
         self._shared = endpoint
         self._timeline: FaultTimeline | None = None
         self._up: Lane[tuple[Peer, bytes]] = Lane()
-        self._senders: list[FailingSender] = [self]
-        self._generators: dict[tuple[int, ...], np.random.Generator] = {}
+        self._senders: WeakValueDictionary[int, FailingSender] = WeakValueDictionary({0: self})
+        """Those that somebody still holds, by the number of their lane."""
+        self._lanes = 1
+        """How many there have been: a number is never given again."""
+        self._generators: dict[tuple[int, int, int], np.random.Generator] = {}
 
     def begin(self, timeline: FaultTimeline | None) -> None:
         """Begin an episode: what was under way is lost, and these faults act; None: nothing fails.
@@ -186,7 +190,7 @@ class FailingEndpoint(FailingSender):
         self._timeline = timeline
         self._generators.clear()
         self._up.clear()
-        for sender in self._senders:
+        for sender in self._senders.values():
             sender.lane.clear()
         if timeline is not None:
             timeline.on_change(self._rearrange)
@@ -220,7 +224,8 @@ class FailingEndpoint(FailingSender):
         if healthy is None:
             return None
         sender = FailingSender(healthy, self._clock, conducted=self._conducted)
-        self._senders.append(sender)
+        self._senders[self._lanes] = sender
+        self._lanes += 1
         self._rearrange()
         return sender
 
@@ -228,7 +233,9 @@ class FailingEndpoint(FailingSender):
         if self._timeline is None:
             return
         self._up.set(self._acting(UP, 0))
-        for number, sender in enumerate(self._senders):
+        for key in [k for k in self._generators if k[1] == DOWN and k[2] not in self._senders]:
+            del self._generators[key]
+        for number, sender in self._senders.items():
             sender.lane.set(self._acting(DOWN, number))
 
     def _acting(self, direction: int, lane: int) -> list[tuple[Acting, np.random.Generator]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,19 +11,19 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.streams import Stream, stream
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
-from airl_mav.faults.schedule import FOREVER_US, active, next_change_us, window_us
+from airl_mav.faults.schedule import FOREVER_US, active, next_change_us
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
 
-PHASE_OF_MODE = {
-    "TAKEOFF": "climb",
-    "HOLD": "hold",
-    "OFFBOARD": "offboard",
-    "MISSION": "mission",
-    "RETURN": "return",
-    "LAND": "landing",
+PHASE_OF_MODE: Mapping[Mode, str] = {
+    Mode.TAKEOFF: "climb",
+    Mode.HOLD: "hold",
+    Mode.OFFBOARD: "offboard",
+    Mode.MISSION: "mission",
+    Mode.RETURN: "return",
+    Mode.LAND: "landing",
 }
-"""Phase of a flight in the air, by the name of the mode that is flown."""
+"""Phase of a flight in the air, by the mode that is flown."""
 
 
 class Acting(NamedTuple):
@@ -50,7 +50,7 @@ class Acted(NamedTuple):
 def phase_of(flight: Flight) -> str | None:
     """Return the phase of a flight, as faults name it; None for one that sets nothing off."""
     if flight.phase is Phase.AIR:
-        return PHASE_OF_MODE.get(Mode(flight.mode).name)
+        return PHASE_OF_MODE.get(flight.mode)
     return None if flight.phase is Phase.BOOT else "ground"
 
 
@@ -68,7 +68,8 @@ class FaultTimeline:
         self._faults = list(faults)
         self._seed = seed
         self._entered: dict[str, int] = {}
-        self._acting: tuple[int, ...] = ()
+        self._acting: dict[int, tuple[int, int]] = {}
+        """From when to when those that act now do [µs since the start], by their index."""
         self._spans: list[Acted] = []
         self._open: dict[int, int] = {}
         self._listeners: list[Callable[[], None]] = []
@@ -80,7 +81,7 @@ class FaultTimeline:
         self._entered.clear()
         self._spans.clear()
         self._open.clear()
-        self._acting = ()
+        self._acting = {}
         self._phase: str | None = None
         self._next_us = 0
         self._now_us = start_us
@@ -121,10 +122,9 @@ class FaultTimeline:
     def clear(self, *parts: Part) -> None:
         """End all that acts on these parts, as if its time were over."""
         since_us = self._now_us - self._start_us
-        for index in self._acting:
+        for index, (begin_us, _) in self._acting.items():
             fault = self._faults[index]
             if fault.part in parts:
-                begin_us = self._window(index)[0]
                 for_s = max(1, since_us - begin_us) / US_PER_S
                 self._faults[index] = fault.model_copy(update={"for_s": for_s})
         self._renew(since_us)
@@ -141,7 +141,7 @@ class FaultTimeline:
         before = self._acting
         self._acting = active(self._faults, since_us, self._entered)
         self._next_us = next_change_us(self._faults, since_us, self._entered)
-        if self._acting == before:
+        if self._acting.keys() == before.keys():
             return
         for index in before:
             if index not in self._acting:
@@ -155,12 +155,7 @@ class FaultTimeline:
         for listener in self._listeners:
             listener()
 
-    def _window(self, index: int) -> tuple[int, int]:
-        window = window_us(self._faults[index], self._entered)
-        assert window is not None  # noqa: S101 (it acts, or has acted)
-        return window
-
     def _acting_at(self, index: int) -> Acting:
-        begin_us, end_us = self._window(index)
+        begin_us, end_us = self._acting[index]
         until_us = end_us if end_us == FOREVER_US else self._start_us + end_us
         return Acting(index, self._faults[index], self._start_us + begin_us, until_us)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -242,6 +243,28 @@ def test_a_delayed_link_keeps_order_in_both_directions() -> None:
         assert endpoint.receive() == expected
         endpoint.send_streams([b"down%d" % tick])
     assert inner.take() == [b"down%d" % tick for tick in range(40)]
+
+
+def test_a_client_that_is_gone_is_forgotten_and_its_lane_is_nobody_else_s() -> None:
+    endpoint, inner, at = link_of("downlink loss 50% at 0s")
+    at(0)
+
+    def heard() -> list[bytes]:
+        """Send a new client 100 frames; return what reaches it."""
+        sender = endpoint.towards(None)
+        assert sender is not None
+        sender.send_streams([b"%d" % number for number in range(100)])
+        return list(inner.take())
+
+    first, second = heard(), heard()
+    assert 30 < len(first) < 70
+    assert first != second, "each lane has randomness of its own"
+    for _ in range(50):
+        heard()
+    gc.collect()
+    assert len(endpoint._senders) == 1, "the endpoint itself"
+    endpoint.towards(None)
+    assert len(endpoint._generators) <= 2
 
 
 def test_a_link_that_is_cut_passes_nothing_and_then_all() -> None:

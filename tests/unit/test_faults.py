@@ -175,7 +175,7 @@ def test_what_acts_is_a_function_of_time_and_phases() -> None:
     entered = {"hold": 9_500_000}
     expected = {7.9: (), 8.0: (0,), 9.2: (0, 2), 9.5: (0, 1, 2), 13.0: (1, 2)}
     for time_s, indices in expected.items():
-        assert active(asked, round(time_s * 1e6), entered) == indices
+        assert tuple(active(asked, round(time_s * 1e6), entered)) == indices
     assert next_change_us(asked, 0, {}) == 8_000_000
     assert next_change_us(asked, 9_000_000, entered) == 9_500_000
     assert next_change_us(asked, 13_000_000, entered) == FOREVER_US
