@@ -15,6 +15,7 @@ resets the variance of the gyro's bias, and gives up a compass (`mag_fault`).
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,13 @@ samples."""
 
 HEADING_RUN = 25
 """Headings in a row: 0.5 s at 50 Hz."""
+
+LATE_S = 0.5
+"""A receiver may be so much later than stated: a velocity that differs by no more than what the
+vehicle has changed its own in that time says nothing of the inertial sensors [s]."""
+
+_LOOK_BACK = 6
+"""Samples over which the greatest acceleration is looked for."""
 
 REFUSED_US = US_PER_S
 """A compass that the gate has refused for so long is given up [µs]."""
@@ -159,6 +167,7 @@ class Consistency:
         """Of the velocity's noise, as a share of what it should be."""
         self._runs = [Run(VELOCITY_RUN) for _ in range(3)]
         self._before: Vector | None = None
+        self._accelerations: deque[Vector] = deque(maxlen=_LOOK_BACK)
         self._heading = Run(HEADING_RUN)
 
     @property
@@ -166,8 +175,16 @@ class Consistency:
         """By how much the variance of the velocity exceeds what it should be; 1 = it does not."""
         return self._variance if self._variance > NOISY else 1.0
 
-    def velocity(self, innovation: Vector, sigma: Vector, time_us: int) -> Restart | None:
-        """Take a GPS velocity's innovation, and what it is expected to be, each (3,) NED [m/s].
+    def velocity(
+        self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
+    ) -> Restart | None:
+        """Take a GPS velocity.
+
+        Args:
+            innovation: Measured less expected (3,) NED [m/s].
+            sigma: Standard deviation that the innovation should have (3,) [m/s].
+            acceleration: As estimated (3,) NED [m/s²].
+            time_us: When.
 
         Returns:
             What to restart the filter with; None: it may go on.
@@ -182,8 +199,10 @@ class Consistency:
             variance = min(float(change @ change) / 6.0, _OUTLIER)
             self._variance += _NOISE_SHARE * (variance - self._variance)
         self._before = deviations
-        if excess > 1.0:
-            deviations = deviations / math.sqrt(excess)
+        self._accelerations.append(np.abs(acceleration))
+        late = LATE_S * np.max(self._accelerations, axis=0)
+        unexplained = np.sign(innovation) * np.maximum(np.abs(innovation) - late, 0.0)
+        deviations = unexplained / (sigma * math.sqrt(excess))
         lasted = [
             run.take(z, time_us) for run, z in zip(self._runs, deviations.tolist(), strict=True)
         ]

@@ -316,7 +316,9 @@ class Estimator:
         excess = self.consistency.velocity_excess
         innovation = measured - self.state[es.V : es.Q]
         sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
-        self._restart(self.consistency.velocity(innovation, sigma, self._time_us))
+        acceleration = self.state[es.ACCELERATION : es.SIGMA]
+        restart = self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
+        self._restart(restart)
         return variance * excess
 
     def _restart(self, restart: Restart | None) -> None:

@@ -22,6 +22,7 @@ from firmware_sim.autopilot.consistency import (
 GPS_US = 100_000
 MAG_US = 20_000
 SIGMA = np.full(3, 0.06)
+STEADY = np.zeros(3)
 
 
 def velocities(watch: Consistency, innovations: Iterable[np.ndarray]) -> list[int]:
@@ -30,7 +31,7 @@ def velocities(watch: Consistency, innovations: Iterable[np.ndarray]) -> list[in
     return [
         now_us
         for now_us, innovation in zip(times, innovations, strict=False)
-        if watch.velocity(innovation, SIGMA, now_us) is not None
+        if watch.velocity(innovation, SIGMA, STEADY, now_us) is not None
     ]
 
 
@@ -59,10 +60,10 @@ def test_an_outlier_is_neither() -> None:
     excess = []
     watch = Consistency()
     for i, innovation in enumerate(far):
-        watch.velocity(innovation, SIGMA, i * GPS_US)
+        watch.velocity(innovation, SIGMA, STEADY, i * GPS_US)
         excess.append(watch.velocity_excess)
     assert set(excess) == {1.0}, "its own gate must refuse it"
-    watch.velocity(np.full(3, np.nan), SIGMA, 0)
+    watch.velocity(np.full(3, np.nan), SIGMA, STEADY, 0)
     assert watch.velocity_excess == 1.0
 
 
@@ -101,3 +102,13 @@ def test_a_compass_that_was_refused_must_come_back_as_close_as_it_was() -> None:
     assert compass.admits(0.09)
     compass.tested(0.09, 0.3, 2 * REFUSED_US)
     assert not compass.given_up
+
+
+def test_a_late_receiver_is_no_reason_either() -> None:
+    """0.2 s behind a vehicle that brakes with 3 m/s²: 10 standard deviations, on one side."""
+    watch = Consistency()
+    braking = np.array([-3.0, 0.0, 0.0])
+    behind = np.array([0.6, 0.0, 0.0])
+    for sample in range(20):
+        assert watch.velocity(behind, SIGMA, braking, sample * GPS_US) is None
+    assert watch.velocity_excess == 1.0

@@ -47,6 +47,7 @@ def test_what_a_quadrotor_survives_and_what_not() -> None:
         ("gyro bias 0,0,8deg/s", "hold", "landed"),
         ("gps stuck", "climb", "landed"),
         ("gps noise 5x", "ground", "landed"),
+        ("gps delay 200ms", "hold", "landed"),
         # What is wrong before take-off keeps the vehicle on the ground.
         ("accel off", "ground", "not armed"),
         ("mag bias 0.1,0.1,0gauss", "ground", "not armed"),
