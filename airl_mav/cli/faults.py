@@ -13,8 +13,17 @@ from airl_mav.core.errors import EXIT_NOT_MET, FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
-from airl_mav.core.provenance import usable_cores
-from airl_mav.experiments.fault_matrix import cell_text, fly_matrix, markdown, save
+from airl_mav.core.provenance import provenance, usable_cores
+from airl_mav.experiments.fault_matrix import (
+    Cell,
+    cell_text,
+    fly_matrix,
+    markdown,
+    resumed,
+    save,
+    vehicle_digest,
+    with_cells,
+)
 from airl_mav.faults.catalogue import CASES, MATRIX_PHASES
 from airl_mav.faults.kinds import LINKS, Phase
 from airl_mav.faults.model import Fault
@@ -30,7 +39,8 @@ class FaultsOptions(ProfileModel):
     """Fly every fault in every phase of a flight, in simulated time, and say how each flight ended.
 
     The flight controller and its plant alone: a scripted pilot arms, climbs to 5 m, holds, flies in
-    offboard and lands. What ends otherwise than documented is marked, and is exit status 3.
+    offboard and lands. What ends otherwise than documented is marked, and is exit status 3. With
+    the same --out a run that was stopped goes on.
 
     Examples:
         airl faults
@@ -84,20 +94,23 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     seeds = range(options.seed, options.seed + options.episodes)
     workers = options.workers or usable_cores()
     vehicle = load_vehicle(options.vehicle)
-    with RichProgress(console) as progress:
-        bar = progress.bar("faults", len(faults) * len(phases) * len(seeds), unit="flights")
-        cells = fly_matrix(
-            vehicle,
-            faults,
-            phases,
-            seeds,
-            workers=workers,
-            flown=lambda count: bar.update(completed=count),
-        )
-        bar.close()
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-faults"
     out.mkdir(parents=True, exist_ok=True)
-    save(cells, out / "faults.json")
+    file = out / "faults.json"
+    matrix = resumed(file, provenance("airl faults"), vehicle_digest(vehicle))
+    done: list[Cell] = []
+    with RichProgress(console) as progress:
+        bar = progress.bar("faults", len(faults) * len(phases) * len(seeds), unit="flights")
+
+        def flown(cell: Cell) -> None:
+            done.append(cell)
+            save(with_cells(matrix, done), file)
+            bar.update(completed=len(done) * len(seeds))
+
+        cells = fly_matrix(
+            vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
+        )
+        bar.close()
     replace_file(out / "faults.md", markdown(cells).encode())
     rows = tuple(
         (fault, *(cell_text(cell) for cell in cells if cell.fault == fault)) for fault in faults

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-import json
+import hashlib
 import multiprocessing
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from airl_mav.core.files import replace_file
+from pydantic import TypeAdapter
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_json, write_json
 from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
 from airl_mav.faults.catalogue import CASE_OF, MATRIX_PHASES, Case, End
 from airl_mav.faults.kinds import Phase
 from airl_mav.profiles.vehicle import VehicleProfile
+
+SCHEMA = 2
+"""Of `faults.json`."""
 
 ANY: frozenset[End] = frozenset({"not armed", "landed", "crashed"})
 """How a flight with a fault that is not in the catalogue may end."""
@@ -54,7 +61,8 @@ def fly_matrix(
     seeds: Sequence[int] = (1,),
     *,
     workers: int = 1,
-    flown: Callable[[int], None] = lambda _: None,
+    known: Sequence[Cell] = (),
+    flown: Callable[[Cell], None] = lambda _: None,
 ) -> list[Cell]:
     """Fly every fault in every phase with every seed; the same arguments give the same cells.
 
@@ -64,23 +72,42 @@ def fly_matrix(
         phases: When they begin.
         seeds: Of the flights.
         workers: Processes that fly; they change no result.
-        flown: Is told how many flights have been flown.
+        known: Cells that have been flown; those with these seeds are not flown again.
+        flown: Is told each cell in its order, those that were known too.
     """
+    kept = {
+        (cell.fault, cell.phase): cell
+        for cell in known
+        if [flight.seed for flight in cell.flights] == list(seeds)
+    }
     jobs = [(fault, phase) for fault in faults for phase in phases]
     cells: list[Cell] = []
+    for cell in _flown_cells(vehicle, jobs, tuple(seeds), kept, workers):
+        cells.append(cell)
+        flown(cell)
+    return cells
+
+
+def _flown_cells(
+    vehicle: VehicleProfile,
+    jobs: Sequence[tuple[str, Phase]],
+    seeds: Sequence[int],
+    kept: Mapping[tuple[str, Phase], Cell],
+    workers: int,
+) -> Iterator[Cell]:
+    """Yield the cells of the jobs, in their order."""
     if workers == 1:
         for job in jobs:
-            cells.append(_fly_cell(vehicle, *job, seeds))
-            flown(len(cells) * len(seeds))
-        return cells
+            yield kept.get(job) or _fly_cell(vehicle, *job, seeds)
+        return
     # A fresh process each: pybullet and compiled kernels do not survive a fork beside threads.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting = [pool.submit(_fly_cell, vehicle, *job, tuple(seeds)) for job in jobs]
-        for future in waiting:
-            cells.append(future.result())
-            flown(len(cells) * len(seeds))
-    return cells
+        waiting = {
+            job: pool.submit(_fly_cell, vehicle, *job, seeds) for job in jobs if job not in kept
+        }
+        for job in jobs:
+            yield kept.get(job) or waiting[job].result()
 
 
 def _fly_cell(vehicle: VehicleProfile, fault: str, phase: Phase, seeds: Sequence[int]) -> Cell:
@@ -109,7 +136,70 @@ def cell_text(cell: Cell) -> str:
     return ", ".join(parts) + (" !" if cell.unexpected else "")
 
 
-def save(cells: Sequence[Cell], path: Path) -> None:
-    """Write every flight of a matrix as JSON."""
-    flights = [asdict(flight) for cell in cells for flight in cell.flights]
-    replace_file(path, json.dumps({"schema": 1, "flights": flights}, indent=1).encode())
+class Matrix(NamedTuple):
+    """What `faults.json` holds."""
+
+    made: dict[str, Any]
+    """With what it was flown (`core.provenance`)."""
+    vehicle: str
+    """SHA-256 of its profile."""
+    cells: tuple[Cell, ...]
+
+
+_FLIGHTS = TypeAdapter(tuple[FaultFlight, ...])
+
+
+def with_cells(matrix: Matrix, cells: Sequence[Cell]) -> Matrix:
+    """Return a matrix with these cells in place of its own of the same fault and phase."""
+    new = {(cell.fault, cell.phase) for cell in cells}
+    kept = (cell for cell in matrix.cells if (cell.fault, cell.phase) not in new)
+    return matrix._replace(cells=(*cells, *kept))
+
+
+def vehicle_digest(vehicle: VehicleProfile) -> str:
+    """Return the SHA-256 of a profile."""
+    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
+
+
+def save(matrix: Matrix, path: Path) -> None:
+    """Write every flight of a matrix as JSON, whole or not at all."""
+    flights = [asdict(flight) for cell in matrix.cells for flight in cell.flights]
+    head = {"schema": SCHEMA, "made": matrix.made, "vehicle": matrix.vehicle}
+    write_json(path, {**head, "flights": flights})
+
+
+def load(path: Path) -> Matrix:
+    """Read a matrix. Raises UsageError: it is missing or damaged."""
+    data = read_json(path, SCHEMA, "fault matrix")
+    try:
+        flights = _FLIGHTS.validate_python(data["flights"])
+        made, vehicle = dict(data["made"]), str(data["vehicle"])
+    except (KeyError, TypeError, ValueError):
+        raise UsageError(
+            f"{path}: no fault matrix of this version; accepted: faults.json"
+        ) from None
+    cells: dict[tuple[str, Phase], list[FaultFlight]] = {}
+    for flight in flights:
+        cells.setdefault((flight.fault, flight.phase), []).append(flight)
+    return Matrix(made, vehicle, tuple(Cell(*key, tuple(of)) for key, of in cells.items()))
+
+
+def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:
+    """Return the matrix that goes on in a file: what a stopped one has flown, else nothing yet.
+
+    Raises:
+        UsageError: Another vehicle, or another version of this package, has flown there.
+    """
+    if not path.exists():
+        return Matrix(dict(made), vehicle, ())
+    found = load(path)
+    if found.vehicle != vehicle:
+        raise UsageError(f"{path}: flown by another vehicle; accepted: another --out")
+    if _version(found.made) != _version(made):
+        raise UsageError(f"{path}: flown by another version; accepted: another --out")
+    return found
+
+
+def _version(made: Mapping[str, Any]) -> tuple[object, object]:
+    git = made["git"]
+    return made["versions"]["airl-mav"], None if git is None else git["commit"]

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
+from airl_mav.experiments.fault_matrix import load, markdown
 from airl_mav.experiments.run import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.model import Comparison, load_comparison
 from published.declared import Declared
-from published.record import MEASURES, Figure, FlownRun, Gap, Made, Record, shipped_policies
+from published.record import (
+    MEASURES,
+    Figure,
+    FlownRun,
+    Gap,
+    Made,
+    Printed,
+    Record,
+    shipped_policies,
+)
 
 
 def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
@@ -27,6 +38,8 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
     Raises:
         UsageError: The folder does not hold it, or its flights are not all there.
     """
+    if declared.kind == "faults":
+        return _fault_matrix(declared, out, behaviour)
     if declared.kind == "run":
         runs, gaps, infos = _single(out)
     else:
@@ -47,6 +60,39 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
     )
 
 
+def _fault_matrix(declared: Declared, out: Path, behaviour: str | None) -> Record:
+    """Return a fault matrix, as the table that `airl faults` shows."""
+    matrix = load(out / "faults.json")
+    head, _, *rows = markdown(matrix.cells).strip().split("\n")
+    columns, *cells = (
+        tuple(cell.strip() for cell in line.strip("|").split("|")) for line in (head, *rows)
+    )
+    return Record(
+        name=declared.name,
+        what=declared.what,
+        made=made_of(declared.command, matrix.made, behaviour, {}),
+        printed=Printed(columns=columns, rows=tuple(cells)),
+    )
+
+
+def made_of(
+    command: str, made: Mapping[str, Any], behaviour: str | None, policies: dict[str, str]
+) -> Made:
+    """Return with what figures were made, from what `core.provenance` wrote down."""
+    git, versions = made["git"], dict(made["versions"])
+    return Made(
+        command=command,
+        date=datetime.fromisoformat(made["created_utc"]).date().isoformat(),
+        version=versions.pop("airl-mav"),
+        commit=None if git is None else git["commit"],
+        changed=None if git is None else git["changed"],
+        cpu=f"{made['machine']['cpu']}, {made['machine']['cores_usable']} cores",
+        versions=versions,
+        behaviour=behaviour,
+        policies=policies,
+    )
+
+
 def made_by(command: str, infos: list[RunInfo], policies: set[str], behaviour: str | None) -> Made:
     """Return with what runs were made: of one command, by one version, on one machine.
 
@@ -57,19 +103,9 @@ def made_by(command: str, infos: list[RunInfo], policies: set[str], behaviour: s
     if len(commits) > 1:
         raise UsageError(f"{command}: flown by {len(commits)} commits; accepted: one")
     last = max(infos, key=lambda info: info.created_utc)
-    versions = dict(last.versions)
     shipped = shipped_policies()
-    return Made(
-        command=command,
-        date=datetime.fromisoformat(last.created_utc).date().isoformat(),
-        version=versions.pop("airl-mav"),
-        commit=commits.pop(),
-        changed=None if last.git is None else last.git["changed"],
-        cpu=f"{last.machine['cpu']}, {last.machine['cores_usable']} cores",
-        versions=versions,
-        behaviour=behaviour,
-        policies={name: shipped[name] for name in sorted(policies) if name in shipped},
-    )
+    used = {name: shipped[name] for name in sorted(policies) if name in shipped}
+    return made_of(command, vars(last), behaviour, used)
 
 
 def _single(out: Path) -> tuple[dict[str, FlownRun], dict[str, Gap], list[RunInfo]]:

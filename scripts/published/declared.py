@@ -19,7 +19,7 @@ from published.record import RESULTS
 
 DECLARED_FILE = RESULTS / "results.toml"
 
-Kind = Literal["gap", "matrix", "ladder", "degradation", "compare", "run"]
+Kind = Literal["gap", "matrix", "ladder", "degradation", "compare", "run", "faults"]
 
 
 class Declared(ProfileModel):
@@ -29,7 +29,9 @@ class Declared(ProfileModel):
     what: str = Field(description="one line for people")
     command: str = Field(description="as a person types it; --out is added")
     quick: str = Field(default="--episodes 20", description="what --quick adds to the command")
-    kind: Kind = Field(description="file of the comparison, or run: the folder is a single run")
+    kind: Kind = Field(
+        description="file of the comparison; run: the folder is a single run; faults: its matrix"
+    )
     within: tuple[str, ...] = Field(default=(".",), description="folders of comparisons, in --out")
     cards: bool = Field(default=False, description="its runs go onto the cards of their policies")
     minutes: float = Field(gt=0, description="on two cores, about")

@@ -71,7 +71,7 @@ class Gap(ProfileModel):
 
 
 class Printed(ProfileModel):
-    """A table taken from a page as it was printed: the runs behind it are not kept."""
+    """A table as it was printed: what is behind it is not kept, or no run of a policy."""
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]

@@ -9,12 +9,14 @@ import pytest
 from rich.console import Console
 
 from airl_mav.cli import faults
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.experiments import fault_matrix
 from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
 from airl_mav.experiments.fault_matrix import Cell, cell_text, fly_matrix, markdown
 from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
+from airl_mav.profiles.vehicle import VehicleProfile
 from tests.support.flight_rig import quad
 
 
@@ -98,6 +100,35 @@ def test_the_command_flies_shows_and_saves(tmp_path: Path) -> None:
     assert "| `mag off` | 1 landed" in (tmp_path / "faults.md").read_text()
     flights = json.loads((tmp_path / "faults.json").read_text())["flights"]
     assert [(f["fault"], f["phase"], f["seed"]) for f in flights] == [("mag off", "hold", 1)]
+
+
+def test_a_stopped_run_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only what is missing is flown; another vehicle or version may not go on there."""
+
+    def options(*faulty: str, **more: object) -> faults.FaultsOptions:
+        asked = {"faults": faulty, "phases": ["ground"], "episodes": 1, "workers": 1}
+        return faults.OPTIONS.model_validate({**asked, "out": tmp_path, **more})
+
+    faults.run(options("accel off"), Console(quiet=True))
+    asked: list[str] = []
+
+    def spy(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> FaultFlight:
+        asked.append(fault)
+        return fly_fault(vehicle, fault, phase, seed)
+
+    monkeypatch.setattr("airl_mav.experiments.fault_matrix.fly_fault", spy)
+    faults.run(options("accel off", "gyro off"), Console(quiet=True))
+    assert asked == ["gyro off"]
+    found = fault_matrix.load(tmp_path / "faults.json")
+    assert [cell.fault for cell in found.cells] == ["accel off", "gyro off"]
+    monkeypatch.setattr(faults, "vehicle_digest", lambda _: "another")
+    with pytest.raises(UsageError, match="another vehicle"):
+        faults.run(options("gyro off"))
+    (tmp_path / "faults.json").write_text("{}")
+    with pytest.raises(UsageError, match=r"faults\.json"):
+        faults.run(options("gyro off"))
 
 
 @pytest.mark.parametrize(
