@@ -11,31 +11,21 @@ from mavsdk.plugins.telemetry import FlightMode
 
 from airl_mav.core.constants import EARTH_RADIUS_M
 from tests.flight.test_mavsdk_firmware import Client, client
+from tests.support.mavsdk_items import waypoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("flight"), pytest.mark.timeout(300)]
 
-NAN = math.nan
 
-
-def waypoint(c: Client, north: float, east: float, *, loiter_s: float = NAN) -> MissionItem:
+def place(c: Client, north: float, east: float) -> MissionItem:
     """Return a waypoint at metres from home, 4 m above it."""
     home = c.telemetry.home()
     shrink = math.cos(math.radians(home.latitude_deg))
-    return MissionItem(
-        latitude_deg=home.latitude_deg + math.degrees(north / EARTH_RADIUS_M),
-        longitude_deg=home.longitude_deg + math.degrees(east / EARTH_RADIUS_M / shrink),
-        relative_altitude_m=4.0,
+    return waypoint(
+        home.latitude_deg + math.degrees(north / EARTH_RADIUS_M),
+        home.longitude_deg + math.degrees(east / EARTH_RADIUS_M / shrink),
+        height_m=4.0,
         speed_m_s=4.0,
-        is_fly_through=math.isnan(loiter_s),
-        gimbal_pitch_deg=NAN,
-        gimbal_yaw_deg=NAN,
-        camera_action=MissionItem.CameraAction.NONE,
-        loiter_time_s=loiter_s,
-        camera_photo_interval_s=NAN,
-        acceptance_radius_m=1.0,
-        yaw_deg=NAN,
-        camera_photo_distance_m=NAN,
-        vehicle_action=MissionItem.VehicleAction.NONE,
+        acceptance_m=1.0,
     )
 
 
@@ -46,7 +36,7 @@ def test_upload_start_pause_resume_jump_and_finish(tmp_path: Path) -> None:
         with pytest.raises(MissionError):
             mission.start_mission()  # none is stored
         places = [(8, 0), (8, 8), (0, 8), (0, 4)]
-        mission.upload_mission(MissionPlan([waypoint(c, *place) for place in places]))
+        mission.upload_mission(MissionPlan([place(c, *metres) for metres in places]))
         mission.start_mission()
         c.until(lambda: c.telemetry.flight_mode() == FlightMode.MISSION, "mission")
         c.until(lambda: mission.mission_progress().current == 1, "the first waypoint")

@@ -2,46 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 from mavsdk.plugins import geofence, mission, mission_raw
 from mavsdk.plugins.action import Action
 
+from tests.support.mavsdk_items import LATITUDE, LONGITUDE, raw_item, waypoint
 from tests.support.px4_walk.row import Row
 from tests.support.px4_walk.vehicle import Vehicle
-
-NAN = math.nan
-LATITUDE, LONGITUDE = 47.397743, 8.545594
-
-
-def _waypoint(north_deg: float, height_m: float, loiter_s: float = NAN) -> Any:
-    return mission.MissionItem(
-        latitude_deg=LATITUDE + north_deg,
-        longitude_deg=LONGITUDE,
-        relative_altitude_m=height_m,
-        speed_m_s=3.0,
-        is_fly_through=math.isnan(loiter_s),
-        gimbal_pitch_deg=NAN,
-        gimbal_yaw_deg=NAN,
-        camera_action=mission.MissionItem.CameraAction.NONE,
-        loiter_time_s=loiter_s,
-        camera_photo_interval_s=NAN,
-        acceptance_radius_m=2.0,
-        yaw_deg=NAN,
-        camera_photo_distance_m=NAN,
-        vehicle_action=mission.MissionItem.VehicleAction.NONE,
-    )
-
-
-def _raw(seq: int, command: int, *, kind: int = 0, frame: int = 6, east_deg: float = 0.0) -> Any:
-    return mission_raw.MissionItem(
-        seq=seq, frame=frame, command=command, current=int(seq == 0), autocontinue=1,
-        param1=0.0, param2=0.0, param3=0.0, param4=NAN,
-        x=round(LATITUDE * 1e7) if frame != 2 else 0,
-        y=round((LONGITUDE + east_deg) * 1e7) if frame != 2 else 0,
-        z=10.0, mission_type=kind,
-    )  # fmt: skip
 
 
 def _mission(vehicle: Vehicle) -> mission.Mission:
@@ -53,8 +19,9 @@ def _items(vehicle: Vehicle) -> mission_raw.MissionRaw:
 
 
 def _upload(vehicle: Vehicle) -> None:
-    items = [_waypoint(1e-4, 8.0), _waypoint(2e-4, 8.0), _waypoint(3e-4, 10.0, 2.0)]
-    plan = mission.MissionPlan([*items, _waypoint(4e-4, 8.0)])
+    third = waypoint(LATITUDE + 3e-4, height_m=10.0, loiter_s=2.0)
+    items = [waypoint(LATITUDE + 1e-4), waypoint(LATITUDE + 2e-4), third]
+    plan = mission.MissionPlan([*items, waypoint(LATITUDE + 4e-4)])
     _mission(vehicle).upload_mission(plan)
 
 
@@ -119,24 +86,32 @@ ROWS = (
         "mission",
         "raw upload",
         lambda v: _items(v).upload_mission(
-            [_raw(0, 22), _raw(1, 16), _raw(2, 178, frame=2), _raw(3, 19), _raw(4, 20, frame=2)]
+            [
+                raw_item(0, 22),
+                raw_item(1, 16),
+                raw_item(2, 178, frame=2),
+                raw_item(3, 19),
+                raw_item(4, 20, frame=2),
+            ]
         ),
     ),
     Row(
         "mission",
         "raw upload 5 km off",
-        lambda v: _items(v).upload_mission([_raw(0, 22), _raw(1, 16, east_deg=0.066)]),
+        lambda v: _items(v).upload_mission(
+            [raw_item(0, 22), raw_item(1, 16, longitude_deg=LONGITUDE + 0.066)]
+        ),
     ),
     Row(
         "mission",
         "raw upload of LOITER_TURNS",
-        lambda v: _items(v).upload_mission([_raw(0, 22), _raw(1, 18)]),
+        lambda v: _items(v).upload_mission([raw_item(0, 22), raw_item(1, 18)]),
         ("UNSUPPORTED",),
     ),
     Row(
         "mission",
         "raw upload_rally_points",
-        lambda v: _items(v).upload_rally_points([_raw(0, 5100, kind=2)]),
+        lambda v: _items(v).upload_rally_points([raw_item(0, 5100, kind=2)]),
     ),
     Row(
         "mission",

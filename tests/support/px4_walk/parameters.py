@@ -47,27 +47,18 @@ def _all(vehicle: Vehicle) -> tuple[int, int]:
 
 
 def _set_and_read(name: str, value: float) -> Any:
+    """A float is set as a float parameter, an int as an integer one; it is put back."""
+    kind = "int" if isinstance(value, int) else "float"
+
     def make(vehicle: Vehicle) -> float:
         param = vehicle.plugin(Param)
-        before = param.get_param_float(name)
+        read, write = (getattr(param, f"{verb}_param_{kind}") for verb in ("get", "set"))
+        before = read(name)
         try:
-            param.set_param_float(name, value)
-            return float(param.get_param_float(name))
+            write(name, value)
+            return float(read(name))
         finally:
-            param.set_param_float(name, before)
-
-    return make
-
-
-def _set_and_read_int(name: str, value: int) -> Any:
-    def make(vehicle: Vehicle) -> int:
-        param = vehicle.plugin(Param)
-        before = param.get_param_int(name)
-        try:
-            param.set_param_int(name, value)
-            return int(param.get_param_int(name))
-        finally:
-            param.set_param_int(name, before)
+            write(name, before)
 
     return make
 
@@ -76,47 +67,33 @@ def _close(value: float) -> Any:
     return lambda found: abs(found - value) < 1e-6
 
 
-def _float(name: str, value: float) -> Row:
+def _read(name: str, value: float) -> Row:
+    kind = "int" if isinstance(value, int) else "float"
     return Row(
         AREA,
-        f"get_param_float {name}",
-        lambda v: v.plugin(Param).get_param_float(name),
+        f"get_param_{kind} {name}",
+        lambda v: getattr(v.plugin(Param), f"get_param_{kind}")(name),
         check=_close(value),
     )
 
 
-def _integer(name: str, value: int) -> Row:
-    return Row(
-        AREA,
-        f"get_param_int {name}",
-        lambda v: v.plugin(Param).get_param_int(name),
-        check=lambda found: found == value,
-    )
+def _altitude(of: str, value: float) -> Any:
+    def make(vehicle: Vehicle) -> float:
+        action = vehicle.plugin(Action)
+        read, write = (getattr(action, f"{verb}_{of}_altitude") for verb in ("get", "set"))
+        before = read()
+        write(value)
+        found = float(read())
+        write(before)
+        return found
 
-
-def _takeoff_altitude(vehicle: Vehicle) -> float:
-    action = vehicle.plugin(Action)
-    before = action.get_takeoff_altitude()
-    action.set_takeoff_altitude(8.0)
-    found = float(action.get_takeoff_altitude())
-    action.set_takeoff_altitude(before)
-    return found
-
-
-def _return_altitude(vehicle: Vehicle) -> float:
-    action = vehicle.plugin(Action)
-    before = action.get_return_to_launch_altitude()
-    action.set_return_to_launch_altitude(15.0)
-    found = float(action.get_return_to_launch_altitude())
-    action.set_return_to_launch_altitude(before)
-    return found
+    return make
 
 
 ROWS = (
     # A SITL has these, give or take those that a driver brings along.
     Row(AREA, "get_all_params", _all, check=lambda n: n[0] >= 275 and n[1] >= 602),
-    *(_float(name, value) for name, value in FLOATS.items()),
-    *(_integer(name, value) for name, value in INTEGERS.items()),
+    *(_read(name, value) for name, value in (FLOATS | INTEGERS).items()),
     Row(
         AREA,
         "get_param_int of a float",
@@ -148,7 +125,7 @@ ROWS = (
     Row(
         AREA,
         "set_param_int, read back",
-        _set_and_read_int("COM_RC_IN_MODE", 2),
+        _set_and_read("COM_RC_IN_MODE", 2),
         check=lambda found: found == 2,
     ),
     Row(
@@ -158,6 +135,6 @@ ROWS = (
         ("TIMEOUT", "WRONG_TYPE"),
         slow=True,
     ),
-    Row("action", "takeoff altitude", _takeoff_altitude, check=_close(8.0)),
-    Row("action", "return altitude", _return_altitude, check=_close(15.0)),
+    Row("action", "takeoff altitude", _altitude("takeoff", 8.0), check=_close(8.0)),
+    Row("action", "return altitude", _altitude("return_to_launch", 15.0), check=_close(15.0)),
 )
