@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-
-import numpy as np
 
 from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
@@ -42,12 +39,12 @@ from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
+from firmware_sim.autopilot.snapshot import Parts, snapshot
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -95,6 +92,17 @@ class BuiltinAutopilot:
             self._newest,
             self._state,
             self._say,
+        )
+        self._parts = Parts(
+            self.estimator,
+            self._commander,
+            self.supervisor,
+            self._guidance,
+            self._navigator,
+            self._controller,
+            self._newest,
+            self._home,
+            self.plans,
         )
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
@@ -361,39 +369,9 @@ class BuiltinAutopilot:
         status = self._commander.status
         if self._snapshot is not None and self._snapshot.status is status:
             return self._snapshot
-        sample, demand = self.sample, self._demand
+        sample = self.sample
         if sample is None:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        estimate = self.estimator.estimate()
-        attitude, rates, velocity, thrust = self._controller.setpoints()
-        if demand is None or isinstance(demand, AttitudeDemand | RateDemand):
-            setpoint = Setpoint(estimate.position, velocity, math.nan, 0.0)
-        else:
-            position = np.array(demand.position)
-            setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
-        self._snapshot = AutopilotState(
-            time_us=sample.time_us,
-            estimate=estimate,
-            status=status,
-            setpoint=setpoint,
-            attitude_setpoint=attitude,
-            rate_setpoint=rates,
-            thrust_setpoint=thrust,
-            motors=self._motors,
-            accel=sample.accel,
-            gyro=sample.gyro,
-            mag=self._newest.mag,
-            pressure_hpa=self._newest.pressure_hpa,
-            temperature_c=sample.temperature_c,
-            battery=sample.battery,
-            gps=self._newest.gps,
-            home=self._home.place,
-            origin=self.estimator.origin,
-            orbit=self._guidance.context.orbit if self.flight.mode is Mode.ORBIT else None,
-            armed_us=self._commander.armed_us,
-            takeoff_us=self._commander.takeoff_us,
-            mission=progress(self.plans),
-            fence=self._navigator.fence.status,
-            health=self.supervisor.health(sample.time_us),
-        )
+        hover = self.parameters["MPC_THR_HOVER"]
+        self._snapshot = snapshot(self._parts, sample, self._demand, self._motors, hover)
         return self._snapshot

@@ -115,6 +115,7 @@ class Result(IntEnum):
     DENIED = 2
     UNSUPPORTED = 3
     FAILED = 4
+    CANCELLED = 6
 
 
 class Setpoint(NamedTuple):
@@ -272,3 +273,11 @@ class AutopilotState(NamedTuple):
     orbit: OrbitStatus | None = None
     """In Orbit mode."""
     health: Health = ALL_HEALTHY
+    hover_thrust: float = 0.5
+    """Collective that hovers, 0..1."""
+    destination: tuple[float, float, float] | None = None
+    """Where an automatic mode is going, local NED [m]; None in other modes."""
+    home_yaw: float = 0.0
+    """Heading at home [rad]."""
+    has_pilot: bool = False
+    """Whether a pilot's sticks are heard."""

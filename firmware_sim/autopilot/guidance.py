@@ -8,6 +8,7 @@ from collections.abc import Callable
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.modes import MODES
@@ -72,6 +73,11 @@ class Guidance:
     def is_done(self, state: Vector) -> bool:
         """Return whether the present mode has reached its end."""
         return not self._stopped and self._flown.is_done(state)
+
+    @property
+    def destination(self) -> Vec | None:
+        """Where the present mode is going, local NED [m]; None = nowhere of its own choice."""
+        return None if self._stopped else self._flown.destination
 
     def demand(self, state: Vector, phase: Phase, time_us: int) -> AnyDemand | None:
         """Return what to fly now; None = the motors are stopped."""

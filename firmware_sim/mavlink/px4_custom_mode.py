@@ -78,16 +78,17 @@ def base_mode(status: CommanderStatus) -> int:
     return bits
 
 
-def system_status(status: CommanderStatus) -> int:
-    """Return the MAV_STATE of HEARTBEAT: UNINIT, STANDBY, ACTIVE, or CRITICAL in a failsafe.
+def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
+    """Return the MAV_STATE of HEARTBEAT.
 
+    ACTIVE, or CRITICAL in a failsafe; disarmed STANDBY, or UNINIT while the mode cannot be armed.
     Once terminated it is FLIGHT_TERMINATION, armed or not.
     """
     if status.mode is Mode.TERMINATION:
         return int(dialect.MAV_STATE_FLIGHT_TERMINATION)
     if status.arming is Arming.ARMED:
         return int(dialect.MAV_STATE_CRITICAL if status.failsafe else dialect.MAV_STATE_ACTIVE)
-    standby = status.arming is Arming.STANDBY
+    standby = status.arming is Arming.STANDBY and can_arm
     return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
 
 

@@ -18,7 +18,7 @@ from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import RawClient
 
 MEASURED_PAYLOAD_HZ = {
-    "ATTITUDE": 14.32, "GPS_RAW_INT": 7.89, "HIGHRES_IMU": 7.16, "ATTITUDE_QUATERNION": 7.16,
+    "ATTITUDE": 14.32, "GPS_RAW_INT": 10.0, "HIGHRES_IMU": 7.16, "ATTITUDE_QUATERNION": 7.16,
     "GLOBAL_POSITION_INT": 7.16, "LOCAL_POSITION_NED": 4.3, "ODOMETRY": 4.3, "TIMESYNC": 1.43,
     "ALTITUDE": 1.43, "VFR_HUD": 1.43, "HEARTBEAT": 1.0, "MISSION_CURRENT": 1.0,
     "SYS_STATUS": 0.73, "SCALED_PRESSURE": 0.13,

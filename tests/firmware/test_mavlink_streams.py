@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from airl_mav.core.constants import EARTH_RADIUS_M, TICK_US, US_PER_S
+from airl_mav.core.constants import EARTH_RADIUS_M, GRAVITY_M_S2, TICK_US, US_PER_S
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
@@ -38,7 +38,7 @@ MEASURED_ONBOARD = {
     "ATTITUDE": 100, "GLOBAL_POSITION_INT": 50, "HIGHRES_IMU": 50, "ATTITUDE_QUATERNION": 50,
     "LOCAL_POSITION_NED": 30, "ODOMETRY": 30, "TIMESYNC": 10, "ALTITUDE": 10,
     "ATTITUDE_TARGET": 10, "POSITION_TARGET_LOCAL_NED": 10, "SERVO_OUTPUT_RAW": 10, "VFR_HUD": 10,
-    "GPS_RAW_INT": 8, "EXTENDED_SYS_STATE": 5, "SYS_STATUS": 5, "HEARTBEAT": 1,
+    "GPS_RAW_INT": 10, "EXTENDED_SYS_STATE": 5, "SYS_STATUS": 5, "HEARTBEAT": 1,
     "ESTIMATOR_STATUS": 1, "PING": 1, "SCALED_PRESSURE": 1, "SYSTEM_TIME": 1,
     "MISSION_CURRENT": 1, "BATTERY_STATUS": 0.5, "HOME_POSITION": 0.5, "VIBRATION": 0.5,
     "CURRENT_MODE": 0.5, "ESC_INFO": 10, "ESC_STATUS": 10,
@@ -204,18 +204,17 @@ def test_height_is_above_home_not_above_the_origin() -> None:
     assert (home.latitude, home.longitude) == (473_977_430, 85_455_940)
     assert (home.altitude, home.x, home.y) == (491_400, 0.0, 0.0)
     assert home.z == pytest.approx(-2.0)
-    assert all(map(math.isnan, home.q))
+    assert home.q == pytest.approx([math.cos(0.3), 0.0, 0.0, math.sin(0.3)])
     origin = newest(autopilot, "GPS_GLOBAL_ORIGIN")
     assert (origin.latitude, origin.longitude) == (473_977_430, 85_455_940)
     assert origin.altitude == 489_400
 
 
-def test_odometry_turns_the_velocity_into_the_body() -> None:
+def test_odometry_is_in_the_local_frame() -> None:
+    """As PX4 1.16 sends it, velocity too."""
     message = newest(flown(), "ODOMETRY")
-    rotation = Rotation.from_euler("ZYX", [-1.25, -0.2, 0.1])
-    body = rotation.inv().apply([1.5, -0.5, 0.25])
-    assert [message.vx, message.vy, message.vz] == pytest.approx(body, abs=1e-6)
-    assert (message.frame_id, message.child_frame_id) == (1, 12)  # LOCAL_NED, BODY_FRD
+    assert [message.vx, message.vy, message.vz] == [1.5, -0.5, 0.25]
+    assert (message.frame_id, message.child_frame_id) == (1, 1)  # LOCAL_NED both
     assert [message.x, message.y, message.z] == [12.5, -7.25, -3.5]
     sigma = np.arange(1.0, 16.0) / 100.0
     pose = np.full((6, 6), math.nan)
@@ -225,7 +224,7 @@ def test_odometry_turns_the_velocity_into_the_body() -> None:
     rates[np.triu_indices(6)] = message.velocity_covariance
     assert np.diag(rates)[:3] == pytest.approx(sigma[3:6] ** 2)
     assert np.isnan(rates).sum() == 33
-    assert (message.estimator_type, message.quality) == (8, 100)
+    assert (message.estimator_type, message.quality) == (8, 0)
 
 
 def test_vfr_hud() -> None:
@@ -297,26 +296,28 @@ def test_battery_state_is_undefined_without_thresholds() -> None:
 
 
 def test_sys_status() -> None:
-    autopilot = KinematicAutopilot()
-    ready = 0x1 | 0x2 | 0x4 | 0x20
-    prearm, ahrs = 0x1000_0000, 0x20_0000
-    booting = newest(autopilot, "SYS_STATUS")
-    assert booting.onboard_control_sensors_present & (ready | prearm | ahrs) == (
-        ready | prearm | ahrs
-    )
-    assert booting.onboard_control_sensors_health & (0x20 | prearm | ahrs) == 0
-    message = newest(flown(), "SYS_STATUS")
-    assert message.onboard_control_sensors_health & (ready | prearm | ahrs) == (
-        ready | prearm | ahrs
-    )
+    """The bits are those of a running PX4 1.16 SITL, disarmed and armed, without a radio."""
+    prearm, ahrs, gps, radio = 0x1000_0000, 0x20_0000, 0x20, 0x1_0000
+    booting = newest(KinematicAutopilot(), "SYS_STATUS")
+    assert booting.onboard_control_sensors_health & (gps | prearm | ahrs) == 0
+    assert booting.onboard_control_sensors_enabled & gps
+    autopilot = flown()
+    message = newest(autopilot, "SYS_STATUS")
+    assert message.onboard_control_sensors_present == 33_603_629
+    assert message.onboard_control_sensors_enabled == 33_669_165
+    assert message.onboard_control_sensors_health == 857_786_431
+    assert not message.onboard_control_sensors_health & radio
+    assert message.onboard_control_sensors_health_extended == 1
+    autopilot.arming = Arming.ARMED
+    assert newest(autopilot, "SYS_STATUS").onboard_control_sensors_present == 50_380_845
     assert (message.voltage_battery, message.current_battery) == (15_800, 1_234)
     assert (message.battery_remaining, message.load) == (83, 123)
 
 
 def test_estimator_status() -> None:
     message = newest(flown(), "ESTIMATOR_STATUS")
-    good = 1 | 2 | 4 | 8 | 16 | 32 | 256 | 512
-    assert message.flags == good
+    good, stands = 1 | 2 | 4 | 8 | 16 | 32 | 256 | 512, 128
+    assert message.flags == good | stands
     assert message.pos_horiz_ratio == pytest.approx(0.1)
     assert message.pos_vert_ratio == pytest.approx(0.2)
     assert message.mag_ratio == pytest.approx(0.3)
@@ -344,11 +345,11 @@ def estimator_flags(state: AutopilotState) -> int:
         ({"mag": False}, 0x4, 0),
         ({"baro": False}, 0x8, 0),
         ({"gps": False}, 0x20, 0),
-        ({"attitude": False}, 0x20_0000, 1),
+        ({"attitude": False}, 0x20_0000 | 0x800, 1),
         ({"battery": False}, 0x200_0000, 0),
         ({"velocity": False}, 0, 2),
         ({"altitude": False}, 0, 4 | 32),
-        ({"position": False}, 0, 8 | 16 | 256 | 512),
+        ({"position": False}, 0x4000, 8 | 16 | 256 | 512),
     ],
 )
 def test_what_has_failed_clears_its_bits(
@@ -387,27 +388,43 @@ def test_motors() -> None:
     autopilot = flown()
     message = newest(autopilot, "SERVO_OUTPUT_RAW")
     names = [f"servo{i}_raw" for i in range(1, 9)]
-    assert [getattr(message, name) for name in names] == [900] * 4 + [0] * 4
+    assert [getattr(message, name) for name in names] == [900] * 8
     autopilot.arming = Arming.ARMED
     message = newest(autopilot, "SERVO_OUTPUT_RAW")
-    assert [getattr(message, name) for name in names] == [1000, 1250, 1500, 2000, 0, 0, 0, 0]
+    assert [getattr(message, name) for name in names] == [1000, 1250, 1500, 2000, *[900] * 4]
 
 
 def test_setpoints_and_their_masks() -> None:
     autopilot = flown()
-    autopilot.mode = Mode.OFFBOARD
+    autopilot.mode, autopilot.arming = Mode.OFFBOARD, Arming.ARMED
     nan = math.nan
     autopilot.offer_setpoint(
         Setpoint(np.array([nan, nan, -2.0]), np.array([1.0, 2.0, nan]), nan, 0.5), 0
     )
     message = newest(autopilot, "POSITION_TARGET_LOCAL_NED")
     assert message.coordinate_frame == 1
-    ignored = 1 | 2 | 32 | 64 | 128 | 256 | 1024
-    assert message.type_mask == ignored
+    assert message.type_mask == 1 | 2 | 32
+    # The thrust of a hover along a body that is tilted.
+    tilted = Rotation.from_euler("ZYX", [-1.25, -0.2, 0.1]).apply([0.0, 0.0, GRAVITY_M_S2])
+    acceleration = [message.afx, message.afy, message.afz]
+    assert acceleration == pytest.approx([0.0, 0.0, GRAVITY_M_S2] - tilted, abs=1e-5)
+    assert message.yaw == pytest.approx(-1.25)
     assert (message.z, message.vx, message.vy, message.yaw_rate) == (-2.0, 1.0, 2.0, 0.5)
     target = newest(autopilot, "ATTITUDE_TARGET")
     assert (target.thrust, target.type_mask) == (0.5, 0)
     assert target.q == pytest.approx(autopilot.state().attitude_setpoint)
+    autopilot.arming = Arming.STANDBY
+    message = newest(autopilot, "POSITION_TARGET_LOCAL_NED")
+    assert (message.type_mask, message.afz) == (63, 100.0)
+
+
+def test_where_an_automatic_mode_is_going() -> None:
+    autopilot = flown()
+    autopilot.destination = (0.0, 0.0, -4.0)
+    message = newest(autopilot, "POSITION_TARGET_GLOBAL_INT")
+    assert (message.coordinate_frame, message.type_mask) == (5, 0)
+    assert (message.lat_int, message.lon_int) == (473_977_430, 85_455_940)
+    assert message.alt == pytest.approx(493.4)
 
 
 def test_vibration_metrics_are_px4s() -> None:
@@ -477,7 +494,8 @@ def test_heartbeat(
     autopilot = flown()
     autopilot.arming, autopilot.mode, autopilot.failsafe = arming, mode, failsafe
     snapshot = autopilot.state().status
-    assert (base_mode(snapshot), custom_mode(mode), system_status(snapshot)) == (
+    state = system_status(snapshot, can_arm=True)
+    assert (base_mode(snapshot), custom_mode(mode), state) == (
         base,
         custom,
         status,

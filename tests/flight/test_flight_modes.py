@@ -94,7 +94,12 @@ def test_return_flies_home_and_lands(home_north: float) -> None:
         rig.stream(None)
         out = away(rig, *home)
         assert out > 10.0
+        assert rig.ap.state().destination is None
         assert rig.ap.set_mode(Mode.RETURN) is Result.ACCEPTED
+        rig.tick()
+        above = rig.ap.state().destination
+        assert above is not None
+        assert away(rig, *above[:2]) < 1.0
         rig.until(lambda: rig.height > 7.5, 20.0)
         assert away(rig, *home) > 0.8 * out, "climbs first"
         rig.until(lambda: disarmed(rig), 60.0)

@@ -112,6 +112,7 @@ class KinematicAutopilot:
         self.failsafe = False
         self.home: Geodetic | None = None
         self.origin: Geodetic | None = None
+        self.destination: tuple[float, float, float] | None = None
         self.battery = BatterySample(15.8, 12.34, 456.0, 0.83)
         self.mag = np.array([0.21, 0.01, 0.43])
         self.accel = np.array([0.1, -0.2, -GRAVITY_M_S2])
@@ -262,6 +263,8 @@ class KinematicAutopilot:
             origin=self.origin,
             load=0.123,
             mission=progress(self.plans),
+            home_yaw=0.6,
+            destination=self.destination,
         )
 
     # --- flying ---

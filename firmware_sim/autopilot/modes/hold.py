@@ -6,6 +6,7 @@ import math
 
 from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import (
     FREE,
@@ -37,6 +38,11 @@ class Hold(FlightMode):
         self._travelling = False
         self._settling = False
         """Whether hold still climbs to the altitude of a take-off that has ended."""
+
+    @property
+    def destination(self) -> Vec | None:
+        """The place, once it is known."""
+        return None if self._braking else self._place.position
 
     def enter(self, state: Vector, request: Request | None, /) -> None:
         """Begin: climb the rest of a take-off, go to a place, or brake here."""

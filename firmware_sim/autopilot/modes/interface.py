@@ -83,6 +83,11 @@ class FlightMode(Protocol):
         """Whether an armed vehicle that stands on the ground takes off in this mode."""
         return False
 
+    @property
+    def destination(self) -> Vec | None:
+        """Where an automatic mode is going, local NED [m]; None in all other modes."""
+        return None
+
     def enter(self, _state: Vector, _request: Request | None, /) -> None:
         """Begin at the present state.
 

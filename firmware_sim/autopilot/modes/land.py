@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import (
     FREE,
@@ -30,6 +31,12 @@ class Land(FlightMode):
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
         self._stopping = False
+
+    @property
+    def destination(self) -> Vec | None:
+        """The ground below, as high as home."""
+        north, east, _ = self._place.position
+        return north, east, self._context.home[2]
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin at the present place."""

@@ -32,6 +32,11 @@ class Mission(FlightMode):
         """Whether the mission leads off the ground."""
         return self._context.triplet.kind not in (_IDLE, _LAND)
 
+    @property
+    def destination(self) -> Vec | None:
+        """The item that is flown to."""
+        return self._context.triplet.target
+
     def enter(self, _state: Vector, _request: Request | None, /) -> None:
         """Begin; the executor says with what."""
         self._triplet = None

@@ -11,6 +11,7 @@ from enum import Enum, auto
 from airl_mav.control.demand import AnyDemand
 from airl_mav.core.constants import DEG, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
@@ -39,6 +40,16 @@ class ReturnToLaunch(FlightMode):
         self._down = 0.0
         """Of the way home, NED [m]."""
         self._home = Place((0.0, 0.0, 0.0), 0.0)
+
+    @property
+    def destination(self) -> Vec | None:
+        """The end of the present stage."""
+        north, east, ground = self._home.position
+        if self._stage is _Stage.CLIMB:
+            return *self._start.position[:2], self._down
+        if self._stage is _Stage.GO_HOME:
+            return north, east, self._down
+        return north, east, ground if self._stage is _Stage.LAND else self._waiting_down
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin with the climb, if it takes one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from airl_mav.control.demand import Demand
 from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import ClimbLimits
 from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, over
@@ -25,6 +26,16 @@ class Takeoff(FlightMode):
         """Whether the altitude lies above the ground."""
         return self._context.takeoff_altitude_m > LEAST_CLIMB_M
 
+    @property
+    def destination(self) -> Vec | None:
+        """The altitude above the place where it began."""
+        return self._end
+
+    @property
+    def _end(self) -> Vec:
+        north, east, _ = self._place.position
+        return north, east, self._context.home[2] - self._context.takeoff_altitude_m
+
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin the climb at the present place."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
@@ -43,9 +54,7 @@ class Takeoff(FlightMode):
         """Return the altitude above the place where it began, once it is near: hold goes on."""
         if not self.is_done(state):
             return None
-        north, east, _ = self._place.position
-        down = self._context.home[2] - self._context.takeoff_altitude_m
-        return ClimbOn(Place((north, east, down), self._place.yaw))
+        return ClimbOn(Place(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
         """Return whether the take-off has come near its altitude, by PX4's acceptance radius.

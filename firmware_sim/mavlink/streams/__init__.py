@@ -39,6 +39,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "ALTITUDE": pose.altitude,
         "ATTITUDE_TARGET": pose.attitude_target,
         "POSITION_TARGET_LOCAL_NED": pose.position_target_local_ned,
+        "POSITION_TARGET_GLOBAL_INT": pose.position_target_global_int,
         "SERVO_OUTPUT_RAW": actuators.servo_output_raw,
         "VFR_HUD": pose.vfr_hud,
         "GPS_RAW_INT": sensors.gps_raw_int,

@@ -27,16 +27,14 @@ _ESCS = 4
 
 
 def servo_output_raw(state: AutopilotState) -> Values:
-    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed; others unused."""
+    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed, as all others."""
     port = 0
-    return state.time_us & units.UINT32_MAX, port, *_pulses(state), 0, 0, 0, 0
+    return state.time_us & units.UINT32_MAX, port, *_outputs(state)
 
 
 def actuator_output_status(state: AutopilotState) -> Values:
     """The same pulse widths as an array of 16 outputs in use."""
-    pulses = _pulses(state)
-    unused = (_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
-    return state.time_us, _OUTPUTS, *pulses, *unused, *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
+    return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
 
 
 def hil_actuator_controls(state: AutopilotState) -> Values:
@@ -69,6 +67,12 @@ def esc_status(state: AutopilotState) -> Values:
         *(state.battery.voltage_v,) * _ESCS,
         *(_ESC_IDLE_A + _ESC_SPAN_A * u if armed else 0.0 for u in commands),
     )
+
+
+def _outputs(state: AutopilotState) -> Values:
+    """Return the pulse widths of all outputs [µs]."""
+    pulses = _pulses(state)
+    return *pulses, *(_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
 
 
 def _armed(state: AutopilotState) -> bool:

@@ -7,10 +7,11 @@ import math
 import numpy as np
 from numba.extending import register_jitable
 
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle import atmosphere
-from airl_mav.vehicle.rotation import conjugate, rotate, yaw_of
+from airl_mav.vehicle.rotation import Vec, rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
@@ -20,16 +21,15 @@ register_jitable(local_to_geodetic)  # so that kernels can call it, as Python ca
 _NO_ROTATION_OFFSET = (0.0, 0.0, 0.0, 0.0)
 """PX4 saves bytes: zeros mean the identity (tailsitters alone differ)."""
 
-_UNKNOWN_QUATERNION = (math.nan, math.nan, math.nan, math.nan)
-_NO_ACCELERATION = (math.nan, math.nan, math.nan)
 _NO_APPROACH = (0.0, 0.0, 0.0)
 """HOME_POSITION: there is no special way to land."""
 
-_ACCELERATION_IGNORE: int = (
-    dialect.POSITION_TARGET_TYPEMASK_AX_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_AY_IGNORE
-    | dialect.POSITION_TARGET_TYPEMASK_AZ_IGNORE
-)
+_NOTHING = np.full(3, math.nan)
+_STOPPED = (0.0, 0.0, 100.0)
+"""Acceleration setpoint of stopped motors [m/s²]: PX4's way to say no thrust."""
+
+_UNRATED = 0
+"""ODOMETRY.quality: PX4's estimator gives none."""
 
 
 def attitude(state: AutopilotState) -> Values:
@@ -77,23 +77,23 @@ def global_position_int(state: AutopilotState) -> Values | None:
 
 
 def odometry(state: AutopilotState) -> Values:
-    """Pose in local NED, velocity in body FRD, variances on the diagonals (NaN elsewhere)."""
+    """Pose and velocity in local NED, as PX4 sends both; variances on the diagonals (else NaN)."""
     estimate = state.estimate
     x, y, z, vx, vy, vz, roll, pitch, yaw, *_ = (estimate.sigma**2).tolist()
     reset_counter = 0
     return (
         estimate.time_us,
         dialect.MAV_FRAME_LOCAL_NED,
-        dialect.MAV_FRAME_BODY_FRD,
+        dialect.MAV_FRAME_LOCAL_NED,
         *estimate.position.tolist(),
         *estimate.quaternion.tolist(),
-        *_in_body(estimate.quaternion, estimate.velocity),
+        *estimate.velocity.tolist(),
         *estimate.angular_velocity.tolist(),
         *_covariance(x, y, z, roll, pitch, yaw),
         *_covariance(vx, vy, vz, math.nan, math.nan, math.nan),
         reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT,
-        100 if estimate.healthy else 0,
+        _UNRATED,
     )
 
 
@@ -131,18 +131,47 @@ def vfr_hud(state: AutopilotState) -> Values:
 
 
 def position_target_local_ned(state: AutopilotState) -> Values:
-    """What the position and velocity controllers track; the mask marks what is not commanded."""
+    """What the position and velocity controllers track; the mask marks what is not commanded.
+
+    Source: PX4 1.16, PositionControl::getLocalPositionSetpoint: the heading, the yaw rate and the
+    acceleration are always filled in. Disarmed there is nothing else.
+    """
     setpoint = state.setpoint
-    position, velocity = setpoint.position, setpoint.velocity
+    position, velocity, acceleration = setpoint.position, setpoint.velocity, _acceleration(state)
+    yaw, yaw_rate = setpoint.yaw, setpoint.yaw_rate
+    if state.status.arming is not Arming.ARMED:
+        position = velocity = _NOTHING
+        acceleration, yaw, yaw_rate = _STOPPED, quat_yaw(state.estimate.quaternion), 0.0
     return (
         units.boot_ms(state.time_us),
         dialect.MAV_FRAME_LOCAL_NED,
-        _ignored(position, velocity, setpoint.yaw, setpoint.yaw_rate),
+        _ignored(position, velocity),
         *position.tolist(),
         *velocity.tolist(),
-        *_NO_ACCELERATION,
-        setpoint.yaw,
-        setpoint.yaw_rate,
+        *acceleration,
+        yaw if math.isfinite(yaw) else quat_yaw(state.attitude_setpoint),
+        yaw_rate if math.isfinite(yaw_rate) else 0.0,
+    )
+
+
+def position_target_global_int(state: AutopilotState) -> Values | None:
+    """Where an automatic mode is going, and how fast the vehicle shall be now; else nothing."""
+    target, origin = state.destination, state.origin
+    if target is None or origin is None or not all(map(math.isfinite, target)):
+        return None
+    place = local_to_geodetic(np.array(target), origin)
+    yaw, nothing_ignored = state.setpoint.yaw, 0
+    return (
+        units.boot_ms(state.time_us),
+        dialect.MAV_FRAME_GLOBAL_INT,
+        nothing_ignored,
+        units.deg_e7(place.latitude_deg),
+        units.deg_e7(place.longitude_deg),
+        place.altitude_m,
+        *state.setpoint.velocity.tolist(),
+        *_acceleration(state),
+        yaw if math.isfinite(yaw) else quat_yaw(state.attitude_setpoint),
+        0.0,
     )
 
 
@@ -172,7 +201,7 @@ def home_position(state: AutopilotState) -> Values | None:
         if origin is None
         else geodetic_to_local(home, origin).tolist()
     )
-    return *_wire(home), *local, *_UNKNOWN_QUATERNION, *_NO_APPROACH, state.time_us
+    return *_wire(home), *local, *_heading(state.home_yaw), *_NO_APPROACH, state.time_us
 
 
 def gps_global_origin(state: AutopilotState) -> Values | None:
@@ -232,25 +261,27 @@ def _on_globe(
 
 
 @kernel
-def _ignored(position: Vector, velocity: Vector, yaw: float, yaw_rate: float) -> int:
+def _ignored(position: Vector, velocity: Vector) -> int:
     """Return the POSITION_TARGET_TYPEMASK of a setpoint: what is not commanded."""
-    mask = _ACCELERATION_IGNORE
+    mask = 0
     for i in range(3):  # the bits of y and z follow that of x
         if not math.isfinite(position[i]):
             mask |= dialect.POSITION_TARGET_TYPEMASK_X_IGNORE << i
         if not math.isfinite(velocity[i]):
             mask |= dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE << i
-    if not math.isfinite(yaw):
-        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE
-    if not math.isfinite(yaw_rate):
-        mask |= dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
     return mask
 
 
-@kernel
-def _in_body(q: Vector, v: Vector) -> tuple[float, float, float]:
-    """Return a NED vector (3,) in body FRD; q (4,) is the attitude."""
-    return rotate(conjugate((q[0], q[1], q[2], q[3])), (v[0], v[1], v[2]))
+def _acceleration(state: AutopilotState) -> Vec:
+    """Return the acceleration NED [m/s²] that the thrust setpoint stands for, gravity apart."""
+    w, x, y, z = state.attitude_setpoint.tolist()
+    north, east, down = rotate((w, x, y, z), (0.0, 0.0, state.thrust_setpoint / state.hover_thrust))
+    return -GRAVITY_M_S2 * north, -GRAVITY_M_S2 * east, GRAVITY_M_S2 * (1.0 - down)
+
+
+def _heading(yaw: float) -> Values:
+    """Return a level attitude w, x, y, z with a heading [rad]."""
+    return math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)
 
 
 def _height_above_home(state: AutopilotState) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
 from firmware_sim.mavlink.codec import Values, dialect
@@ -58,20 +58,28 @@ _LANDED = {
     Landed.LANDING: dialect.MAV_LANDED_STATE_LANDING,
 }
 
-_SENSORS_ALWAYS = (
-    dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS | dialect.MAV_SYS_STATUS_EXTENSION_USED
+_NEVER_WRONG = (
+    dialect.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
+    | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
+    | dialect.MAV_SYS_STATUS_LOGGING
+    | dialect.MAV_SYS_STATUS_OBSTACLE_AVOIDANCE
 )
-_SENSORS_PRESENT = (
-    _SENSORS_ALWAYS
-    | dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+_PRESENT = (
+    dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
     | dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
     | dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
     | dialect.MAV_SYS_STATUS_SENSOR_GPS
-    | dialect.MAV_SYS_STATUS_AHRS
+    | dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
+    | dialect.MAV_SYS_STATUS_SENSOR_MOTOR_OUTPUTS
     | dialect.MAV_SYS_STATUS_SENSOR_BATTERY
-    | dialect.MAV_SYS_STATUS_PREARM_CHECK
 )
+"""As a running PX4 1.16 SITL has them: it does not count the accelerometer."""
+
+_LOGGED = dialect.MAV_SYS_STATUS_LOGGING
+"""Present once it is armed: the log begins then."""
+
+_RADIO = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+_NONE_EXTENDED, _PARACHUTE = 0, dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 
 
 def heartbeat(state: AutopilotState) -> Values:
@@ -82,7 +90,7 @@ def heartbeat(state: AutopilotState) -> Values:
         dialect.MAV_AUTOPILOT_PX4,
         base_mode(status),
         custom_mode(status.mode),
-        system_status(status),
+        system_status(status, can_arm=state.health.armable),
         _MAVLINK_VERSION,
     )
 
@@ -93,36 +101,55 @@ def extended_sys_state(state: AutopilotState) -> Values:
 
 
 def sys_status(state: AutopilotState) -> Values:
-    """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%]."""
-    health = state.health
-    fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
-    bits: int = _SENSORS_ALWAYS
-    for good, bit in (
-        (health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO),
-        (health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL),
-        (health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG),
-        (
-            health.baro and state.pressure_hpa > 0.0,
-            dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
-        ),
-        (health.gps and fixed, dialect.MAV_SYS_STATUS_SENSOR_GPS),
-        (health.attitude and _knows(state), dialect.MAV_SYS_STATUS_AHRS),
-        (health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY),
-        (_may_be_armed(state), dialect.MAV_SYS_STATUS_PREARM_CHECK),
-    ):
+    """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%].
+
+    Source: PX4 1.16, streams/SYS_STATUS.hpp: a part is enabled when it is present or unhealthy.
+    """
+    present: int = _PRESENT
+    if state.status.arming is Arming.ARMED:
+        present |= _LOGGED
+    if state.has_pilot:
+        present |= _RADIO
+    healthy: int = _NEVER_WRONG
+    unhealthy: int = 0
+    for good, bit in _health(state):
         if good:
-            bits |= bit
+            healthy |= bit
+        else:
+            unhealthy |= bit
+    if _may_be_armed(state):
+        healthy |= dialect.MAV_SYS_STATUS_PREARM_CHECK
     battery = state.battery
     return (
-        _SENSORS_PRESENT,
-        _SENSORS_PRESENT,
-        bits,
+        present,
+        present | unhealthy,
+        healthy,
         uint16(state.load * 1e3),
         uint16(battery.voltage_v * 1e3),
         int16(battery.current_a * 100.0, unknown=-1),
         percent(battery.remaining),
         *_NO_ERRORS,
+        *(_NONE_EXTENDED, _NONE_EXTENDED, _PARACHUTE),
     )
+
+
+def _health(state: AutopilotState) -> Iterator[tuple[bool, int]]:
+    """Yield what may fail, and its bits: whether it is good."""
+    health = state.health
+    fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
+    attitude = health.attitude and _knows(state)
+    yield health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    yield health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    yield health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
+    pressure = health.baro and state.pressure_hpa > 0.0
+    yield pressure, dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+    yield health.gps and fixed, dialect.MAV_SYS_STATUS_SENSOR_GPS
+    yield attitude, dialect.MAV_SYS_STATUS_AHRS
+    yield attitude, dialect.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    located = health.position and _knows(state)
+    yield located, dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
+    yield health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY
+    yield state.has_pilot, _RADIO
 
 
 def estimator_status(state: AutopilotState) -> Values:
@@ -165,6 +192,8 @@ def _estimator_flags(state: AutopilotState) -> int:
         ),
         (bool(state.estimate.innovation_ratio[0] > 1.0), dialect.ESTIMATOR_GPS_GLITCH),
         (health.accel_error, dialect.ESTIMATOR_ACCEL_ERROR),
+        # A disarmed vehicle is known to stand.
+        (state.status.arming is not Arming.ARMED, dialect.ESTIMATOR_CONST_POS_MODE),
     ):
         if good:
             flags |= bits
