@@ -188,7 +188,7 @@ def test_set_home(rig: Rig) -> None:
 
 def test_missions_are_started_and_places_looked_at(rig: Rig) -> None:
     assert rig.command(300, 0)[0] == DENIED  # none is stored
-    assert rig.command(189)[0] == Result.FAILED
+    assert rig.command(189)[0] == Result.CANCELLED
     rig.autopilot.plans.store(Kind.MISSION, (at(0, 0, 5), at(0, 0, 0, 21)), 1)
     assert rig.command(300, 0)[0] == ACCEPTED
     assert rig.command(300, math.nan)[0] == DENIED

@@ -166,7 +166,8 @@ def _calibrate(command: Command, context: Context) -> Result:
         text = "[cal] calibration failed: Disconnect battery and try again"
         context.announce(Message(Severity.CRITICAL, text))
         return Result.DENIED
-    return Result.ACCEPTED if asked[4] == 0 else Result.UNSUPPORTED
+    # What is no number is none of PX4's calibrations, nor a cancellation.
+    return Result.ACCEPTED if command.integer(4) == 0 else Result.UNSUPPORTED
 
 
 def _quick_magnetometer(command: Command, context: Context) -> Result:

@@ -20,7 +20,8 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams import flight_modes
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
-_INTERVAL_DISABLED, _INTERVAL_UNAVAILABLE = -1, 0
+_INTERVAL_UNAVAILABLE = 0
+"""PX4 says the same of a stream that is off as of one that there is not."""
 _MIB = 1024.0 * 1024.0
 
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
@@ -45,16 +46,13 @@ def _set_message_interval(command: Command, context: Context) -> Result:
 
 
 def _get_message_interval(command: Command, context: Context) -> Result:
-    number = command.integer(1)
-    if number is None or not 0 <= number <= 0xFFFF:
-        return Result.DENIED
-    return _send_interval(number, context)
+    return _send_interval((command.integer(1) or 0) & 0xFFFF, context)
 
 
 def _request_message(command: Command, context: Context) -> Result:
     """Parameter 1: message id; 2: what the message takes."""
-    number = command.integer(1)
-    special = _SPECIAL.get(number) if number is not None else None
+    number = command.integer(1) or 0
+    special = _SPECIAL.get(number)
     if special is not None:
         return special(command, context)
     name = _stream_name(number, context)
@@ -130,7 +128,7 @@ def _send_interval(number: int, context: Context) -> Result:
     name, interval = _stream_name(number, context), _INTERVAL_UNAVAILABLE
     if name is not None:
         interval = context.link.scheduler.interval_us(name)
-        interval = _INTERVAL_DISABLED if interval == OFF else interval
+        interval = _INTERVAL_UNAVAILABLE if interval == OFF else interval
     context.link.send(dialect.MAVLink_message_interval_message(number, interval))
     return Result.ACCEPTED
 

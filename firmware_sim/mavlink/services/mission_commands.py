@@ -27,12 +27,12 @@ def _start(command: Command, context: Context) -> Result:
 
 
 def _start_landing(_command: Command, context: Context) -> Result:
-    """Go to the mission's landing: DO_LAND_START, or the first landing."""
+    """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
     commands = [item.command for item in context.port.plans.mission]
     for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
         if marker in commands:
             return context.port.start_mission(commands.index(marker))
-    return Result.FAILED
+    return Result.CANCELLED
 
 
 def _set_home(command: Command, context: Context) -> Result:

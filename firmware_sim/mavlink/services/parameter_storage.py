@@ -18,7 +18,7 @@ def _store(command: Command, context: Context) -> Result | None:
     if context.port.state().status.arming is Arming.ARMED:
         return Result.TEMPORARILY_REJECTED
     parameters = context.port.parameters
-    asked = command.integer(1) or 0
+    asked = command.integer(1)
     if asked in (_RESET, _FACTORY_RESET):
         parameters.reset()
     elif asked == _LOAD:

@@ -6,7 +6,7 @@ of the vehicle that is not there, and so nobody acknowledges them.
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import Context
@@ -18,7 +18,14 @@ ACCEPTED = (
 )
 
 NOT_ACKNOWLEDGED = (
-    dialect.MAV_CMD_ACTUATOR_TEST,
+    dialect.MAV_CMD_CONFIGURE_ACTUATOR,
+    dialect.MAV_CMD_DO_FIGURE_EIGHT,
+    dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST,
+    dialect.MAV_CMD_DO_SET_CAM_TRIGG_INTERVAL,
+    dialect.MAV_CMD_OBLIQUE_SURVEY,
+    dialect.MAV_CMD_SET_CAMERA_ZOOM,
+    dialect.MAV_CMD_SET_CAMERA_FOCUS,
+    dialect.MAV_CMD_START_RX_PAIR,
     dialect.MAV_CMD_SET_CAMERA_MODE,
     dialect.MAV_CMD_DO_DIGICAM_CONTROL,
     dialect.MAV_CMD_DO_TRIGGER_CONTROL,
@@ -47,6 +54,16 @@ def _ignore(_command: Command, _context: Context) -> None:
     return None
 
 
+def _actuator_test(_command: Command, context: Context) -> Result | None:
+    """PX4 refuses it while armed; disarmed there is nothing here that could be turned."""
+    armed = context.port.state().status.arming is Arming.ARMED
+    return Result.DENIED if armed else None
+
+
+def _reject_for_now(_command: Command, _context: Context) -> Result:
+    return Result.TEMPORARILY_REJECTED
+
+
 def _high_latency(_command: Command, context: Context) -> Result:
     text = "Control high latency failed! Telemetry unavailable"
     context.announce(Message(Severity.CRITICAL, text))
@@ -56,5 +73,8 @@ def _high_latency(_command: Command, context: Context) -> Result:
 ACTIONS: dict[int, Action] = {
     **dict.fromkeys(ACCEPTED, _accept),
     **dict.fromkeys(NOT_ACKNOWLEDGED, _ignore),
+    dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
     dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
+    # The estimator takes a place from outside only while it has none of its own.
+    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _reject_for_now,
 }
