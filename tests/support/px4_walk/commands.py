@@ -13,8 +13,8 @@ from mavsdk.plugins.events import Events
 from mavsdk.plugins.gimbal import ControlMode, Gimbal
 from mavsdk.plugins.gripper import Gripper
 
-from tests.support.px4_walk.row import Refused, Row
-from tests.support.px4_walk.vehicle import NO_ACK, Vehicle
+from tests.support.px4_walk.row import Row
+from tests.support.px4_walk.vehicle import NO_ACK, Refused, Vehicle
 
 RESULTS = {
     "GET_HOME_POSITION": (410, (), "ACCEPTED"),

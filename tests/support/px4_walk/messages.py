@@ -9,8 +9,8 @@ from mavsdk.plugins.info import Info
 from mavsdk.plugins.telemetry import Telemetry
 from mavsdk.plugins.transponder import Transponder
 
-from tests.support.px4_walk.row import OK, Refused, Row
-from tests.support.px4_walk.vehicle import Vehicle
+from tests.support.px4_walk.row import OK, Row
+from tests.support.px4_walk.vehicle import Refused, Vehicle
 
 REQUEST_MESSAGE = 512
 
@@ -51,6 +51,9 @@ RATES = (
     *("scaled_imu", "velocity_ned", "vtol_state"),
 )
 
+CLOCK_HZ = {"odometry": 50.0, "position_velocity_ned": 50.0}
+"""What the walk tells the time and the place by is not slowed down [Hz]."""
+
 NO_RATES = ("actuator_control_target", "raw_imu")
 
 
@@ -65,7 +68,9 @@ def _request(number: int, name: str) -> Callable[[Vehicle], Any]:
 
 
 def _rate(name: str) -> Callable[[Vehicle], Any]:
-    return lambda vehicle: getattr(vehicle.plugin(Telemetry), f"set_rate_{name}")(5.0)
+    return lambda vehicle: getattr(vehicle.plugin(Telemetry), f"set_rate_{name}")(
+        CLOCK_HZ.get(name, 5.0)
+    )
 
 
 ROWS = (

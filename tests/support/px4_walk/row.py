@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from tests.support.px4_walk.vehicle import Vehicle
+from tests.support.px4_walk.vehicle import Refused, Vehicle
 
 OK = "ok"
 """The call succeeds."""
@@ -57,11 +57,3 @@ def answered(row: Row, vehicle: Vehicle) -> Answer:
         return Answer(row, refused.outcome)
     except Exception as error:  # MAVSDK's errors have one class for each plugin
         return Answer(row, str(error).split(";")[0].strip() or type(error).__name__)
-
-
-class Refused(Exception):  # noqa: N818 - an outcome, not a fault of the program
-    """A call that is not one of MAVSDK's was refused."""
-
-    def __init__(self, outcome: str) -> None:
-        super().__init__(outcome)
-        self.outcome = outcome

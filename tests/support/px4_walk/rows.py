@@ -2,14 +2,39 @@
 
 from __future__ import annotations
 
-from tests.support.px4_walk import commands, files, messages, missions, parameters
+from tests.support.px4_walk import (
+    commands,
+    ending,
+    files,
+    flight,
+    messages,
+    missions,
+    offboard,
+    parameters,
+    pilot,
+    plans_flown,
+)
 from tests.support.px4_walk.row import Row
 
-ROWS: tuple[Row, ...] = (
+GROUND: tuple[Row, ...] = (
     *parameters.ROWS,
     *messages.ROWS,
     *files.ROWS,
     *commands.ROWS,
     *missions.ROWS,
 )
+"""Of a vehicle that stands."""
+
+FLIGHT: tuple[Row, ...] = (
+    *flight.GROUND,
+    *flight.CLIMB,
+    *flight.AIR,
+    *offboard.ROWS,
+    *plans_flown.ROWS,
+    *pilot.ROWS,
+    *ending.ROWS,
+)
+"""A flight from arming to the end."""
+
+ROWS = GROUND + FLIGHT
 """In the order in which they are made."""

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import queue
+import time
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, TypeVar, cast
 
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
+from mavsdk.plugins.telemetry import FlightMode, Telemetry
 
+from airl_mav.core.constants import EARTH_RADIUS_M, US_PER_S
 from tests.support.mavlink_clients import Companion
 
 NO_ACK = "no ack"
@@ -21,16 +25,141 @@ _RESULTS = (
     *("IN_PROGRESS", "CANCELLED"),
 )
 
+_CLOCK_HZ = 50.0
+"""How often the vehicle tells its time and its place [Hz]."""
+
+_STANDS_STILL_S = 60.0
+"""So long may simulated time stand still before a wait is given up [wall s]."""
+
+FAST, OFFBOARD = 16.0, 5.0
+"""How fast a wait may run [simulated s a wall s]; MAVSDK repeats setpoints by the wall clock."""
+
 Plugin = TypeVar("Plugin")
+Pace = Callable[[float], AbstractContextManager[None]]
+"""Lets simulated time run at a speed meanwhile, where that can be chosen."""
+
+
+def _as_it_is(_speed: float) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
+class Refused(Exception):  # noqa: N818 - an outcome, not a fault of the program
+    """A call that is not one of MAVSDK's was refused, or a wait was in vain."""
+
+    def __init__(self, outcome: str) -> None:
+        super().__init__(outcome)
+        self.outcome = outcome
 
 
 class Vehicle:
     """A connected vehicle."""
 
-    def __init__(self, companion: Companion, system_id: int = 1) -> None:
+    def __init__(self, companion: Companion, system_id: int = 1, *, pace: Pace = _as_it_is) -> None:
         self._companion = companion
         self._plugins: dict[type, Any] = {}
+        self._pace = pace
+        self._clock_set = False
         self.system_id = system_id
+
+    # --- where it is
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """MAVSDK's telemetry."""
+        return self.plugin(Telemetry)
+
+    @property
+    def mode(self) -> FlightMode:
+        """The mode by its heartbeat."""
+        return cast("FlightMode", self.telemetry.flight_mode())
+
+    @property
+    def position(self) -> tuple[float, float, float]:
+        """North, east, down [m], as estimated."""
+        p = self.telemetry.position_velocity_ned().position
+        return p.north_m, p.east_m, p.down_m
+
+    @property
+    def velocity(self) -> tuple[float, float, float]:
+        """North, east, down [m/s], as estimated."""
+        v = self.telemetry.position_velocity_ned().velocity
+        return v.north_m_s, v.east_m_s, v.down_m_s
+
+    @property
+    def yaw_deg(self) -> float:
+        """Heading [deg]."""
+        return float(self.telemetry.attitude_euler().yaw_deg)
+
+    @property
+    def height(self) -> float:
+        """Height above home [m]."""
+        return float(self.telemetry.position().relative_altitude_m)
+
+    def is_near(self, north: float, east: float, within: float = 1.0) -> bool:
+        """Whether it is within some metres of a place, horizontally."""
+        n, e, _ = self.position
+        return math.hypot(n - north, e - east) < within
+
+    def place(self, north: float, east: float) -> tuple[float, float]:
+        """Return latitude and longitude [deg] of metres from the local origin."""
+        origin = self.telemetry.get_gps_global_origin()
+        return (
+            origin.latitude_deg + math.degrees(north / EARTH_RADIUS_M),
+            origin.longitude_deg
+            + math.degrees(east / EARTH_RADIUS_M / math.cos(math.radians(origin.latitude_deg))),
+        )
+
+    # --- time
+
+    @property
+    def now_s(self) -> float:
+        """Simulated time [s]."""
+        if not self._clock_set:
+            self._clock_set = True
+            # PX4's calendar time is the host's; its odometry has the time of the simulation.
+            self.telemetry.set_rate_odometry(_CLOCK_HZ)
+            self.telemetry.set_rate_position_velocity_ned(_CLOCK_HZ)
+        return float(self.telemetry.odometry().time_usec) / US_PER_S
+
+    def until(self, condition: Callable[[], Any], limit_s: float, *, speed: float = FAST) -> None:
+        """Wait for a condition. Raises Refused after a simulated time."""
+        end = self.now_s + limit_s
+        for _ in self._ticks(speed):
+            if condition():
+                return
+            if self.now_s > end:
+                raise Refused(f"not within {limit_s:g} s")
+
+    def wait(
+        self,
+        seconds: float,
+        each: Callable[[], object] | None = None,
+        *,
+        speed: float = FAST,
+    ) -> None:
+        """Let simulated time go by; call `each` at some 30 Hz."""
+        end, due = self.now_s + seconds, 0.0
+        for now in self._ticks(speed):
+            if now >= end:
+                return
+            if each is not None and now >= due:
+                each()
+                due = now + 0.03
+
+    def _ticks(self, speed: float) -> Any:
+        """Yield the simulated time whenever it has moved. Raises Refused when it stands still."""
+        before, deadline = 0.0, time.monotonic() + _STANDS_STILL_S
+        with self._pace(speed):
+            while True:
+                now = self.now_s
+                if now != before:
+                    before, deadline = now, time.monotonic() + _STANDS_STILL_S
+                    yield now
+                elif time.monotonic() > deadline:
+                    raise Refused("simulated time stands still")
+                time.sleep(0.001)
+
+    # --- what is asked of it
 
     def plugin(self, kind: Callable[..., Plugin]) -> Plugin:
         """Return one of MAVSDK's plugins; each is made once."""

@@ -1,0 +1,116 @@
+"""MAVSDK at the built-in autopilot and a simulated vehicle, all in this process.
+
+Simulated time runs at a multiple of real time that the test chooses: slowly while MAVSDK is waiting
+for an answer, fast while the vehicle flies.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from mavsdk import ComponentType, Configuration, Mavsdk
+
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import TICK_S
+from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.mavlink.link import LinkConfig
+from firmware_sim.mavlink.rates import ONBOARD_HZ
+from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.simulation import EpisodeSetup, Simulation
+from tests.support.flight_rig import quad
+from tests.support.mavlink_clients import BOOT_UNIX_US, Companion, RawLane
+
+SLOW = 2.0
+"""Speed while nobody waits for simulated time."""
+
+MOST_HZ = 10.0
+"""Of any stream: at the speed of the tests they would cost more than the flight."""
+
+_TURN_S = 0.01
+"""So long is the pause between two bursts of ticks [wall s]."""
+
+
+class Flown:
+    """A vehicle in simulated time, on a thread of its own."""
+
+    def __init__(self, companion: Companion, simulation: Simulation) -> None:
+        self.companion = companion
+        self.simulation = simulation
+        self.speed = SLOW
+
+    @contextmanager
+    def at(self, speed: float) -> Iterator[None]:
+        """Let simulated time run at a speed meanwhile."""
+        before, self.speed = self.speed, speed
+        try:
+            yield
+        finally:
+            self.speed = before
+
+
+class _Thread:
+    """Ticks the vehicle and its MAVLink."""
+
+    def __init__(self, lane: RawLane) -> None:
+        setup = EpisodeSetup(quad(), None, 1, Aircraft())
+        self.simulation = Simulation(setup, start_us=0, clock=SimClock(), recording=False)
+        rates = {name: min(hz, MOST_HZ) for name, hz in ONBOARD_HZ.items()}
+        self.server = MavlinkServer([LinkConfig("onboard", lane, rates)], boot_unix_us=BOOT_UNIX_US)
+        self.simulation.tick()
+        autopilot = self.simulation.autopilot.internals
+        assert autopilot is not None
+        self.server.attach(autopilot)
+        self.flown: Flown | None = None
+        self.error: BaseException | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+        self.server.close()
+        self.simulation.close()
+        if self.error is not None:
+            raise self.error
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                speed = SLOW if self.flown is None else self.flown.speed
+                for _ in range(max(1, round(speed * _TURN_S / TICK_S))):
+                    self.server.receive(self.simulation.time_us)
+                    self.simulation.tick()
+                    self.server.send(self.simulation.time_us)
+                time.sleep(_TURN_S)
+        except BaseException as error:  # shown to the test by stop()
+            self.error = error
+
+
+@contextmanager
+def flown(component: ComponentType = ComponentType.GROUND_STATION) -> Iterator[Flown]:
+    """Yield MAVSDK and the vehicle that it is connected to."""
+    lane = RawLane()
+    thread = _Thread(lane)
+    mavsdk = Mavsdk(Configuration.create_with_component_type(component))
+    assert mavsdk.add_any_connection("raw://") == 0
+    mavsdk.subscribe_raw_bytes_to_be_sent(lane.inbox.append)
+    lane.mavsdk = mavsdk
+    companion: Companion | None = None
+    thread.start()
+    try:
+        companion = Companion(mavsdk)
+        thread.flown = Flown(companion, thread.simulation)
+        yield thread.flown
+    finally:
+        # Feed no more before MAVSDK goes.
+        thread.stop()
+        if companion is None:
+            mavsdk.destroy()
+        else:
+            companion.destroy()
