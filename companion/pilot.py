@@ -7,16 +7,19 @@ that is compensated, the policy sees what will be when its action is sent.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from threading import Event
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
+from airl_mav.policy.layouts import MOST_FRAMES
 from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
@@ -55,6 +58,10 @@ class Pilot:
     """Carries forward what is seen, of one companion; None = as it is."""
     memory: DecisionMemory = field(init=False)
     """The setpoints and latencies so far."""
+    earlier_mm: deque[NDArray[np.uint16]] = field(
+        default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
+    )
+    """What the decisions before saw, the newest first."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
 
     def __post_init__(self) -> None:
@@ -69,6 +76,7 @@ class Pilot:
         Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
+        self.earlier_mm.clear()
         if self.compensator is not None:
             self.compensator.begin(0)
         else:
@@ -156,9 +164,12 @@ class Pilot:
             depth_mm = images[0]
             state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
         told = self.memory.in_flight(age_us)
+        earlier_mm = tuple(self.earlier_mm)
+        self.earlier_mm.appendleft(depth_mm)
         return observe(
             *(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64)),
             InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+            earlier_mm,
         )
 
 

@@ -15,8 +15,9 @@ from airl_mav.cli.options import POSITIONAL
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
+from airl_mav.policy.flown_otherwise import copy_policy
 from airl_mav.policy.registry import find_policy
-from airl_mav.training.export_request import ExportRequest
+from airl_mav.training.export_request import FLOWN, ExportRequest
 
 
 class ExportOptions(ExportRequest):
@@ -32,6 +33,7 @@ class ExportOptions(ExportRequest):
         airl export model.zip --algorithm PPO --out policies/mine
         airl export mypackage.nets:make_net --weights net.pt --like my.toml --out policies/mine
         airl export static-obstacles --int8 --out policies/static-obstacles-int8
+        airl export crowded --decisions pipelined --out policies/crowded-pipelined
     """
 
     model: Annotated[str, POSITIONAL] = Field(
@@ -51,6 +53,9 @@ RENAMED_OPTIONS = {
 }
 EXTRAS = ("train",)
 
+CHANGED = ("description", "decisions", *FLOWN)
+"""What of a policy that is there may be said anew."""
+
 
 def run(options: ExportOptions, console: Console | None = None) -> int:
     """Export, and print what was written. Raises UsageError as `airl_mav.training.export.export`.
@@ -58,7 +63,17 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
     Nothing was written then.
     """
     console = console or Console()
-    card = _export_int8(options) if options.int8 else _export(options)
+    if options.int8:
+        card = _export_int8(options)
+    elif (
+        options.own_module
+        or options.algorithm is not None
+        or options.model.endswith(".zip")
+        or Path(options.model).is_file()
+    ):
+        card = _export(options)
+    else:
+        card = _copy(options)
     for line in (
         f"{options.out / ONNX_FILE}  {card.network}",
         f"{options.out / CARD_FILE}  {card.parameters:,} parameters, "
@@ -86,6 +101,26 @@ def _export(options: ExportOptions) -> PolicyCard:
     return export(options, command)
 
 
+def _copy(options: ExportOptions) -> PolicyCard:
+    """Write a policy that is there, to be flown otherwise."""
+    given = options.model_dump(exclude_defaults=True)
+    changes = {name: given[name] for name in CHANGED if name in given}
+    if other := sorted(given.keys() - {"model", "out", "name", *CHANGED}):
+        accepted = ", ".join(CHANGED)
+        raise FieldError(other[0], given[other[0]], f"of a policy that is there: {accepted}")
+    return copy_policy(
+        _policy_folder(options), options.out, changes | {"name": options.policy_name}
+    )
+
+
+def _policy_folder(options: ExportOptions) -> Path:
+    """Return the folder of the learned policy that is named as the model. Raises UsageError."""
+    found = find_policy(options.model)
+    if found.folder is None:
+        raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
+    return found.folder
+
+
 def _export_int8(options: ExportOptions) -> PolicyCard:
     """Export a model, or take a policy that is there, and write it in 8-bit integers."""
     if options.with_torch:
@@ -96,7 +131,4 @@ def _export_int8(options: ExportOptions) -> PolicyCard:
             folder = Path(scratch) / name
             _export(options.model_copy(update={"out": folder}))
             return export_int8(folder, options.out, name=name)
-    found = find_policy(options.model)
-    if found.folder is None:
-        raise FieldError("model", options.model, f"a learned policy; {found.name} has no network")
-    return export_int8(found.folder, options.out, name=name)
+    return export_int8(_policy_folder(options), options.out, name=name)

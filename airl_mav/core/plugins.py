@@ -44,11 +44,12 @@ class Door:
 POLICIES = Door("policy", "airl_mav.policies", "a class with a method act")
 REWARDS = Door("reward", "airl_mav.rewards", "a function, or a class whose objects can be called")
 NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeaturesExtractor")
+LAYOUTS = Door("layout", "airl_mav.layouts", "a class with methods boxes and encode")
 ACTION_SETS = Door("actions", "airl_mav.action_sets", "a class with a method commands")
 GENERATORS = Door("generator", "airl_mav.generators", "a function that makes an Arena")
 MODELS = Door("model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments")
 
-DOORS = (POLICIES, REWARDS, NETWORKS, ACTION_SETS, GENERATORS, MODELS)
+DOORS = (POLICIES, REWARDS, NETWORKS, LAYOUTS, ACTION_SETS, GENERATORS, MODELS)
 
 
 def names_code(name: str) -> bool:

@@ -25,7 +25,13 @@ class Companions:
     """The companions of n vehicles."""
 
     def __init__(
-        self, n: int, image: Intrinsics, *, compensator: Compensator | None, told: bool
+        self,
+        n: int,
+        image: Intrinsics,
+        *,
+        compensator: Compensator | None,
+        told: bool,
+        earlier: int = 0,
     ) -> None:
         """Prepare n companions.
 
@@ -34,6 +40,7 @@ class Companions:
             image: Of their cameras.
             compensator: Carries forward what is seen; None: nothing does.
             told: Whether the policy is told of its decisions.
+            earlier: How many images of the decisions before a policy sees.
         """
         self._n = n
         self._compensator = compensator
@@ -44,6 +51,8 @@ class Companions:
             self._state = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
         elif told:
             self._memory = DecisionMemory(n)
+        self._earlier_mm = np.zeros((earlier, n, image.height, image.width), np.uint16)
+        """What the decisions before saw, the newest first; 0 = no return, or none yet."""
         self._age_us = np.zeros(n, np.int64)
         """Of the frames, when their decisions begin."""
 
@@ -54,6 +63,13 @@ class Companions:
         elif self._memory is not None:
             self._memory.begin(i)
         self._age_us[i] = 0
+        self._earlier_mm[:, i] = 0
+
+    def deciding(self, image_mm: NDArray[np.uint16]) -> None:
+        """Keep what all decide on, of the newest images (n, h, w), as far as it is seen again."""
+        if len(self._earlier_mm):
+            self._earlier_mm[1:] = self._earlier_mm[:-1]
+            self._earlier_mm[0] = image_mm if self._compensator is None else self._image_mm
 
     def aged(self, age_us: Times) -> None:
         """Take how old the frames (n,) are of which the next decisions are made."""
@@ -117,9 +133,15 @@ class Companions:
         """Return what policies may be told of the decisions; None: nobody keeps account."""
         return None if self._memory is None else self._memory.in_flight(self._age_us)
 
+    def earlier_mm(self) -> tuple[NDArray[np.uint16], ...]:
+        """Return the images (n, h, w) of the decisions before, the newest first."""
+        return tuple(self._earlier_mm)
+
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
+        if len(self._earlier_mm):
+            held["earlier"] = {"depth_mm": self._earlier_mm}
         if self._compensator is not None:
             foreseen = {"depth_mm": self._image_mm, **vars(self._state)}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}

@@ -132,6 +132,7 @@ class Navigation(Stateful):
             width_px=spec.image_width_px,
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
             range_m=self.camera.range_m,
+            frames=spec.frames,
             in_flight=spec.in_flight,
         )
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
@@ -177,7 +178,11 @@ class Navigation(Stateful):
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
         self._companions = Companions(
-            n, self.intrinsics, compensator=compensator, told=bool(spec.in_flight)
+            n,
+            self.intrinsics,
+            compensator=compensator,
+            told=bool(spec.in_flight),
+            earlier=spec.frames - 1,
         )
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
@@ -238,7 +243,10 @@ class Navigation(Stateful):
         Where latency is compensated, they are those of when the decision is expected to act.
         """
         image, state = self._companions.seen(self.cameras.image, self.kinematics())
-        return observe(image, self.intrinsics, state, self._batch.goal, self._companions.told())
+        known = self._companions
+        return observe(
+            image, self.intrinsics, state, self._batch.goal, known.told(), known.earlier_mm()
+        )
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
         """Return the present observations in the environment's layout.
@@ -294,6 +302,7 @@ class Navigation(Stateful):
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
+        self._companions.deciding(self.cameras.image)
         self._companions.aged(self._timing.fly(self, setpoints, t2_us))
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)

@@ -49,6 +49,7 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             "layout": card.observation.layout,
             "image_width_px": card.observation.width_px,
             "image_height_px": card.observation.height_px,
+            "frames": card.observation.frames,
             "in_flight": card.observation.in_flight,
             "actions": card.actions.set,
             "max_speed_m_s": card.actions.max_speed_m_s,

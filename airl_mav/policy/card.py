@@ -20,6 +20,7 @@ from airl_mav.core.files import read_json, replace_file, write_json
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.actions import DecisionTiming
+from airl_mav.policy.layouts import SHIPPED as SHIPPED_LAYOUTS
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
 from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 from airl_mav.policy.runtime import OnnxRuntime
@@ -274,6 +275,8 @@ def check_trust(folder: Path, card: PolicyCard, *, trust: bool) -> None:
     A card that comes with this package names none.
     """
     named = {"actions.set": card.actions.set} if card.actions.set not in SHIPPED_ACTION_SETS else {}
+    if card.observation.layout not in SHIPPED_LAYOUTS:
+        named["observation.layout"] = card.observation.layout
     if named and not trust:
         listed = ", ".join(f"{field} = {name!r}" for field, name in named.items())
         raise UsageError(

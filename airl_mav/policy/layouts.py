@@ -2,7 +2,8 @@
 
 `body` is the default: a depth image, and goal and velocity in the heading frame. `paper` is Air
 Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of the
-goal, and vectors in the world frame. Both are Dicts of `depth`, `velocity` and `goal`.
+goal, and vectors in the world frame. Both are Dicts of `depth`, `velocity` and `goal`. Any other is
+the user's own: a class, made without arguments, whose objects are a `Layout`.
 
 The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
 and the companion is n = 1.
@@ -13,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +22,18 @@ from pydantic import Field, model_validator
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core import plugins
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import heading_to_ned
 from airl_mav.policy.observation import InFlight, Observation
 
-LayoutName = Literal["body", "paper"]
+SHIPPED = ("body", "paper")
+LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 Encoded = dict[str, NDArray[Any]]
 
 DEPTH, VELOCITY, GOAL = "depth", "velocity", "goal"
-"""Keys of every layout."""
+"""Keys of the shipped layouts; every one has the first."""
 
 IN_FLIGHT = "in_flight"
 """Key of what else a network is told, where it is."""
@@ -51,15 +55,25 @@ STRIP_ROWS = 10
 STRIP_HALF_WIDTH = 1
 """`paper`: the bar that draws the bearing is three columns wide."""
 
+MOST_FRAMES = 8
+"""Most images that a network sees at a time."""
+
 
 class ObservationSpec(ProfileModel):
     """What a network takes, and the camera that can provide it."""
 
-    layout: LayoutName = "body"
+    layout: LayoutName = Field(default="body", description="which arrays it takes")
     height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
     range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
+    frames: int = quantity(
+        "images that the network sees: of this decision, and of so many less one before it",
+        "1",
+        ge=1,
+        le=MOST_FRAMES,
+        default=1,
+    )
     in_flight: tuple[Told, ...] = Field(
         default=(),
         description="what else the network is told: command, the newest setpoint; latency, the t2"
@@ -73,6 +87,8 @@ class ObservationSpec(ProfileModel):
                 f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
                 "the strip of layout 'paper'"
             )
+        if self.frames > 1 and self.layout == "paper":
+            raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
         return self
 
     @property
@@ -90,10 +106,28 @@ class Box(NamedTuple):
     high: float
 
 
+class Layout(Protocol):
+    """A layout of the user's."""
+
+    def boxes(self, spec: ObservationSpec) -> Mapping[str, Box]:
+        """Return its arrays by key: `depth` uint8 (channels, height, width), others float32."""
+        ...
+
+    def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
+        """Return those arrays for n vehicles, as `encode_layout` does: of each from its own row."""
+        ...
+
+
 def boxes(spec: ObservationSpec) -> dict[str, Box]:
-    """Return the arrays of a layout, by key."""
+    """Return the arrays of a layout, by key.
+
+    Raises:
+        UsageError: A layout of the user's has others than a network can take.
+    """
+    if spec.layout not in SHIPPED:
+        return _own_boxes(spec)
     found = {
-        DEPTH: Box((1, spec.height_px, spec.width_px), np.uint8, 0, 255),
+        DEPTH: Box((spec.frames, spec.height_px, spec.width_px), np.uint8, 0, 255),
         VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
         GOAL: Box((3,), np.float32, -math.inf, math.inf),
     }
@@ -148,7 +182,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
         shrink: What makes the network's images of the camera's; numpy by default.
 
     Returns:
-        `depth` (n, 1, height, width) uint8, `velocity` (n, 3) and `goal` (n, 3) float32.
+        `depth` (n, frames, height, width) uint8, the newest first and "no return" where there was
+        none yet, `velocity` (n, 3) and `goal` (n, 3) float32.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
         its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
@@ -156,10 +191,14 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
 
     Raises:
         ValueError: The network is told of decisions of which nobody keeps account.
+        UsageError: A layout of the user's gives anything else than it says.
     """
+    if spec.layout not in SHIPPED:
+        return _own_arrays(spec, seen)
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
     table = _body_table if spec.layout == "body" else _paper_table
-    image = shrink(seen.depth_mm, spec.camera_rows, spec.width_px, table(spec.range_m))
+    bytes_of = table(spec.range_m)
+    image = shrink(seen.depth_mm, spec.camera_rows, spec.width_px, bytes_of)
     if spec.layout == "body":
         safe = np.maximum(distance, 1e-6)
         goal = np.stack(
@@ -173,13 +212,30 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
         goal[:, 2] = distance
         velocity = heading_to_ned(seen.velocity, seen.yaw)
     encoded: Encoded = {
-        DEPTH: image[:, None],
+        DEPTH: image[:, None]
+        if spec.frames == 1
+        else _stacked(spec, image, seen, shrink, bytes_of),
         VELOCITY: velocity.astype(np.float32),
         GOAL: goal.astype(np.float32),
     }
     if spec.in_flight:
         encoded[IN_FLIGHT] = _told(spec.in_flight, seen.in_flight)
     return encoded
+
+
+def _stacked(
+    spec: ObservationSpec,
+    newest: NDArray[np.uint8],
+    seen: Observation,
+    shrink: Shrink,
+    bytes_of: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """Return the network's images (n, frames, height, width), the newest first."""
+    stack = np.full((len(newest), spec.frames, *newest.shape[1:]), 255, np.uint8)
+    stack[:, 0] = newest
+    for k, image in enumerate(seen.earlier_mm[: spec.frames - 1], start=1):
+        stack[:, k] = shrink(image, spec.camera_rows, spec.width_px, bytes_of)
+    return stack
 
 
 def _told(names: tuple[Told, ...], known: InFlight | None) -> NDArray[np.float32]:
@@ -192,6 +248,55 @@ def _told(names: tuple[Told, ...], known: InFlight | None) -> NDArray[np.float32
         "age": np.asarray(known.age_s)[:, None],
     }
     return np.concatenate([parts[name] for name in names], axis=1).astype(np.float32)
+
+
+def _own_boxes(spec: ObservationSpec) -> dict[str, Box]:
+    """Return the arrays of a layout of the user's by key, sorted, if a network can take them."""
+    found = {key: Box(*box) for key, box in sorted(_own(spec.layout).boxes(spec).items())}
+    wrong = [
+        f"{key} {np.dtype(box.dtype)} {box.shape}"
+        for key, box in found.items()
+        if len(box.shape) != (3 if key == DEPTH else 1)
+        or np.dtype(box.dtype) != np.dtype(np.uint8 if key == DEPTH else np.float32)
+    ]
+    if wrong or DEPTH not in found:
+        problem = f"its arrays are {', '.join(wrong) or ', '.join(found)}"
+        wanted = f"{DEPTH} uint8 (channels, height, width), all others float32 (k,)"
+        raise FieldError(
+            plugins.LAYOUTS.field, spec.layout, problem=f"{problem}; accepted: {wanted}"
+        )
+    return found
+
+
+def _own_arrays(spec: ObservationSpec, seen: Observation) -> Encoded:
+    """Return what a layout of the user's makes of an observation, if it is what it says."""
+    found, wanted = _own(spec.layout).encode(spec, seen), _own_boxes(spec)
+    encoded = {key: np.asarray(found[key]) for key in wanted if key in found}
+    n = len(seen.goal)
+    for key, box in wanted.items():
+        array = encoded.get(key)
+        if array is None or array.shape != (n, *box.shape) or array.dtype != box.dtype:
+            given = "nothing" if array is None else f"{array.dtype} {array.shape}"
+            raise UsageError(
+                f"layout {spec.layout!r}: gives {given} for {key!r}; accepted:"
+                f" {np.dtype(box.dtype)} {(n, *box.shape)}"
+            )
+    return encoded
+
+
+@cache
+def _own(name: str) -> Layout:
+    """Return a layout of the user's. Raises FieldError."""
+    door = plugins.LAYOUTS
+    methods = ("boxes", "encode")
+    found = plugins.load_part(
+        door, name, lambda made: all(callable(getattr(made, each, None)) for each in methods)
+    )
+    try:
+        return cast("Layout", found() if isinstance(found, type) else found)
+    except Exception as error:
+        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
+        raise FieldError(door.field, name, problem=problem) from error
 
 
 def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:

@@ -63,6 +63,8 @@ class Observation:
     """(...) heading [rad], 0 = north, positive to the east."""
     in_flight: InFlight | None = None
     """None: nobody keeps account of the decisions."""
+    earlier_mm: tuple[NDArray[np.uint16], ...] = ()
+    """The images (..., h, w) of the decisions before, as far as they are kept, the newest first."""
 
     def rows(self, index: int | Sequence[int] | None) -> Observation:
         """Return what vehicle `index` of n sees, or several of them.
@@ -77,6 +79,7 @@ class Observation:
                 np.asarray(told.latency_s)[index],
                 np.asarray(told.age_s)[index],
             )
+        found["earlier_mm"] = tuple(image[index] for image in self.earlier_mm)
         return replace(self, **found)
 
     @property
@@ -106,6 +109,7 @@ def observe(
     state: Kinematics,
     goal: Vector,
     in_flight: InFlight | None = None,
+    earlier_mm: tuple[NDArray[np.uint16], ...] = (),
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
@@ -115,6 +119,7 @@ def observe(
         state: Telemetry.
         goal: (..., 2) north, east [m].
         in_flight: What is known of the decisions; None: nothing is.
+        earlier_mm: Images of the decisions before, the newest first.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
@@ -128,4 +133,5 @@ def observe(
         pitch=pitch,
         yaw=yaw,
         in_flight=in_flight,
+        earlier_mm=earlier_mm,
     )

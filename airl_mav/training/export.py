@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -32,6 +32,9 @@ from airl_mav.training.onnx_export import (
     random_memory,
 )
 from airl_mav.training.recurrent import RecurrentNetwork
+
+SHIPPED_INPUTS = (DEPTH, VELOCITY, GOAL)
+"""What the shipped layouts give where nothing else is told."""
 
 CHECKED = 64
 """Random observations on which the model's own decisions are compared."""
@@ -72,6 +75,19 @@ class _ToldNetwork(nn.Module):
         return found
 
 
+class _OwnNetwork(nn.Module):
+    """The same of a network with a layout of the user's: any arrays, in the order of their keys."""
+
+    def __init__(self, inner: nn.Module, keys: Sequence[str]) -> None:
+        super().__init__()
+        self.inner = inner
+        self.keys = tuple(keys)
+
+    def forward(self, *arrays: torch.Tensor) -> torch.Tensor:
+        found: torch.Tensor = self.inner(dict(zip(self.keys, arrays, strict=True)))
+        return found
+
+
 class _MeanOfQuantiles(nn.Module):
     """QR-DQN: the value of an action is the mean of its quantiles."""
 
@@ -107,8 +123,12 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         UsageError: The policy is of a kind that is not known.
     """
     policy: Any = model.policy
-    told = IN_FLIGHT in policy.observation_space.spaces
-    network = _ToldNetwork if told else _Network
+    keys = tuple(sorted(policy.observation_space.spaces))
+    usual = set(keys) == set(SHIPPED_INPUTS)
+    network: Callable[[nn.Module], nn.Module] = _Network
+    if not usual:
+        told = set(keys) == {*SHIPPED_INPUTS, IN_FLIGHT}
+        network = _ToldNetwork if told else partial(_OwnNetwork, keys=keys)
     if hasattr(policy, "quantile_net"):
         return network(_MeanOfQuantiles(policy.quantile_net))
     if hasattr(policy, "q_net"):
@@ -129,8 +149,11 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
-            if told:
-                raise UsageError("in_flight: accepted: none for a network with a memory of its own")
+            if not usual:
+                raise UsageError(
+                    f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
+                    f" {', '.join(SHIPPED_INPUTS)}"
+                )
             head = nn.Sequential(hidden, policy.action_net, last)
             return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
@@ -213,8 +236,10 @@ def taken_by(model: BaseAlgorithm) -> Taken:
     seen, space = model.observation_space, model.action_space
     depth = seen.spaces.get(DEPTH) if isinstance(seen, spaces.Dict) else None
     shape = None if depth is None else depth.shape
-    image = f"{shape[2]}x{shape[1]}" if shape is not None and len(shape) == 3 else None
-    return Taken(image, "velocity" if isinstance(space, spaces.Box) else None)
+    actions = "velocity" if isinstance(space, spaces.Box) else None
+    if shape is None or len(shape) != 3:
+        return Taken(actions=actions)
+    return Taken(f"{shape[2]}x{shape[1]}", shape[0], actions)
 
 
 def load_module(name: str, weights: Path | None) -> nn.Module:

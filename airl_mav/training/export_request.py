@@ -16,6 +16,7 @@ from airl_mav.core.provenance import package_versions
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
+from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.layouts import LayoutName, ObservationSpec
 from airl_mav.profiles.loading import load_profile
@@ -28,6 +29,7 @@ FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 DEFAULTS: dict[str, Any] = {
     "layout": "body",
     "image": "32x24",
+    "frames": 1,
     "horizontal_fov_deg": 90.0,
     "range_m": 20.0,
     "actions": "arc-25",
@@ -36,14 +38,17 @@ DEFAULTS: dict[str, Any] = {
     "goal_radius_m": GOAL_RADIUS_M,
     "altitude_m": PilotSettings.altitude_m,
     "hover_after_s": None,
+    "decisions": PilotSettings.decisions,
+    "compensate": PilotSettings.compensate,
 }
 """What is said of a model where nobody says anything else."""
 
 
 class Taken(NamedTuple):
-    """What can be read from a model: the size of its image, and its action set."""
+    """What can be read from a model: its images, and its action set."""
 
     image: str | None = None
+    frames: int | None = None
     actions: ActionSetName | None = None
 
 
@@ -52,8 +57,8 @@ class ExportRequest(BaseModel):
 
     model: str = Field(
         description="the .zip that the model's `save` wrote, or a torch.nn.Module of your own, or a"
-        " function that makes one, as MODULE:NAME or FILE.py:NAME; with --int8 also a policy, by"
-        " its name or folder"
+        " function that makes one, as MODULE:NAME or FILE.py:NAME; or a policy, by its name or"
+        " folder, to be written in integers, or to fly otherwise"
     )
     algorithm: str | None = Field(
         default=None,
@@ -81,6 +86,11 @@ class ExportRequest(BaseModel):
         default=None,
         description="width x height of the image that the network sees, px; `paper`: with its"
         " strip; by default as the .zip says, or 32x24",
+    )
+    frames: int | None = Field(
+        default=None,
+        description="images that the network sees, of this decision and those before it; by default"
+        " as the .zip says, or 1",
     )
     horizontal_fov_deg: float | None = Field(
         default=None, description="horizontal field of view of the camera, deg; by default 90"
@@ -114,6 +124,11 @@ class ExportRequest(BaseModel):
         default=None,
         description="age of a command at which the vehicle hovered in training, s; by default the"
         " last one flew on",
+    )
+    decisions: DecisionTiming | None = Field(
+        default=None,
+        description="when a decision begins: sequential, after the hold of the one before, or"
+        " pipelined, with the newest frame; by default sequential",
     )
     epsilon: float = Field(
         default=0.0,
@@ -155,15 +170,15 @@ class ExportRequest(BaseModel):
         environment = None if self.like is None else _environment(self.like)
         if environment is not None:
             known |= _known_of(environment)
-        known |= {name: value for name in known if (value := getattr(self, name)) is not None}
+        known |= {n: value for n in known if (value := getattr(self, n, None)) is not None}
         image: str = known["image"]
         size = re.fullmatch(r"(\d{1,4})x(\d{1,4})", image)
         if size is None:
             raise FieldError("image", image, "WIDTHxHEIGHT in px, as 32x24")
-        seen = {name: known[name] for name in ("layout", "horizontal_fov_deg", "range_m")}
+        seen = {name: known[name] for name in ("layout", "frames", "horizontal_fov_deg", "range_m")}
         seen |= {"width_px": int(size[1]), "height_px": int(size[2])}
         speed = {"set": known["actions"], "max_speed_m_s": known["max_speed_m_s"]}
-        facts = {name: known[name] for name in FLOWN} | {
+        facts = {name: known[name] for name in (*FLOWN, "decisions", "compensate")} | {
             "name": self.policy_name,
             "description": self.description,
             "algorithm": self.algorithm or "",
@@ -203,11 +218,14 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
     return {
         "layout": spec.layout,
         "image": f"{spec.image_width_px}x{spec.image_height_px}",
+        "frames": spec.frames,
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "range_m": camera.range_m,
         "actions": spec.actions,
         "max_speed_m_s": spec.max_speed_m_s,
         **{name: getattr(spec.episode, name) for name in FLOWN},
+        "decisions": spec.decisions,
+        "compensate": spec.compensate,
     }
 
 

@@ -19,7 +19,8 @@ from airl_mav.policy.layouts import DEPTH, GOAL, IN_FLIGHT, VELOCITY
 from airl_mav.training.config import NetworkSpec
 
 VECTORS = (VELOCITY, GOAL, IN_FLIGHT)
-"""Inputs that join the convolutions, in this order; not every layout has all."""
+"""Inputs that join the convolutions, in this order and before any others; not every layout has
+all."""
 
 OWN_DENSE = (128, 128)
 """Units of the dense layers behind an extractor of the user's, where none are given."""
@@ -80,7 +81,7 @@ def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
 
 
 class DepthExtractor(BaseFeaturesExtractor):
-    """Convolutions over `depth` (n, 1, height, width), joined with `velocity`, `goal` and others.
+    """Convolutions over `depth` (n, frames, height, width), joined with `velocity`, `goal`, others.
 
     The image comes in scaled to 0..1, which stable-baselines3 does with uint8 images.
     """
@@ -89,10 +90,11 @@ class DepthExtractor(BaseFeaturesExtractor):
         shape = observation_space[DEPTH].shape
         assert shape is not None  # noqa: S101 (a Box has a shape)
         vectors = [key for key in VECTORS if key in observation_space.spaces]
+        vectors += [key for key in observation_space.spaces if key not in (DEPTH, *VECTORS)]
         numbers = sum(spaces.flatdim(observation_space[key]) for key in vectors)
         super().__init__(observation_space, flat_size(spec, *shape[1:]) + numbers)
         self.vectors = vectors
-        self.convolutions = _convolution_stack(spec, shape[1])
+        self.convolutions = _convolution_stack(spec, *shape[:2])
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features (n, features_dim)."""
@@ -137,9 +139,8 @@ def to_channels_last(policy: nn.Module) -> None:
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-def _convolution_stack(spec: NetworkSpec, height_px: int) -> nn.Sequential:
+def _convolution_stack(spec: NetworkSpec, channels: int, height_px: int) -> nn.Sequential:
     layers: list[nn.Module] = []
-    channels = 1
     for filters, kernel, stride, padding in convolutions(spec, height_px):
         layers += [nn.Conv2d(channels, filters, kernel, stride, padding), nn.ReLU()]
         channels = filters

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import inspect
 import io
 import logging
 import warnings
@@ -108,7 +109,7 @@ def export_network(
         try:
             module = copy.deepcopy(module).cpu().eval()
             program = _program(module, example)
-            onnx = _onnx(program, state)
+            onnx = _onnx(program, [*boxes(spec), *state], state)
         except Exception as error:  # torch's exporter raises all kinds.
             raise UsageError(f"torch cannot export the network: {first_line(error)}") from error
         archive = _archive(program) if with_torch else None
@@ -191,13 +192,17 @@ def _compare_arrays(found: NDArray[np.float32], wanted: NDArray[np.float32], nam
 def _program(module: nn.Module, example: tuple[torch.Tensor, ...]) -> torch.export.ExportedProgram:
     """Trace a network with a free number of rows, without the paths of this machine."""
     rows = {0: torch.export.Dim("n", min=1)}
-    program = torch.export.export(module, example, dynamic_shapes=tuple(rows for _ in example))
+    free: Any = tuple(rows for _ in example)
+    if len(inspect.signature(module.forward).parameters) < len(example):
+        # One parameter that takes them all.
+        free = (free,)
+    program = torch.export.export(module, example, dynamic_shapes=free)
     for node in program.graph.nodes:
         node.meta.pop("stack_trace", None)
     return program
 
 
-def _onnx(program: torch.export.ExportedProgram, state: Shapes) -> bytes:
+def _onnx(program: torch.export.ExportedProgram, inputs: list[str], state: Shapes) -> bytes:
     """Turn a program into ONNX, weights inside, without notes on where each operator came from."""
     written = torch.onnx.export(
         program,
@@ -205,6 +210,7 @@ def _onnx(program: torch.export.ExportedProgram, state: Shapes) -> bytes:
         dynamo=True,
         opset_version=OPSET,
         external_data=False,
+        input_names=inputs,
         output_names=[ACTION, *(f"{NEXT}{name}" for name in state)],
         verbose=False,
     )

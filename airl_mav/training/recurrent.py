@@ -94,7 +94,7 @@ class GreedyDecisions:
 
     def __call__(self, seen: Encoded) -> NDArray[Any]:
         """Return the actions of n vehicles."""
-        starts = np.zeros(len(seen[GOAL]), np.bool_)
+        starts = np.zeros(len(seen[DEPTH]), np.bool_)
         starts[list(self._new)] = True
         self._new.clear()
         actions, self._state = self._model.predict(

@@ -207,6 +207,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
         "width_px": 32,
         "horizontal_fov_deg": 90.0,
         "range_m": 20.0,
+        "frames": 1,
         "in_flight": [],
     }
 
@@ -520,6 +521,20 @@ def test_a_module_that_cannot_be_exported_is_refused_in_one_line(
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(words, line)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_is_copied_to_fly_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "every-frame"
+    words = ("export", "crowded", "--out", str(out))
+    assert airl(monkeypatch, *words, "--decisions", "pipelined", "--altitude-m", "3") == 0
+    card, before = load_card(out), read_card(ROOT / "profiles/policies/crowded")
+    changed = {"name": "every-frame", "decisions": "pipelined", "altitude_m": 3.0, "results": ()}
+    assert dict(card) == dict(before) | changed
+    capsys.readouterr()
+    assert airl(monkeypatch, *words, "--actions", "arc-25") == 2
+    assert "--actions arc-25: accepted: of a policy that is there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""An action set and an arena generator of the user's: flown, exported, and asked trust for."""
+"""A layout, an action set and an arena generator of the user's: flown, and asked trust for."""
 
 from __future__ import annotations
 
@@ -26,6 +26,30 @@ import numpy as np
 
 from airl_mav.arena.generate import local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.policy.layouts import Box, boxes, encode_layout
+
+
+class Tilted:
+    """The body's, and how the vehicle leans."""
+
+    def boxes(self, spec):
+        tilt = Box((2,), np.float32, -np.inf, np.inf)
+        return {**boxes(spec.model_copy(update={"layout": "body"})), "tilt": tilt}
+
+    def encode(self, spec, seen):
+        body = encode_layout(spec.model_copy(update={"layout": "body"}), seen)
+        tilt = np.stack([seen.roll, seen.pitch], axis=1)
+        return {**body, "tilt": tilt.astype(np.float32)}
+
+
+class Untyped(Tilted):
+    def encode(self, spec, seen):
+        return {**super().encode(spec, seen), "tilt": np.stack([seen.roll, seen.pitch], axis=1)}
+
+
+class Blind(Tilted):
+    def boxes(self, spec):
+        return {"goal": boxes(spec.model_copy(update={"layout": "body"}))["goal"]}
 
 
 class Steps:
@@ -139,21 +163,44 @@ def test_actions_that_cannot_be_flown_are_told_in_one_line(
         env.step(np.array([0, 0]))
 
 
-def test_a_policy_with_the_user_s_actions_asks_for_trust(parts: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Untyped", r"gives float64 \(2, 2\) for 'tilt'; accepted: float32 \(2, 2\)"),
+        ("Blind", r"its arrays are goal; accepted: depth uint8 \(channels, height, width\), all"),
+        ("Steps", r"accepted: a class with methods boxes and encode"),
+    ],
+)
+def test_a_layout_that_no_network_can_take_is_told_in_one_line(
+    parts: str, name: str, words: str
+) -> None:
+    with pytest.raises(UsageError, match=rf"layout '.*:{name}': {words}"):
+        NavigationVectorEnv(2, arena="no-obstacles", layout=f"{parts}:{name}").reset(seed=1)
+
+
+def test_a_policy_with_the_user_s_layout_and_actions_asks_for_trust(
+    parts: str, tmp_path: Path
+) -> None:
     config = validated(
         TrainingConfig,
         {
             "description": "of one's own",
             "steps": 400,
             "vehicles": 8,
-            "environment": {"arena": "no-obstacles", "actions": f"{parts}:Steps"},
+            "environment": {
+                "arena": "no-obstacles",
+                "layout": f"{parts}:Tilted",
+                "frames": 2,
+                "actions": f"{parts}:Steps",
+            },
             "algorithm": {"learning_starts": 100},
             "selection": {"every": 400, "episodes": 4},
         },
     )
     train(config, tmp_path / "run", name="mine")
     folder = tmp_path / "run/policy"
-    with pytest.raises(UsageError, match=r"card\.json: actions\.set = '.*:Steps' is code that wou"):
+    named = r"card\.json: actions\.set = '.*:Steps', observation\.layout = '.*:Tilted' is code that"
+    with pytest.raises(UsageError, match=named):
         load_learned(folder)
     with pytest.raises(UsageError, match=r"accepted: with --trust, if you trust its maker"):
         rehearse(Scenario(level="gym", policy=str(folder)), out=tmp_path / "refused")

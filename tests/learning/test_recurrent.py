@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,10 @@ from numpy.typing import NDArray
 from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_episodes, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.lockstep.flight import fly
-from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.layouts import ObservationSpec
+from airl_mav.policy.action_sets import ActionSpec, command, commands
+from airl_mav.policy.layouts import ObservationSpec, encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.training.export import export_sb3
@@ -106,6 +108,35 @@ def test_the_selection_flies_as_the_export(
     for _, flown in fly_seeds(Navigation(spec, 2), pilots, SEEDS):
         assert learner[flown.seed].decisions == flown.decisions
         assert learner[flown.seed].distance_m == pytest.approx(flown.distance_m, rel=1e-3)
+
+
+def test_what_was_seen_before_is_kept_alike_in_twin_and_companion(tmp_path: Path) -> None:
+    """Three images a decision: in lockstep each is what the decisions before saw, and decides."""
+    shape = SHAPE.model_copy(update={"frames": 3})
+    velocity = ActionSpec(set="velocity")
+    stacked = make_model("PPO", "velocity", spec=shape, n_steps=8, batch_size=8)
+    folder = tmp_path / "stacked"
+    export_sb3(stacked, facts(name="stacked", actions=velocity, observation=shape), folder)
+    policy = load_learned(folder)
+    scenario = demo_scenario(policy=str(folder), time_limit_s=5.0)
+    seen: list[Observation] = []
+    fly(scenario, Recorded(policy, seen, []), 0, 1)
+    navigation = Navigation(environment_of(scenario), 1)
+    navigation.begin([0], [1])
+    twin: list[Observation] = []
+    for _ in range(4):
+        twin.append(deepcopy(navigation.see()))
+        chosen = policy.act_batch(encode_layout(shape, twin[-1]))
+        assert policy.act(twin[-1].rows(0)) == command(velocity, chosen[0])
+        navigation.fly(commands(velocity, chosen))
+    for flight in (seen, [each.rows(0) for each in twin]):
+        assert len(flight) > 3
+        for k, each in enumerate(flight):
+            before = flight[max(k - 2, 0) : k][::-1]
+            for kept, image in zip(each.earlier_mm, before, strict=False):
+                np.testing.assert_array_equal(kept, image.depth_mm)
+            # The twin has room for what is not there yet, the companion keeps more than is asked.
+            assert all((kept == 0).all() for kept in each.earlier_mm[k:])
 
 
 def test_a_companion_begins_each_flight_with_nothing_in_mind(model: Any, tmp_path: Path) -> None:

@@ -56,7 +56,8 @@ class Eye(BaseFeaturesExtractor):
         shape = observation_space[DEPTH].shape
         assert shape is not None
         layers = nn.Sequential(
-            nn.Conv2d(1, 4, 3, stride=2), nn.ReLU(), nn.Conv2d(4, 8, 3, stride=2), nn.ReLU()
+            *(nn.Conv2d(shape[0], 4, 3, stride=2), nn.ReLU()),
+            *(nn.Conv2d(4, 8, 3, stride=2), nn.ReLU()),
         )
         features = layers(torch.zeros(1, *shape)).numel()
         super().__init__(observation_space, features + 6)

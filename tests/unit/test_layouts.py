@@ -293,6 +293,26 @@ def test_the_arrays_are_those_of_the_boxes(layout: ObservationSpec, n: int) -> N
         assert encoded[key].dtype == box.dtype
 
 
+def test_images_of_the_decisions_before_are_stacked_the_newest_first() -> None:
+    depth, state, goal = random_state(4)
+    before = tuple(np.roll(depth, k, axis=0) for k in (1, 2))
+    for kept in range(3):
+        looked = observe(depth, lens(64, 48), state, goal, earlier_mm=before[:kept])
+        # Of one vehicle, as the companion has it.
+        alone = looked.rows(2).rows(None)
+        for seen_, rows in ((looked, slice(None)), (alone, [2])):
+            stack = encode_layout(spec(frames=3), seen_)["depth"]
+            for k, image in enumerate((depth, *before)[: kept + 1]):
+                single = encode_layout(spec(), observe(image, lens(64, 48), state, goal))["depth"]
+                np.testing.assert_array_equal(stack[:, k], single[rows, 0])
+            assert (stack[:, kept + 1 :] == 255).all()
+
+
+def test_images_are_not_stacked_below_a_strip() -> None:
+    with pytest.raises(ValidationError, match="frames = 2: accepted: 1 with layout 'paper'"):
+        spec("paper", 34, frames=2)
+
+
 @pytest.mark.parametrize("key", ["depth", "velocity", "goal"])
 def test_an_ablated_input_is_zero_and_the_others_are_as_they_were(key: str) -> None:
     depth, state, goal = random_state(3)
