@@ -257,6 +257,23 @@ def test_refusals_have_px4s_codes(card: Card) -> None:
     assert (card.folder / "a").read_bytes() == b"a"
 
 
+def test_the_session_number_comes_back_but_for_the_one_that_was_opened(card: Card) -> None:
+    # As PX4: MAVProxy counts sessions by itself, and takes no answer with another number.
+    (card.folder / "a").write_bytes(b"text")
+
+    def session_of(opcode: int, data: bytes) -> tuple[int, int]:
+        card.sequence += 1
+        card.send(opcode, data, session=101)
+        card.tick()
+        (message,) = card.client.received("FILE_TRANSFER_PROTOCOL")
+        return message.payload[3], message.payload[2]
+
+    assert session_of(LIST, b"/") == (ACK, 101)
+    assert session_of(OPEN, b"@PARAM/param.pck") == (NAK, 101)
+    assert session_of(CRC32, b"a") == (ACK, 101)
+    assert session_of(OPEN, b"a") == (ACK, 0)
+
+
 def test_a_lost_answer_is_sent_again_and_nothing_done_twice(card: Card) -> None:
     assert card.ask(MAKE_FOLDER, b"d") == (ACK, b"")
     card.sequence -= 1

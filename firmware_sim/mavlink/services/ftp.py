@@ -15,7 +15,14 @@ from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
-from firmware_sim.mavlink.services.ftp_session import Burst, Code, RefusedError, Request, Summing
+from firmware_sim.mavlink.services.ftp_session import (
+    SESSION,
+    Burst,
+    Code,
+    RefusedError,
+    Request,
+    Summing,
+)
 
 _HEADER = struct.Struct("<HBBBBBxI")
 """Sequence, session, opcode, size, requested opcode, burst complete, padding, offset."""
@@ -23,6 +30,8 @@ _HEADER = struct.Struct("<HBBBBBxI")
 _PAYLOAD_BYTES = 251
 _CRC32, _BURST = 14, 15
 _ACK, _NAK = 128, 129
+_OPENS = (4, 6, 11)
+"""To read, new, and to write."""
 
 BURST_MESSAGES = 8
 """Messages of a burst that are sent per tick: half a megabyte a second."""
@@ -63,7 +72,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
             component_metadata.provide(context.storage)
             checksum = Checksum(context.storage.path(request.name))
             client.burst = None
-            client.summing = Summing(sequence, offset, asker, checksum)
+            client.summing = Summing(sequence, session, offset, asker, checksum)
             _sum(client.summing, context)
             return True
         answer = _carried_out(request, context)
@@ -71,7 +80,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     except (RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
     client.burst = None
-    _answer(Answered(sequence, opcode, offset, asker), kind, answer, context)
+    _answer(Answered(sequence, session, opcode, offset, asker), kind, answer, context)
     return True
 
 
@@ -79,6 +88,7 @@ class Answered(NamedTuple):
     """What an answer says of its request."""
 
     sequence: int
+    session: int
     opcode: int
     offset: int
     asker: tuple[int, int]
@@ -87,7 +97,10 @@ class Answered(NamedTuple):
 def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> None:
     client = context.ftp
     sequence = (request.sequence + 1) & 0xFFFF
-    body = _packed(sequence, kind, request.opcode, request.offset, answer)
+    # As PX4: the number that the client has given, but for the session that was opened.
+    opened = kind == _ACK and request.opcode in _OPENS
+    session = SESSION if opened else request.session
+    body = _packed(sequence, session, kind, request.opcode, request.offset, answer)
     small = len(answer) <= _SMALL_BYTES
     client.last_sequence, client.last_answer = (request.sequence, body) if small else (None, b"")
     _send(body, request.asker, context)
@@ -102,7 +115,7 @@ def _sum(summing: Summing, context: Context) -> None:
         answer, kind = _error(error), _NAK
     if answer is not None:
         context.ftp.stop_summing()
-        asked = Answered(summing.sequence, _CRC32, summing.offset, summing.asker)
+        asked = Answered(summing.sequence, summing.session, _CRC32, summing.offset, summing.asker)
         _answer(asked, kind, answer, context)
 
 
@@ -125,7 +138,7 @@ def send_pending(context: Context) -> None:
             burst.offset += len(data)
         except (RefusedError, OSError) as error:
             data, kind, client.burst = _error(error), _NAK, None
-        body = _packed(burst.sequence, kind, _BURST, offset, data)
+        body = _packed(burst.sequence, SESSION, kind, _BURST, offset, data)
         burst.sequence = (burst.sequence + 1) & 0xFFFF
         client.used_us = context.now_us
         _send(body, burst.asker, context)
@@ -153,8 +166,8 @@ def _error(error: RefusedError | OSError) -> bytes:
     return bytes([Code.FAIL_ERRNO, number & 0xFF]) if code is None else bytes([code])
 
 
-def _packed(sequence: int, kind: int, opcode: int, offset: int, data: bytes) -> bytes:
-    session = complete = 0
+def _packed(sequence: int, session: int, kind: int, opcode: int, offset: int, data: bytes) -> bytes:
+    complete = 0
     header = _HEADER.pack(sequence, session, kind, len(data), opcode, complete, offset)
     return (header + data).ljust(_PAYLOAD_BYTES, b"\0")
 

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import BinaryIO, Protocol
 
+SESSION = 0
+"""Number of a client's only session, as of PX4's."""
+
 
 class Code(IntEnum):
     """Error codes in the first byte of a NAK."""
@@ -58,7 +61,7 @@ class Session:
 
     def opened(self, request: Request) -> BinaryIO:
         """Return the open file. Raises RefusedError when there is none."""
-        if request.session != 0 or self.file is None:
+        if request.session != SESSION or self.file is None:
             raise RefusedError(Code.INVALID_SESSION)
         return self.file
 
@@ -95,6 +98,7 @@ class Summing:
     """A request for a checksum that is not yet answered."""
 
     sequence: int
+    session: int
     offset: int
     asker: tuple[int, int]
     sum: Sum
