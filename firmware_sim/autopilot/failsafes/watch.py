@@ -18,6 +18,7 @@ from firmware_sim.autopilot.failsafes.conditions import (
     FenceBreach,
 )
 from firmware_sim.autopilot.failsafes.detectors import AttitudeFailure, Validity
+from firmware_sim.autopilot.failsafes.endurance import Endurance
 from firmware_sim.autopilot.sensor_monitor import SensorMonitor
 from firmware_sim.interfaces import BatterySample, SensorSample
 
@@ -39,11 +40,15 @@ class Reports:
     """What the mode flies to cannot be reached."""
     motor_failure: bool = False
     """A motor does not do what it is told."""
+    return_time_s: float = 0.0
+    """How long a return would take, with its margins; 0 = not known."""
 
 
 class WatchSettings(NamedTuple):
     """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
 
+    bat1_capacity: float = -1.0
+    bat_avrg_current: float = 15.0
     bat_low_thr: float = 0.15
     bat_crit_thr: float = 0.07
     bat_emergen_thr: float = 0.05
@@ -85,6 +90,7 @@ class Watch:
         self._gcs_us: int | None = None
         self._gcs_lost = True
         self._battery = BatteryWarning.NONE
+        self._endurance = Endurance()
         self._takeoff_us: int | None = None
         self._local, self._relaxed, self._velocity = Validity(), Validity(), Validity()
         self._gps_fused = False
@@ -170,6 +176,7 @@ class Watch:
             manual_control_signal_lost=_silent(self._manual_us, now_us, p.com_rc_loss_t),
             gcs_connection_lost=_silent(self._gcs_us, now_us, p.com_dl_loss_t),
             battery_warning=self._battery,
+            battery_low_remaining_time=self._lasts_too_short(sample, armed=armed),
             geofence=reports.fence,
             mission_failure=reports.mission_failure,
             navigator_failure=reports.navigator_failure,
@@ -207,6 +214,14 @@ class Watch:
                 text = "Compass needs calibration - Land now!"
                 texts.append(Message(Severity.CRITICAL, text))
         return texts
+
+    def _lasts_too_short(self, sample: SensorSample, *, armed: bool) -> bool:
+        """Return whether the battery lasts no longer than a return takes."""
+        p, needed_s = self.settings, self.reports.return_time_s
+        left_s = self._endurance.update(
+            sample.time_us, sample.battery, p.bat1_capacity, p.bat_avrg_current, armed=armed
+        )
+        return left_s < needed_s
 
     def _charge(self, battery: BatterySample, *, armed: bool) -> BatteryWarning:
         """Return how low the charge is; while armed it gets no better."""

@@ -6,6 +6,7 @@ Source: PX4 1.16, RtlDirect and RTL::calculate_return_alt_from_cone_half_angle.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from enum import Enum, auto
 
 from airl_mav.control.demand import AnyDemand
@@ -129,19 +130,26 @@ class ReturnToLaunch(FlightMode):
 
     def _return_height(self, height: float, away: float) -> float:
         """Return the height above home [m] for the way home."""
-        value = self._context.value
-        highest, angle, radius = (
-            value("RTL_RETURN_ALT"),
-            value("RTL_CONE_ANG"),
-            value("NAV_ACC_RAD"),
-        )
-        if angle <= 0.0:
-            return max(height, highest)
-        if away <= radius:
-            wanted = 2.0 * away
-        else:
-            wanted = highest
-            if away <= value("RTL_MIN_DIST"):
-                wanted = min(highest, away / math.tan(min(89.0, max(1.0, angle)) * DEG))
-            wanted = max(wanted, 2.0 * radius)
-        return max(height, min(wanted, highest))
+        return return_height(self._context.value, height, away)
+
+
+def return_height(value: Callable[[str], float], height: float, away: float) -> float:
+    """Return the height of the way home [m], for a vehicle so high and so far away [m].
+
+    `value` looks up PX4 parameter names.
+    """
+    highest, angle, radius = (
+        value("RTL_RETURN_ALT"),
+        value("RTL_CONE_ANG"),
+        value("NAV_ACC_RAD"),
+    )
+    if angle <= 0.0:
+        return max(height, highest)
+    if away <= radius:
+        wanted = 2.0 * away
+    else:
+        wanted = highest
+        if away <= value("RTL_MIN_DIST"):
+            wanted = min(highest, away / math.tan(min(89.0, max(1.0, angle)) * DEG))
+        wanted = max(wanted, 2.0 * radius)
+    return max(height, min(wanted, highest))

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
+from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
+from firmware_sim.autopilot.failsafes.endurance import return_time_s
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
+from firmware_sim.autopilot.modes.return_to_launch import return_height
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
 from firmware_sim.autopilot.navigation.fence_monitor import FenceMonitor
@@ -34,6 +38,7 @@ class Navigator:
         self.due_us = 0
         """When to step next [µs]; 0 = at once."""
         self._flying = False
+        self._position: Vec | None = None
 
     @property
     def triplet(self) -> Triplet:
@@ -63,12 +68,22 @@ class Navigator:
         reports.fence = FenceBreach(*self.fence.status.breached)
         reports.mission_missing = not self.mission.valid
         reports.mission_finished = self.mission_over
+        if self._value("BAT1_CAPACITY") > 0.0 and self._position is not None:
+            reports.return_time_s = self._return_time_s(context, self._position)
+
+    def _return_time_s(self, context: FlightContext, position: Vec) -> float:
+        """Return how long a return from a place, local NED [m], takes [s]."""
+        goal = context.home if context.return_place is None else context.return_place().position
+        away, height = math.dist(position[:2], goal[:2]), goal[2] - position[2]
+        at = return_height(self._value, height, away)
+        return return_time_s(self._value, away, height, at)
 
     def step(
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
         """Advance by a period; `place` is where the vehicle is, for the geofence."""
         self.due_us = situation.time_us + PERIOD_US
+        self._position = situation.position
         self.fence.step(situation, mode, place)
         flying = armed and mode is Mode.MISSION
         if flying and not self._flying:

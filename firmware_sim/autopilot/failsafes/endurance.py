@@ -1,0 +1,78 @@
+"""How long the battery lasts, and how long a return takes.
+
+Source: PX4 1.16, Battery::computeRemainingTime and RtlTimeEstimator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.interfaces import BatterySample
+
+AVERAGE_S = 50.0
+"""Time constant of the mean current [s]."""
+
+_SLOWEST = 0.1
+"""Bound of every speed: a parameter may be zero [m/s]."""
+
+_S_PER_H = 3600.0
+_MA_PER_A = 1000.0
+
+
+class Endurance:
+    """Averages the current while armed, and says how long the charge lasts."""
+
+    def __init__(self) -> None:
+        self._current_a: float | None = None
+        self._time_us = 0
+
+    def update(
+        self,
+        time_us: int,
+        battery: BatterySample,
+        capacity_mah: float,
+        expected_a: float,
+        *,
+        armed: bool,
+    ) -> float:
+        """Return how long the battery lasts [s], infinite where its capacity is not set.
+
+        Args:
+            time_us: Of the sample [µs].
+            battery: What the power module reads.
+            capacity_mah: BAT1_CAPACITY; 0 or less: not set.
+            expected_a: BAT_AVRG_CURRENT, the mean to begin with.
+            armed: Whether the motors draw current: only then it counts.
+        """
+        if capacity_mah <= 0.0:
+            return math.inf
+        if self._current_a is None:
+            self._current_a = expected_a
+        elif armed:
+            share = -math.expm1(-(time_us - self._time_us) / (AVERAGE_S * US_PER_S))
+            self._current_a += share * (max(battery.current_a, 0.0) - self._current_a)
+        self._time_us = time_us
+        left_mah = battery.remaining * capacity_mah
+        return left_mah / max(self._current_a * _MA_PER_A, 1e-6) * _S_PER_H
+
+
+def return_time_s(
+    value: Callable[[str], float], away_m: float, height_m: float, return_height_m: float
+) -> float:
+    """Return how long a return takes [s], with its margins RTL_TIME_FACTOR and RTL_TIME_MARGIN.
+
+    Args:
+        value: Looks up PX4 parameter names.
+        away_m: Horizontal distance from where it lands.
+        height_m: Above there.
+        return_height_m: Of the way home, above there.
+    """
+    climb_s = max(0.0, return_height_m - height_m) / max(value("MPC_Z_V_AUTO_UP"), _SLOWEST)
+    cruise_s = away_m / max(value("MPC_XY_CRUISE"), _SLOWEST)
+    slow_m = min(return_height_m, value("MPC_LAND_ALT2"))
+    descent_s = (return_height_m - slow_m) / max(value("MPC_Z_V_AUTO_DN"), _SLOWEST)
+    land_s = slow_m / max(value("MPC_LAND_SPEED"), _SLOWEST)
+    total_s = climb_s + cruise_s + descent_s + max(0.0, value("RTL_LAND_DELAY")) + land_s
+    return value("RTL_TIME_FACTOR") * total_s + value("RTL_TIME_MARGIN")
