@@ -59,7 +59,7 @@ class ArmingSettings(NamedTuple):
 
 
 class Readiness(NamedTuple):
-    """What the checks look at."""
+    """What the checks look at. No measured number: it is the same until something has changed."""
 
     mode: Mode
     conditions: Conditions
@@ -77,8 +77,8 @@ class Readiness(NamedTuple):
     rolled: bool = False
     """Roll is beyond FD_FAIL_R."""
     pitched: bool = False
-    charge: float = 1.0
-    """Of the battery, 0..1."""
+    charge_short: bool = False
+    """The battery's charge is below COM_ARM_BAT_MIN."""
     terminated: bool = False
     armed: bool = False
 
@@ -126,7 +126,7 @@ def _charge_required(r: Readiness) -> bool:
 def _battery_level(r: Readiness) -> BatteryWarning:
     """Return the warning; a charge below COM_ARM_BAT_MIN counts as low at least."""
     warning = r.conditions.battery_warning
-    if _charge_required(r) and r.charge < r.settings.com_arm_bat_min:
+    if _charge_required(r) and r.charge_short:
         return max(warning, BatteryWarning.LOW)
     return warning
 
@@ -134,7 +134,7 @@ def _battery_level(r: Readiness) -> BatteryWarning:
 def _battery_blocks(r: Readiness) -> bool:
     """Return whether the charge forbids arming: below COM_ARM_BAT_MIN, without it critical."""
     if _charge_required(r):
-        return r.charge < r.settings.com_arm_bat_min
+        return r.charge_short
     return r.conditions.battery_warning >= BatteryWarning.CRITICAL
 
 

@@ -67,6 +67,8 @@ class Supervisor:
         """What was wrong at the last look."""
         self.failing: tuple[Check, ...] = ()
         """Pre-arm checks that failed at the last look."""
+        self._ready: Readiness | None = None
+        """What the pre-arm checks looked at last."""
         self._armable = False
         self._state = FailsafeState()
         self._decided: tuple[object, ...] = ()
@@ -111,8 +113,9 @@ class Supervisor:
         if now_us >= self._check_us or changed:
             self._check_us, self._checked = now_us + CHECK_US, flight.phase
             readiness = self.readiness(sample, flight, flight.mode)
-            self.failing = prearm.failing(readiness)
-            self._armable = not prearm.blocking(self.failing, readiness)
+            if readiness != self._ready:
+                self._ready, self.failing = readiness, prearm.failing(readiness)
+                self._armable = not prearm.blocking(self.failing, readiness)
             texts += self._report(now_us, flight)
         return texts
 
@@ -132,7 +135,7 @@ class Supervisor:
             gps=sensors.gps.has_data(now_us),
             rolled=attitude.roll,
             pitched=attitude.pitch,
-            charge=sample.battery.remaining,
+            charge_short=sample.battery.remaining < self._arming.com_arm_bat_min,
             terminated=flight.mode is Mode.TERMINATION,
             armed=flight.phase >= _GROUND,
         )
