@@ -129,7 +129,8 @@ def note_errors(
 ) -> None:
     """Note the errors of position, velocity and attitude by the true ones."""
     estimator, e = autopilot.estimator, autopilot.state().estimate
-    assert estimator.origin is not None
+    if estimator.origin is None:
+        return  # Not aligned yet: it says nothing.
     place = geodetic_to_local(local_to_geodetic(position, HOME), estimator.origin)
     known, true = (Rotation.from_quat(quat_wxyz_to_xyzw(q)) for q in (e.quaternion, quaternion))
     covariance = estimator.filter.covariance

@@ -13,7 +13,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments import fault_matrix
 from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
 from airl_mav.experiments.fault_matrix import Cell, cell_text, fly_matrix, markdown
-from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES
+from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES, End
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -65,9 +65,8 @@ def test_the_estimator_copes_with_sensors_that_fail(fault: str, phase: Phase, en
     assert told is ("bias" in fault and end == "landed"), flown.said
 
 
-def flight(end: str, touchdown_m_s: float | None = None) -> FaultFlight:
-    told = ("baro off", "hold", 1, end, touchdown_m_s, 5.0, "LAND", ())
-    return FaultFlight(*told)  # type: ignore[arg-type]
+def flight(end: End, touchdown_m_s: float | None = None) -> FaultFlight:
+    return FaultFlight("baro off", "hold", 1, end, touchdown_m_s, 5.0, "LAND", ())
 
 
 def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
@@ -86,8 +85,8 @@ def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
 
 
 def test_workers_change_no_result() -> None:
-    asked = (quad(), ("baro off",), ("landing",), (1, 2))
-    assert fly_matrix(*asked, workers=2) == fly_matrix(*asked)  # type: ignore[arg-type]
+    alone = fly_matrix(quad(), ("baro off",), ("landing",), (1, 2))
+    assert fly_matrix(quad(), ("baro off",), ("landing",), (1, 2), workers=2) == alone
 
 
 def test_the_command_flies_shows_and_saves(tmp_path: Path) -> None:
