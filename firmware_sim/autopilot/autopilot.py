@@ -152,6 +152,8 @@ class BuiltinAutopilot:
         situation, flight = self._situation(), self.flight
         if situation is not None:
             armed = flight.phase >= _GROUND
+            if not armed:
+                self._home.stands()
             place = self._whereabouts.fenced_place
             self._navigator.step(situation, flight.mode, place, armed=armed)
             self._navigator.tell(self._guidance.context, self.supervisor.watch.reports)

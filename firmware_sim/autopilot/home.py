@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
-from firmware_sim.autopilot.error_state import P, V
+from firmware_sim.autopilot.error_state import SIGMA, P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.guidance import Guidance
 
+LEAST_MOVE_M, LEAST_CLIMB_M = 1.0, 1.5
+"""A vehicle that stands farther from home, or higher or lower, has been moved [m]."""
+
 
 class Home:
-    """Set where the vehicle stands at boot and at arming, unless somebody has chosen a place."""
+    """Where the vehicle stands while it is disarmed, unless somebody has chosen a place."""
 
     def __init__(self, estimator: Estimator, guidance: Guidance) -> None:
         """Begin without one; guidance is told of every change."""
@@ -22,6 +27,21 @@ class Home:
     def boot(self) -> bool:
         """Set it as soon as there is a fix; return whether it is new."""
         return self.place is None and self.set_here()
+
+    def stands(self) -> None:
+        """Follow a disarmed vehicle that stands elsewhere, unless home was chosen.
+
+        Source: PX4 1.16, HomePosition::hasMovedFromCurrentHomeLocation.
+        """
+        if self.place is None or self._is_chosen:
+            return
+        state, home = self._estimator.state, self._guidance.context.home
+        north, east, down = state[P:V].tolist()
+        sigma_north, sigma_east, sigma_down = state[SIGMA : SIGMA + 3].tolist()
+        away = math.hypot(north - home[0], east - home[1])
+        moved = away > max(2.0 * math.hypot(sigma_north, sigma_east), LEAST_MOVE_M)
+        if moved or abs(down - home[2]) > max(2.0 * sigma_down, LEAST_CLIMB_M):
+            self.set_here()
 
     def armed(self) -> bool:
         """Set it to where the vehicle was armed, unless it was chosen; return whether it is new."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -29,6 +29,11 @@ class ParameterValue:
 
 class ParameterStore(Protocol):
     """PX4-named parameters."""
+
+    @property
+    def value(self) -> Callable[[str], float]:
+        """Looks a value up as it is flown: within bounds. Raises KeyError for an unknown name."""
+        ...
 
     def __len__(self) -> int:
         """Return the number of parameters."""

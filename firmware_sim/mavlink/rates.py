@@ -1,8 +1,9 @@
 """Default stream rates of the links, as measured on a real PX4 1.16 SITL.
 
-Messages that PX4 sends and we do not are left out: TIME_ESTIMATE_TO_TARGET, CURRENT_EVENT_SEQUENCE,
-LINK_NODE_STATUS, OPEN_DRONE_ID_*, DISTANCE_SENSOR (the vehicle has no such device). The tables'
-order is the order on the wire when several messages are due in the same tick.
+Messages that PX4 sends and we do not are left out: EVENT and CURRENT_EVENT_SEQUENCE,
+LINK_NODE_STATUS (its counts depend on when clients speak, and a flight's telemetry must not),
+OPEN_DRONE_ID_*, DISTANCE_SENSOR (the vehicle has no such device). The tables' order is the order on
+the wire when several messages are due in the same tick.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "HOME_POSITION": 0.5,
         "VIBRATION": 0.5,
         "CURRENT_MODE": 0.5,
+        "TIME_ESTIMATE_TO_TARGET": 0.5,
         "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 10.0,
         "ESC_STATUS": 10.0,
@@ -71,6 +73,7 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "PING": 0.1,
         "VIBRATION": 0.1,
         "CURRENT_MODE": 0.5,
+        "TIME_ESTIMATE_TO_TARGET": 0.5,
         "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 1.0,
         "ESC_STATUS": 1.0,

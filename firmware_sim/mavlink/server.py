@@ -21,7 +21,7 @@ from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
-from firmware_sim.mavlink.streams import BUILDERS, Builder, sensors
+from firmware_sim.mavlink.streams import BUILDERS, Builder, information, sensors
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
@@ -101,6 +101,7 @@ class MavlinkServer:
             "SYSTEM_TIME": system_time(boot_unix_us),
             "VIBRATION": lambda state: self._vibration.message(state),
             "BATTERY_STATUS": self._battery_status,
+            "TIME_ESTIMATE_TO_TARGET": self._time_estimate,
             "TIMESYNC": peers.timesync_request,
         }
         self._forwarder = Forwarder(self._all)
@@ -329,6 +330,11 @@ class MavlinkServer:
         if self._port is None:
             return None
         return sensors.battery_status(state, self._port.parameters)
+
+    def _time_estimate(self, state: AutopilotState) -> Values | None:
+        if self._port is None:
+            return None
+        return information.time_estimate_to_target(state, self._port.parameters.value)
 
 
 def _tell(clients: Iterable[Client], text: Message) -> None:

@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import EARTH_RADIUS_M, GRAVITY_M_S2, TICK_US, US_PER_S
+from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
@@ -30,6 +31,7 @@ from firmware_sim.mavlink.px4_custom_mode import (
 )
 from firmware_sim.mavlink.scheduler import OFF, StreamScheduler
 from firmware_sim.mavlink.streams import status, units
+from firmware_sim.mavlink.streams.information import time_estimate_to_target
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import BOOT_UNIX_US, Bench, RawClient
 
@@ -41,7 +43,7 @@ MEASURED_ONBOARD = {
     "GPS_RAW_INT": 10, "EXTENDED_SYS_STATE": 5, "SYS_STATUS": 5, "HEARTBEAT": 1,
     "ESTIMATOR_STATUS": 1, "PING": 1, "SCALED_PRESSURE": 1, "SYSTEM_TIME": 1,
     "MISSION_CURRENT": 1, "BATTERY_STATUS": 0.5, "HOME_POSITION": 0.5, "VIBRATION": 0.5,
-    "CURRENT_MODE": 0.5, "ESC_INFO": 10, "ESC_STATUS": 10,
+    "CURRENT_MODE": 0.5, "TIME_ESTIMATE_TO_TARGET": 0.5, "ESC_INFO": 10, "ESC_STATUS": 10,
 }  # fmt: skip
 MEASURED_GCS = {
     "ATTITUDE_TARGET": 50, "GLOBAL_POSITION_INT": 50, "SERVO_OUTPUT_RAW": 50, "ATTITUDE": 50,
@@ -49,7 +51,7 @@ MEASURED_GCS = {
     "GPS_RAW_INT": 5, "VFR_HUD": 4, "HEARTBEAT": 1, "ALTITUDE": 1, "EXTENDED_SYS_STATE": 1,
     "SCALED_PRESSURE": 1, "SYS_STATUS": 1, "MISSION_CURRENT": 1, "BATTERY_STATUS": 0.5,
     "ESTIMATOR_STATUS": 0.5, "HOME_POSITION": 0.5, "PING": 0.1, "VIBRATION": 0.1,
-    "CURRENT_MODE": 0.5, "ESC_INFO": 1, "ESC_STATUS": 1,
+    "CURRENT_MODE": 0.5, "TIME_ESTIMATE_TO_TARGET": 0.5, "ESC_INFO": 1, "ESC_STATUS": 1,
 }  # fmt: skip
 
 
@@ -425,6 +427,16 @@ def test_where_an_automatic_mode_is_going() -> None:
     assert (message.coordinate_frame, message.type_mask) == (5, 0)
     assert (message.lat_int, message.lon_int) == (473_977_430, 85_455_940)
     assert message.alt == pytest.approx(493.4)
+
+
+def test_how_long_the_way_home_takes() -> None:
+    lookup = {spec.name: float(spec.default) for spec in SPECS}.__getitem__
+    autopilot = flown()
+    assert time_estimate_to_target(autopilot.state(), lookup) == (0, -1, -1, -1, -1)
+    autopilot.landed = Landed.IN_AIR
+    estimate = time_estimate_to_target(autopilot.state(), lookup)
+    assert estimate is not None
+    assert estimate[0] > 100
 
 
 def test_vibration_metrics_are_px4s() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from airl_mav.core.frames import quat_yaw
+from airl_mav.core.frames import geodetic_to_local, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
@@ -122,6 +122,22 @@ def test_home_can_be_moved_to_where_the_vehicle_is() -> None:
         rig.ap.set_mode(Mode.RETURN)
         rig.until(lambda: disarmed(rig), 60.0)
         assert away(rig, *home[:2]) < 0.8
+
+
+def test_home_follows_a_vehicle_that_has_landed_elsewhere() -> None:
+    with flight(2) as rig:
+        rig.take_off(1.5, settle_s=0.0)
+        rig.go_offboard(velocity_setpoint(4.0, 0.0, 0.0))
+        rig.run(2.0)
+        begun = rig.ap.state().home
+        rig.ap.set_mode(Mode.LAND)
+        rig.until(lambda: rig.ap.flight.phase is Phase.GROUND, 30.0)
+        assert rig.ap.state().home == begun
+        rig.until(lambda: disarmed(rig), 5.0)
+        home, origin = rig.ap.state().home, rig.ap.state().origin
+        assert home is not None
+        assert origin is not None
+        assert away(rig, *geodetic_to_local(home, origin)[:2]) < 0.5
 
 
 def test_a_setpoint_that_leaves_an_axis_open_hovers() -> None:

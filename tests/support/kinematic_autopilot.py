@@ -7,12 +7,14 @@ tested without an estimator, a controller or a plant.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
+from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
     AutopilotState,
@@ -57,6 +59,11 @@ class Parameters:
 
     def __init__(self, values: dict[str, int | float] | None = None) -> None:
         self.values = dict(sorted((DEFAULT_PARAMETERS if values is None else values).items()))
+
+    @property
+    def value(self) -> Callable[[str], float]:
+        defaults = {spec.name: float(spec.default) for spec in SPECS}
+        return (defaults | self.values).__getitem__
 
     @property
     def _names(self) -> list[str]:

@@ -1,21 +1,17 @@
-"""How long the battery lasts, and how long a return takes.
+"""How long the battery lasts.
 
-Source: PX4 1.16, Battery::computeRemainingTime and RtlTimeEstimator.
+Source: PX4 1.16, Battery::computeRemainingTime.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.interfaces import BatterySample
 
 AVERAGE_S = 50.0
 """Time constant of the mean current [s]."""
-
-_SLOWEST = 0.1
-"""Bound of every speed: a parameter may be zero [m/s]."""
 
 _S_PER_H = 3600.0
 _MA_PER_A = 1000.0
@@ -56,23 +52,3 @@ class Endurance:
         self._time_us = time_us
         left_mah = battery.remaining * capacity_mah
         return left_mah / max(self._current_a * _MA_PER_A, 1e-6) * _S_PER_H
-
-
-def return_time_s(
-    value: Callable[[str], float], away_m: float, height_m: float, return_height_m: float
-) -> float:
-    """Return how long a return takes [s], with its margins RTL_TIME_FACTOR and RTL_TIME_MARGIN.
-
-    Args:
-        value: Looks up PX4 parameter names.
-        away_m: Horizontal distance from where it lands.
-        height_m: Above there.
-        return_height_m: Of the way home, above there.
-    """
-    climb_s = max(0.0, return_height_m - height_m) / max(value("MPC_Z_V_AUTO_UP"), _SLOWEST)
-    cruise_s = away_m / max(value("MPC_XY_CRUISE"), _SLOWEST)
-    slow_m = min(return_height_m, value("MPC_LAND_ALT2"))
-    descent_s = (return_height_m - slow_m) / max(value("MPC_Z_V_AUTO_DN"), _SLOWEST)
-    land_s = slow_m / max(value("MPC_LAND_SPEED"), _SLOWEST)
-    total_s = climb_s + cruise_s + descent_s + max(0.0, value("RTL_LAND_DELAY")) + land_s
-    return value("RTL_TIME_FACTOR") * total_s + value("RTL_TIME_MARGIN")

@@ -1,22 +1,22 @@
 """Return: climb, fly home or to a rally point, wait if asked to, land.
 
-Source: PX4 1.16, RtlDirect and RTL::calculate_return_alt_from_cone_half_angle.
+Source: PX4 1.16, RtlDirect.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from enum import Enum, auto
 
 from airl_mav.control.demand import AnyDemand
-from airl_mav.core.constants import DEG, US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
 from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.navigation.return_path import return_height
 from firmware_sim.autopilot.requests import Place, Request
 from firmware_sim.autopilot.trajectory import Leg
 
@@ -61,7 +61,7 @@ class ReturnToLaunch(FlightMode):
         self._start = here(state)
         self._waiting_since_us = None
         height = self._height(state)
-        at = self._return_height(height, self._away(state))
+        at = return_height(context.value, height, self._away(state))
         self._down = self._home.position[2] - at
         self._stage = _Stage.CLIMB if height < at else _Stage.GO_HOME
         ground = context.home_amsl_m + context.home[2] - self._home.position[2]
@@ -127,29 +127,3 @@ class ReturnToLaunch(FlightMode):
         """Return the horizontal distance from home [m]."""
         (north, east, _), home = triple(state, P), self._home.position
         return math.hypot(north - home[0], east - home[1])
-
-    def _return_height(self, height: float, away: float) -> float:
-        """Return the height above home [m] for the way home."""
-        return return_height(self._context.value, height, away)
-
-
-def return_height(value: Callable[[str], float], height: float, away: float) -> float:
-    """Return the height of the way home [m], for a vehicle so high and so far away [m].
-
-    `value` looks up PX4 parameter names.
-    """
-    highest, angle, radius = (
-        value("RTL_RETURN_ALT"),
-        value("RTL_CONE_ANG"),
-        value("NAV_ACC_RAD"),
-    )
-    if angle <= 0.0:
-        return max(height, highest)
-    if away <= radius:
-        wanted = 2.0 * away
-    else:
-        wanted = highest
-        if away <= value("RTL_MIN_DIST"):
-            wanted = min(highest, away / math.tan(min(89.0, max(1.0, angle)) * DEG))
-        wanted = max(wanted, 2.0 * radius)
-    return max(height, min(wanted, highest))

@@ -11,16 +11,15 @@ from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
-from firmware_sim.autopilot.failsafes.endurance import return_time_s
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
-from firmware_sim.autopilot.modes.return_to_launch import return_height
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
 from firmware_sim.autopilot.navigation.fence_monitor import FenceMonitor
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.rally import destination
+from firmware_sim.autopilot.navigation.return_path import return_time_s
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
 from firmware_sim.autopilot.requests import Place
 
@@ -75,8 +74,7 @@ class Navigator:
         """Return how long a return from a place, local NED [m], takes [s]."""
         goal = context.home if context.return_place is None else context.return_place().position
         away, height = math.dist(position[:2], goal[:2]), goal[2] - position[2]
-        at = return_height(self._value, height, away)
-        return return_time_s(self._value, away, height, at)
+        return return_time_s(self._value, height, away)
 
     def step(
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool

@@ -1,0 +1,49 @@
+"""How high Return flies home, and how long that takes.
+
+Source: PX4 1.16, RTL::calculate_return_alt_from_cone_half_angle, RtlDirect and RtlTimeEstimator.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from airl_mav.core.constants import DEG
+
+_SLOWEST_M_S = 0.1
+"""Bound of every speed: a parameter may be zero."""
+
+
+def return_height(value: Callable[[str], float], height_m: float, away_m: float) -> float:
+    """Return the height above the destination for the way there [m].
+
+    Args:
+        value: Looks up a PX4 parameter by its name.
+        height_m: Of the vehicle above the destination.
+        away_m: Its horizontal distance from there.
+    """
+    highest, angle, radius = value("RTL_RETURN_ALT"), value("RTL_CONE_ANG"), value("NAV_ACC_RAD")
+    if angle <= 0.0:
+        return max(height_m, highest)
+    if away_m <= radius:
+        wanted = 2.0 * away_m
+    else:
+        wanted = highest
+        if away_m <= value("RTL_MIN_DIST"):
+            wanted = min(highest, away_m / math.tan(min(89.0, max(1.0, angle)) * DEG))
+        wanted = max(wanted, 2.0 * radius)
+    return max(height_m, min(wanted, highest))
+
+
+def return_time_s(value: Callable[[str], float], height_m: float, away_m: float) -> float:
+    """Return how long Return takes from there, with RTL_TIME_FACTOR and RTL_TIME_MARGIN [s].
+
+    PX4 counts the whole way down at MPC_Z_V_AUTO_DN. Arguments as of `return_height`.
+    """
+    at = return_height(value, height_m, away_m)
+    climb = (at - height_m) / max(value("MPC_Z_V_AUTO_UP"), _SLOWEST_M_S)
+    way = away_m / max(value("MPC_XY_CRUISE"), _SLOWEST_M_S)
+    wait = max(0.0, value("RTL_LAND_DELAY"))
+    descent = max(0.0, at) / max(value("MPC_Z_V_AUTO_DN"), _SLOWEST_M_S)
+    took = climb + way + wait + descent
+    return value("RTL_TIME_FACTOR") * took + value("RTL_TIME_MARGIN")
