@@ -34,12 +34,15 @@ SENT = {
     291: "ESC_STATUS",
     241: "VIBRATION",
     375: "ACTUATOR_OUTPUT_STATUS",
+    380: "TIME_ESTIMATE_TO_TARGET",
 }
+
+STREAMED = ("ATTITUDE", "TIME_ESTIMATE_TO_TARGET")
+"""A real PX4 denies a request when nothing new has come since it streamed the last."""
 
 NOT_SENT = {
     410: "EVENT",
     412: "REQUEST_EVENT",
-    380: "TIME_ESTIMATE_TO_TARGET",
     225: "EFI_STATUS",
     132: "DISTANCE_SENSOR",
 }
@@ -87,8 +90,7 @@ ROWS = (
             "reqmsg",
             f"REQUEST_MESSAGE {name}",
             _request(number, name),
-            # A stream of a real PX4 may have sent what it had a moment ago.
-            (OK, "DENIED") if name == "ATTITUDE" else (OK,),
+            (OK, "DENIED") if name in STREAMED else (OK,),
             lambda message: message is not None,
         )
         for number, name in SENT.items()

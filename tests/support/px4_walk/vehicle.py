@@ -31,7 +31,7 @@ _CLOCK_HZ = 50.0
 _STANDS_STILL_S = 60.0
 """So long may simulated time stand still before a wait is given up [wall s]."""
 
-FAST, OFFBOARD = 16.0, 5.0
+FAST, OFFBOARD = 16.0, 4.0
 """How fast a wait may run [simulated s a wall s]; MAVSDK repeats setpoints by the wall clock."""
 
 Plugin = TypeVar("Plugin")
