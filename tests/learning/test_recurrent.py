@@ -10,19 +10,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from airl_mav import Scenario, rehearse
 from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_episodes, fly_seeds
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.experiments.gym_flier import environment_of
+from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.action_sets import ActionSpec, command, commands
 from airl_mav.policy.layouts import ObservationSpec, encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
+from airl_mav.scenario.aircraft import Ports
 from airl_mav.training.export import export_sb3
 from airl_mav.training.recurrent import GreedyDecisions
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.policy_kit import facts, make_model
+from tests.support.ports import choose_ports
 
 SEEDS = (1, 2, 3, 4, 5)
 HOLD_S = 0.4
@@ -154,3 +158,33 @@ def test_a_companion_begins_each_flight_with_nothing_in_mind(model: Any, tmp_pat
         # Another object, as a companion that was started anew has it, decides the same again.
         again = scenario.fresh_policy(seed)
         assert [again.act(each) for each in seen] == done
+
+
+@pytest.mark.nightly
+def test_a_policy_with_a_memory_flies_in_a_companion_of_its_own(model: Any, tmp_path: Path) -> None:
+    """Level sitl: the companion is another process, which has ONNX Runtime and no torch."""
+    folder = tmp_path / "dreamer"
+    export_sb3(model, facts(name="dreamer", actions=ActionSpec(set="velocity")), folder)
+    ports = choose_ports()
+    asked = Scenario(
+        level="sitl",
+        policy=str(folder),
+        arena="no-obstacles",
+        episodes=1,
+        time_limit_s=6.0,
+        ports=Ports(
+            api_port=ports.api,
+            api_local_port=ports.api_local,
+            gcs_port=ports.gcs,
+            gcs_local_port=ports.gcs_local,
+            camera_port=ports.camera,
+        ),
+    )
+    run = rehearse(asked, out=tmp_path / "run")
+    (episode,) = run.episodes
+    assert episode.outcome in (Outcome.TIMEOUT, Outcome.SUCCESS, Outcome.COLLISION)
+    setpoints = run.stamps[0]["setpoint"]
+    assert len(setpoints) > 5
+    # It decides anew with each image, and flies what it decides.
+    assert np.ptp(setpoints[:, 0]) > 0.0
+    assert np.isfinite(setpoints).all()
