@@ -10,6 +10,8 @@ import pytest
 from airl_mav.core.frames import geodetic_to_local, quat_yaw
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.mavlink.codec import dialect
+from firmware_sim.mavlink.streams.status import heartbeat
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
 
 STILL = velocity_setpoint(0.0, 0.0, 0.0)
@@ -176,3 +178,18 @@ def test_speed_is_limited() -> None:
         assert rig.ap.state().setpoint.velocity[0] == pytest.approx(12.0)  # MPC_XY_VEL_MAX
         assert 9.0 < rig.truth.velocity[0] < 12.9
         assert rig.height == pytest.approx(3.0, abs=1.0)
+
+
+def test_clients_are_told_whether_the_present_mode_can_be_armed() -> None:
+    """HEARTBEAT and SYS_STATUS: a running PX4 1.16 says UNINIT in Return and Land."""
+    with flight(0) as rig:
+        rig.boot()
+        rig.run(0.3)
+        assert rig.ap.state().health.armable
+        rig.ap.set_mode(Mode.LAND)
+        rig.run(0.3)
+        assert not rig.ap.state().health.armable
+        assert heartbeat(rig.ap.state())[4] == dialect.MAV_STATE_UNINIT
+        rig.ap.set_mode(Mode.HOLD)
+        rig.run(0.3)
+        assert heartbeat(rig.ap.state())[4] == dialect.MAV_STATE_STANDBY

@@ -110,6 +110,17 @@ ROWS = (
     ),
     Row(
         "mission",
+        "raw upload of DO_DIGICAM_CONTROL",
+        lambda v: _items(v).upload_mission([raw_item(0, 22), raw_item(1, 203, frame=2)]),
+    ),
+    Row(
+        "mission",
+        "raw upload of DO_DIGICAM_CONFIGURE",
+        lambda v: _items(v).upload_mission([raw_item(0, 22), raw_item(1, 202, frame=2)]),
+        ("UNSUPPORTED",),
+    ),
+    Row(
+        "mission",
         "raw upload_rally_points",
         lambda v: _items(v).upload_rally_points([raw_item(0, 5100, kind=2)]),
     ),
