@@ -1,4 +1,4 @@
-"""The network of a policy with another card: flown otherwise than it was trained."""
+"""Copy a policy: the same network under another card, so that it is flown otherwise."""
 
 from __future__ import annotations
 
