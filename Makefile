@@ -8,6 +8,8 @@ ALL   := $(VENV)/.installed-all
 
 # One more than there are cores: tests that fly mostly wait.
 WORKERS := $(shell expr $$(nproc) + 1)
+# Tests that share something stay together, in the order of tests/conftest.py.
+SPREAD := --dist loadgroup --no-loadscope-reorder
 
 comma := ,
 
@@ -63,11 +65,11 @@ kernels: $(ALL)
 .PHONY: test
 test: $(ALL)  ## Everything CI checks
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m "not nightly" --durations 25
+	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD) -m "not nightly" --durations 25
 
 .PHONY: nightly
 nightly: $(ALL)  ## All tests, with the long ones of stops and kills
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD)
 
 .PHONY: docs
 docs: $(ALL)  ## Build the documentation site into site/ (no network needed)

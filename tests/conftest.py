@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import settings
 
 # The first call of a kernel on a fresh machine compiles it: seconds, not a slow example.
 settings.register_profile("kernels", deadline=None)
 settings.register_profile("thorough", deadline=None, max_examples=3000)
 settings.load_profile("kernels")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep the tests of a module on one worker: what they share is made once.
+
+    Tests that name a group of their own fly in real time, the longest of all: they begin.
+    """
+    named = [item.get_closest_marker("xdist_group") is not None for item in items]
+    for item, group in zip(items, named, strict=True):
+        if not group:
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+    order = sorted(range(len(items)), key=lambda index: not named[index])
+    items[:] = [items[index] for index in order]

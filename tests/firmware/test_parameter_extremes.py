@@ -63,6 +63,7 @@ GROUPS = [USED[i : i + 8] for i in range(0, len(USED), 8)]
 AT_ONCE = {"COM_SPOOLUP_TIME": 0.0, "MPC_TKO_RAMP_T": 0.0}
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("group", GROUPS, ids=[f"{g[0].name}-{g[-1].name}" for g in GROUPS])
 def test_each_parameter_at_the_ends_of_its_range(group: list[ParameterSpec]) -> None:
     with flight(parameters=AT_ONCE) as rig:

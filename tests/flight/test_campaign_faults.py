@@ -279,6 +279,7 @@ def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:
         return [int(status) for status in re.findall(r"^status (-?\d+)$", process.text(), re.M)]
 
 
+@pytest.mark.nightly
 @pytest.mark.xdist_group("evaluation")
 def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     """At level gym flights are the same every time: so are runs, killed or not."""

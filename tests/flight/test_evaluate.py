@@ -114,7 +114,7 @@ def test_episodes_are_those_of_the_seeds(greedy: tuple[LoadedRun, str]) -> None:
         assert episode.goal_radius_m == 3.0
 
 
-@pytest.mark.parametrize("level", ["gym", "lockstep"])
+@pytest.mark.parametrize("level", ["gym", pytest.param("lockstep", marks=pytest.mark.nightly)])
 def test_goals_of_a_zone(level: str, tmp_path: Path) -> None:
     """The curriculum's zones: the same arenas, and goals no farther than the zone's radius."""
     asked: dict[str, Any] = {

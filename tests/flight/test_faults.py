@@ -557,6 +557,7 @@ entry.sitl()
 """airl-sitl that flies nothing again."""
 
 
+@pytest.mark.nightly
 def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground: Ground) -> None:
     """1 s: long for the simulation, short for MAVSDK's heartbeats and the watchdog.
 
@@ -672,6 +673,7 @@ class Noise:
         self._thread.join()
 
 
+@pytest.mark.nightly
 def test_malformed_bytes_do_not_disturb_a_flight(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports, goal_m=12.0) as vehicle:

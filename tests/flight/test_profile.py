@@ -516,6 +516,7 @@ run_command("airl-firmware", "airl_mav.cli.firmware")
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

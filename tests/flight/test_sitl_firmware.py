@@ -157,6 +157,7 @@ def test_a_px4_that_never_comes_is_waited_for_in_vain(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.nightly
 def test_a_rehearsal_with_ardupilot(tmp_path: Path) -> None:
     program = tmp_path / "arducopter"
     peer = ROOT / "tests" / "support" / "ardupilot_peer.py"

@@ -264,9 +264,16 @@ class Endless(ToyFleet):
         return self._seen(), np.ones(self.num_envs, np.float32), done, infos
 
 
-@pytest.mark.parametrize("dies", [False, True])
-@pytest.mark.parametrize("n_step", [1, 3])
-def test_values_converge_to_the_closed_form(dies: bool, n_step: int) -> None:
+@pytest.mark.parametrize(
+    ("n_step", "dies"),
+    [
+        (1, False),
+        (3, True),
+        pytest.param(1, True, marks=pytest.mark.nightly),
+        pytest.param(3, False, marks=pytest.mark.nightly),
+    ],
+)
+def test_values_converge_to_the_closed_form(n_step: int, dies: bool) -> None:
     spec = AlgorithmSpec(
         learning_rate=3e-3,
         gamma=0.7,

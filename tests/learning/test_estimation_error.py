@@ -145,6 +145,7 @@ def flown() -> np.ndarray:
     return np.array(flights)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", GROUPS)
 def test_the_shipped_model_is_as_wrong_as_the_ekf(flown: np.ndarray, name: str) -> None:
     """Rms within a factor of 1.5 for velocity and 2 for the rest.
@@ -158,6 +159,7 @@ def test_the_shipped_model_is_as_wrong_as_the_ekf(flown: np.ndarray, name: str) 
     assert rms / factor < MODEL.sd[errors[0]] < rms * factor
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", GROUPS)
 def test_the_shipped_model_forgets_as_the_ekf_does(flown: np.ndarray, name: str) -> None:
     """Correlation times within a factor of 2, and of 3 for attitude (see above)."""
@@ -167,6 +169,7 @@ def test_the_shipped_model_forgets_as_the_ekf_does(flown: np.ndarray, name: str)
     assert found / factor < getattr(TABLE, time_name) < found * factor
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("lag_s", [0.1, 0.5, 1.0, 2.0])
 def test_velocity_errors_correlate_as_the_ekf_s(flown: np.ndarray, lag_s: float) -> None:
     measured = autocorrelation(flown, round(lag_s / 0.02))[3:6]

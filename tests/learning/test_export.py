@@ -94,7 +94,11 @@ def test_the_network_decides_as_the_model_predicts(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["DQN", "QRDQN", "PPO", "PPO, squashed", "SAC, gSDE", "TD3", "TQC"]
+    "name",
+    [
+        *("DQN", "QRDQN", "PPO", "SAC, gSDE"),
+        *(pytest.param(n, marks=pytest.mark.nightly) for n in ("PPO, squashed", "TD3", "TQC")),
+    ],
 )
 def test_onnx_decides_as_the_model_predicts(name: str, tmp_path: Path) -> None:
     model, actions = model_of(name)

@@ -674,6 +674,7 @@ def test_a_gap_without_its_target_says_nothing(whole: tuple[Path, str]) -> None:
 # --- as a person uses it
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_ctrl_c_and_again(whole: tuple[Path, str], mitigated: str, tmp_path: Path) -> None:
     """Stopped in the middle by a real signal, the same command ends with the same figures."""

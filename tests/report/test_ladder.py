@@ -169,6 +169,7 @@ def test_level_sitl_flies_fewer_unless_asked() -> None:
         assert [len(cell.scenario.seeds) for cell in declared.cells] == [episodes, wanted]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_level_sitl_flies_in_a_ladder(tmp_path: Path) -> None:

@@ -10,14 +10,16 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.executors import Stop
-from airl_mav.experiments.fliers import FlyEpisodes
 from airl_mav.experiments.process_executor import ProcessExecutor
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
-from airl_mav.scenario.resolved import PlannedEpisode
+
+if TYPE_CHECKING:  # a second of imports in every worker
+    from airl_mav.experiments.fliers import FlyEpisodes
+    from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
+    from airl_mav.scenario.resolved import PlannedEpisode
 
 PATIENCE_S = 60.0
 
