@@ -39,8 +39,8 @@ class FaultsOptions(ProfileModel):
     """Fly every fault in every phase of a flight, in simulated time, and say how each flight ended.
 
     The flight controller and its plant alone: a scripted pilot arms, climbs to 5 m, holds, flies in
-    offboard and lands. What ends otherwise than documented is marked, and is exit status 3. With
-    the same --out a run that was stopped goes on.
+    offboard or by a mission, and lands. What ends otherwise than documented is marked, and is exit
+    status 3. With the same --out a run that was stopped goes on.
 
     Examples:
         airl faults

@@ -10,6 +10,7 @@ import numpy as np
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.frames import local_to_geodetic
 from airl_mav.faults.catalogue import End
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
@@ -18,6 +19,7 @@ from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase as Commander
+from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
@@ -56,7 +58,7 @@ class FaultFlight:
 
 
 def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> FaultFlight:
-    """Fly to 5 m, hold, fly north in offboard, land; something fails on the way.
+    """Fly to 5 m, hold, fly north in offboard or by a mission, land; something fails on the way.
 
     The same arguments give the same flight. Arming is asked for; the flight controller's own
     decisions stand: a pilot who sees another mode than the one asked for leaves it alone, and
@@ -155,6 +157,21 @@ class _Flight:
         setpoint = Setpoint(np.full(3, math.nan), north, 0.0, math.nan)
         self._autopilot.offer_setpoint(setpoint, self._simulation.time_us)
 
+    def _waypoint(self) -> PlanItem:
+        """Return a mission item: farther to the north than is flown."""
+        origin = self._autopilot.estimator.origin
+        if origin is None:
+            raise ValueError("a mission without a position")
+        place = local_to_geodetic(np.array([FENCE_M, 0.0, 0.0]), origin)
+        return PlanItem(
+            NavCommand.WAYPOINT,
+            Frame.GLOBAL_RELATIVE_ALT_INT,
+            (0.0, 0.0, 0.0, math.nan),
+            place.latitude_deg,
+            place.longitude_deg,
+            ALTITUDE_M,
+        )
+
     def _pilot(self) -> Iterator[End | None]:
         """Say what a pilot does, a tick at a time; yield the end where that is known."""
         autopilot = self._autopilot
@@ -172,14 +189,18 @@ class _Flight:
         autopilot.takeoff(ALTITUDE_M)
         yield from self._fly_as(Mode.TAKEOFF, 30.0, until=Mode.HOLD)
         yield from self._fly_as(Mode.HOLD, 2.0)
+        north = Mode.MISSION if self._told[1] == "mission" else Mode.OFFBOARD
         if autopilot.flight.mode is Mode.HOLD:
-            self._streams = True
-            self._offer()
-            yield None
-            autopilot.set_mode(Mode.OFFBOARD)
-        yield from self._fly_as(Mode.OFFBOARD, 3.0)
+            if north is Mode.MISSION:
+                autopilot.plans.store(Kind.MISSION, (self._waypoint(),), 1, 0)
+            else:
+                self._streams = True
+                self._offer()
+                yield None
+            autopilot.set_mode(north)
+        yield from self._fly_as(north, 3.0)
         self._streams = False
-        if autopilot.flight.mode is Mode.OFFBOARD:
+        if autopilot.flight.mode is north:
             autopilot.set_mode(Mode.LAND)
         else:
             yield from self._until_down(OPERATOR_S)

@@ -16,7 +16,7 @@ be; crashed: faster, or upside down; flying: still in the air at the end of the 
 further from home, or higher, than the bound; broken: a number that is none, or an exception.
 """
 
-MATRIX_PHASES: tuple[Phase, ...] = ("ground", "climb", "hold", "offboard", "landing")
+MATRIX_PHASES: tuple[Phase, ...] = (*("ground", "climb", "hold", "offboard", "mission", "landing"),)
 
 SAFE: frozenset[End] = frozenset({"landed"})
 FALLS: frozenset[End] = frozenset({"landed", "crashed"})
