@@ -138,7 +138,7 @@ def test_what_is_finished_is_told_and_not_flown_again(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.nightly), 2])
 def test_a_campaign_that_is_stopped_goes_on(tmp_path: Path, reference: Path, workers: int) -> None:
     flown = cells()
     first = load(reference / "a").episodes[0]

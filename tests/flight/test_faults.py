@@ -713,7 +713,9 @@ def occupied(kind: socket.SocketKind) -> Iterator[int]:
     ("option", "kind", "named"),
     [
         ("--api-port", socket.SOCK_DGRAM, "--api-port"),
-        ("--camera-port", socket.SOCK_STREAM, "--camera-port"),
+        pytest.param(
+            *("--camera-port", socket.SOCK_STREAM, "--camera-port"), marks=pytest.mark.nightly
+        ),
     ],
 )
 def test_taken_port(tmp_path: Path, option: str, kind: socket.SocketKind, named: str) -> None:

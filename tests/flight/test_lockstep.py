@@ -252,7 +252,7 @@ def battery_runs_low(stage: Stage) -> None:
 
 
 FAILSAFES = [
-    (companion_dies, "Failsafe activated", None),
+    pytest.param(companion_dies, "Failsafe activated", None, marks=pytest.mark.nightly),
     (policy_hangs, "Landing", None),
     (nobody_takes_off, "auto preflight", None),
     (battery_runs_low, "battery", 40.0),

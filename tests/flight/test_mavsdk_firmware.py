@@ -308,6 +308,7 @@ def test_refusals_in_the_air_and_hold(tmp_path: Path) -> None:
             c.wait_landed()
 
 
+@pytest.mark.nightly
 def test_return_to_launch(tmp_path: Path) -> None:
     with client(tmp_path) as c:
         c.param.set_param_float("RTL_RETURN_ALT", 4.0)

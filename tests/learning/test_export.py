@@ -280,7 +280,13 @@ RECURRENT: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("name", RECURRENT)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "continuous, two layers",
+        *(pytest.param(n, marks=pytest.mark.nightly) for n in ("discrete", "one LSTM for both")),
+    ],
+)
 def test_a_recurrent_policy_remembers_as_the_model_does(name: str, tmp_path: Path) -> None:
     """Flights of ten decisions, three beside each other, and two one after the other."""
     actions, kwargs = RECURRENT[name]

@@ -90,11 +90,15 @@ def test_shipped_configurations_are_sound(name: str) -> None:
     assert config.selection.every <= config.steps
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_killed_run_goes_on_as_if_nothing_had_happened(
     short: Path, straight: Path, tmp_path: Path
 ) -> None:
-    """kill -9 at any moment; the evaluations and the weights are those of the straight run."""
+    """kill -9 at any moment; the evaluations and the weights are those of the straight run.
+
+    In every run: tests/learning/test_checkpoint.py kills at every step of saving.
+    """
     out = tmp_path / "run"
     with subprocess.Popen(
         words(short, out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
