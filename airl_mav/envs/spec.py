@@ -13,7 +13,7 @@ from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.layouts import MOST_FRAMES, STRIP_ROWS, LayoutName, Told
+from airl_mav.policy.layouts import STRIP_ROWS, Frames, LayoutName, Told
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.vehicle import Camera, load_vehicle
@@ -211,13 +211,7 @@ class EnvironmentSpec(ProfileModel):
     )
     image_width_px: int = quantity("image that the network sees", "px", ge=4, le=640, default=32)
     image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
-    frames: int = quantity(
-        "images that the network sees: of this decision, and of so many less one before it",
-        "1",
-        ge=1,
-        le=MOST_FRAMES,
-        default=1,
-    )
+    frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(), description="what else the network is told: command, latency, age"
     )

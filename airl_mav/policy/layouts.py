@@ -58,6 +58,16 @@ STRIP_HALF_WIDTH = 1
 MOST_FRAMES = 8
 """Most images that a network sees at a time."""
 
+Frames = Annotated[
+    int,
+    quantity(
+        "images that the network sees: of this decision, and of so many less one before it",
+        "1",
+        ge=1,
+        le=MOST_FRAMES,
+    ),
+]
+
 
 class ObservationSpec(ProfileModel):
     """What a network takes, and the camera that can provide it."""
@@ -67,13 +77,7 @@ class ObservationSpec(ProfileModel):
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
     range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
-    frames: int = quantity(
-        "images that the network sees: of this decision, and of so many less one before it",
-        "1",
-        ge=1,
-        le=MOST_FRAMES,
-        default=1,
-    )
+    frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
         description="what else the network is told: command, the newest setpoint; latency, the t2"

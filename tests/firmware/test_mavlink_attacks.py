@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink import clients, codec, server, traffic_log
-from firmware_sim.mavlink.codec import Decoder
+from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -122,9 +122,9 @@ def test_one_datagram_full_of_commands_takes_no_more_than_its_part_of_a_tick(
     spent = count(1)
     dispatch = server.MavlinkServer._dispatch
 
-    def slow(*words: object) -> bool:
+    def slow(this: server.MavlinkServer, sender: clients.Client, message: WireMessage) -> bool:
         clock.sleep_until(next(spent) * clients.LISTEN_US // 10)
-        return dispatch(*words)  # type: ignore[arg-type]
+        return dispatch(this, sender, message)
 
     monkeypatch.setattr(server.MavlinkServer, "_dispatch", slow)
     frames = [client.pack(dialect.MAVLink_ping_message(0, n, 0, 0)) for n in range(40)]

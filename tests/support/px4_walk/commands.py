@@ -14,7 +14,7 @@ from mavsdk.plugins.gimbal import ControlMode, Gimbal
 from mavsdk.plugins.gripper import Gripper
 
 from tests.support.px4_walk.row import Row
-from tests.support.px4_walk.vehicle import NO_ACK, Refused, Vehicle
+from tests.support.px4_walk.vehicle import NO_ACK, RefusedError, Vehicle
 
 RESULTS = {
     "GET_HOME_POSITION": (410, (), "ACCEPTED"),
@@ -48,7 +48,7 @@ def _command(number: int, params: tuple[float, ...]) -> Callable[[Vehicle], str]
     def make(vehicle: Vehicle) -> str:
         result = vehicle.command(number, *params)
         if result != "ACCEPTED":
-            raise Refused(result)
+            raise RefusedError(result)
         return result
 
     return make
@@ -60,7 +60,7 @@ def _gyro(vehicle: Vehicle) -> CalibrationResult:
     while (result := results.get(timeout=30.0)) is CalibrationResult.NEXT:
         pass
     if result is not CalibrationResult.SUCCESS:
-        raise Refused(result.name)
+        raise RefusedError(result.name)
     return result
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from mavsdk.plugins.ftp import Ftp, FtpResult
 
 from tests.support.px4_walk.row import Row
-from tests.support.px4_walk.vehicle import Refused, Vehicle
+from tests.support.px4_walk.vehicle import RefusedError, Vehicle
 
 AREA = "ftp"
 _TEXT = b"a file of some length\n" * 40
@@ -24,7 +24,7 @@ def _transferred(start: Any, *words: Any) -> FtpResult:
     while (result := results.get(timeout=30.0)) is FtpResult.NEXT:
         pass
     if result is not FtpResult.SUCCESS:
-        raise Refused(result.name)
+        raise RefusedError(result.name)
     return result
 
 

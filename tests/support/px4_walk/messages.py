@@ -10,7 +10,7 @@ from mavsdk.plugins.telemetry import Telemetry
 from mavsdk.plugins.transponder import Transponder
 
 from tests.support.px4_walk.row import OK, Row
-from tests.support.px4_walk.vehicle import Refused, Vehicle
+from tests.support.px4_walk.vehicle import RefusedError, Vehicle
 
 REQUEST_MESSAGE = 512
 
@@ -64,7 +64,7 @@ def _request(number: int, name: str) -> Callable[[Vehicle], Any]:
     def make(vehicle: Vehicle) -> Any:
         result, message = vehicle.command_and_message(REQUEST_MESSAGE, number, message=name)
         if result != "ACCEPTED":
-            raise Refused(result)
+            raise RefusedError(result)
         return message
 
     return make

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from tests.support.px4_walk.vehicle import Refused, Vehicle
+from tests.support.px4_walk.vehicle import RefusedError, Vehicle
 
 OK = "ok"
 """The call succeeds."""
@@ -53,7 +53,7 @@ def answered(row: Row, vehicle: Vehicle) -> Answer:
     """Make a row's call."""
     try:
         return Answer(row, OK, row.make(vehicle))
-    except Refused as refused:
+    except RefusedError as refused:
         return Answer(row, refused.outcome)
     except Exception as error:  # MAVSDK's errors have one class for each plugin
         return Answer(row, str(error).split(";")[0].strip() or type(error).__name__)

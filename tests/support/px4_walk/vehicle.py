@@ -43,7 +43,7 @@ def _as_it_is(_speed: float) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-class Refused(Exception):  # noqa: N818 - an outcome, not a fault of the program
+class RefusedError(Exception):
     """A call that is not one of MAVSDK's was refused, or a wait was in vain."""
 
     def __init__(self, outcome: str) -> None:
@@ -122,13 +122,13 @@ class Vehicle:
         return float(self.telemetry.odometry().time_usec) / US_PER_S
 
     def until(self, condition: Callable[[], Any], limit_s: float, *, speed: float = FAST) -> None:
-        """Wait for a condition. Raises Refused after a simulated time."""
+        """Wait for a condition. Raises RefusedError after a simulated time."""
         end = self.now_s + limit_s
         for _ in self._ticks(speed):
             if condition():
                 return
             if self.now_s > end:
-                raise Refused(f"not within {limit_s:g} s")
+                raise RefusedError(f"not within {limit_s:g} s")
 
     def wait(
         self,
@@ -147,7 +147,7 @@ class Vehicle:
                 due = now + 0.03
 
     def _ticks(self, speed: float) -> Any:
-        """Yield the simulated time whenever it has moved. Raises Refused when it stands still."""
+        """Yield the simulated time whenever it has moved. RefusedError: it stands still."""
         before, deadline = 0.0, time.monotonic() + _STANDS_STILL_S
         with self._pace(speed):
             while True:
@@ -156,7 +156,7 @@ class Vehicle:
                     before, deadline = now, time.monotonic() + _STANDS_STILL_S
                     yield now
                 elif time.monotonic() > deadline:
-                    raise Refused("simulated time stands still")
+                    raise RefusedError("simulated time stands still")
                 time.sleep(0.001)
 
     # --- what is asked of it
