@@ -5,17 +5,20 @@
 By default the paper's algorithm exploration (DQN and PPO, with and without curriculum). Each run is
 an `airl train` of its own that survives a kill: start the script again and it goes on where it was.
 The picture shows the success rate on the selection seeds, mean over the training seeds with a 95 %
-interval (Student's t); the table says when each configuration reached 97 %.
+interval (Student's t); the table says after how many decisions each configuration reached 97 %, not
+how long that took: other work on the machine changes nothing. Leaves curves.png, curves.md and
+table.json.
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -24,7 +27,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from airl_mav.training.store import Evaluation, TrainingFolder
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_json, replace_file
+from airl_mav.report.saved_table import write_table
+from airl_mav.report.table import NONE, Column, TableView, markdown_table
+from airl_mav.training.store import CONFIG_FILE, SCHEMA, Evaluation, TrainingFolder
 
 PAPER = ("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum")
 REACHED = 0.97
@@ -47,7 +54,7 @@ class Command:
     """Runs at a time; each takes one core."""
 
     out: Path = Path("runs/learning-curves")
-    """Where the runs, curves.png and curves.md go."""
+    """Where the runs, curves.png, curves.md and table.json go."""
 
 
 def main() -> None:
@@ -59,8 +66,11 @@ def main() -> None:
         sys.exit("a run did not finish; start again to go on")
     curves = {name: collect(command, name) for name in command.configs}
     draw(curves, command.out / "curves.png")
-    text = table(curves)
-    (command.out / "curves.md").write_text(text, encoding="utf-8")
+    view = table(curves)
+    made = made_with(folder(command, *run) for run in runs)
+    write_table(view, command.out, made)
+    text = markdown_table(view)
+    replace_file(command.out / "curves.md", f"{text}\n".encode())
     print(text)
 
 
@@ -115,26 +125,46 @@ def draw(curves: dict[str, list[list[Evaluation]]], path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-def table(curves: dict[str, list[list[Evaluation]]]) -> str:
-    lines = [
-        "| configuration | seeds | best, mean (least) | last, mean | 97 % reached "
-        "| after, s: median (longest) |",
-        "|---|---|---|---|---|---|",
-    ]
+def table(curves: dict[str, list[list[Evaluation]]]) -> TableView:
+    """Return what each configuration reached, over its training seeds."""
+    rows = []
     for name, runs in curves.items():
-        best = [max(each.success_rate for each in run) for run in runs]
-        last = [run[-1].success_rate for run in runs]
-        times = [
-            next((each.seconds for each in run if each.success_rate >= REACHED), None)
-            for run in runs
+        best = [100.0 * max(each.success_rate for each in run) for run in runs]
+        last = [100.0 * run[-1].success_rate for run in runs]
+        first = [
+            next((each.steps for each in run if each.success_rate >= REACHED), None) for run in runs
         ]
-        reached = [t for t in times if t is not None]
-        when = f"{np.median(reached):.0f} ({max(reached):.0f})" if reached else "-"
-        lines.append(
-            f"| {Path(name).stem} | {len(runs)} | {np.mean(best):.1%} ({min(best):.1%}) "
-            f"| {np.mean(last):.1%} | {len(reached)} of {len(runs)} | {when} |"
+        reached = [steps / 1e3 for steps in first if steps is not None]
+        when = f"{np.median(reached):.0f} ({max(reached):.0f})" if reached else NONE
+        rows.append(
+            (
+                Path(name).stem,
+                f"{len(runs)}",
+                f"{np.mean(best):.1f} ({min(best):.1f})",
+                f"{np.mean(last):.1f}",
+                f"{len(reached)} of {len(runs)}",
+                when,
+            )
         )
-    return "\n".join(lines) + "\n"
+    columns = (
+        Column("configuration", number=False),
+        Column("seeds"),
+        Column("best, mean (least)", "%"),
+        Column("last, mean", "%"),
+        Column("97 % reached"),
+        Column("after, median (latest)", "thousand decisions"),
+    )
+    return TableView("learning-curves", "Learning curves", columns, tuple(rows))
+
+
+def made_with(folders: Iterable[Path]) -> dict[str, Any]:
+    """Return with what the last of the trainings was made. Raises UsageError: not all with one."""
+    made = [read_json(each / CONFIG_FILE, SCHEMA, "training run") for each in folders]
+    commits = {None if each["git"] is None else each["git"]["commit"] for each in made}
+    if len(commits) > 1:
+        raise UsageError(f"trained by {len(commits)} commits; accepted: one")
+    last = max(made, key=lambda each: str(each["created_utc"]))
+    return {key: last[key] for key in ("created_utc", "versions", "machine", "git")}
 
 
 if __name__ == "__main__":

@@ -24,15 +24,21 @@ if str(ROOT) not in sys.path:
 
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, UsageError  # noqa: E402
 from airl_mav.experiments.behaviour import fly_behaviour, write_behaviour  # noqa: E402
-from published.collect import collect  # noqa: E402 (from here on the checkout is found)
-from published.declared import Declared, read_declared  # noqa: E402
-from published.flying import behaviour_differs, fly_result, why_out_of_date  # noqa: E402
+from published.declared import (  # noqa: E402 (from here on the checkout is found)
+    Declared,
+    read_declared,
+)
+from published.flying import (  # noqa: E402
+    behaviour_differs,
+    fly_result,
+    take_result,
+    why_out_of_date,
+)
 from published.pages import pages, rendered, stale_cards, write_all  # noqa: E402
 from published.record import (  # noqa: E402
     BEHAVIOUR_FILE,
     all_records,
     behaviour_today,
-    write_record,
 )
 
 
@@ -95,8 +101,7 @@ def fly(options: argparse.Namespace) -> int:
 def take(options: argparse.Namespace) -> int:
     """Take a result from a folder in which its command was flown."""
     (declared,) = _named([options.name])
-    record = collect(declared, options.folder, options.behaviour or behaviour_today())
-    say(_short(write_record(record)))
+    say(_short(take_result(declared, options.folder, options.behaviour or behaviour_today())))
     return 0
 
 

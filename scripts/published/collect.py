@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Set as AbstractSet
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_json
+from airl_mav.envs.roofline import Roofline, RooflinePoint
 from airl_mav.experiments.fault_matrix import load, markdown
+from airl_mav.experiments.roofline import RESULT_FILE as ROOFLINE_FILE
+from airl_mav.experiments.roofline import SCHEMA as ROOFLINE_SCHEMA
 from airl_mav.experiments.run import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.model import Comparison, load_comparison
+from airl_mav.report.saved_table import read_table
 from published.declared import Declared
 from published.record import (
     MEASURES,
@@ -38,8 +44,14 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
     Raises:
         UsageError: The folder does not hold it, or its flights are not all there.
     """
-    if declared.kind == "faults":
-        return _fault_matrix(declared, out, behaviour)
+    if declared.kind in _TABLES:
+        found = _TABLES[declared.kind](out)
+        return Record(
+            name=declared.name,
+            what=declared.what,
+            made=made_of(declared.command, found.made, behaviour, _shipped(found.policies)),
+            printed=found.printed,
+        )
     if declared.kind == "run":
         runs, gaps, infos = _single(out)
     else:
@@ -60,19 +72,59 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
     )
 
 
-def _fault_matrix(declared: Declared, out: Path, behaviour: str | None) -> Record:
+class _Table(NamedTuple):
+    """What a command leaves that is no comparison of runs."""
+
+    printed: Printed
+    made: Mapping[str, Any]
+    """With what (`core.provenance`)."""
+    policies: frozenset[str] = frozenset()
+    """Names of those that flew."""
+
+
+def _fault_matrix(out: Path) -> _Table:
     """Return a fault matrix, as the table that `airl faults` shows."""
     matrix = load(out / "faults.json")
     head, _, *rows = markdown(matrix.cells).strip().split("\n")
     columns, *cells = (
         tuple(cell.strip() for cell in line.strip("|").split("|")) for line in (head, *rows)
     )
-    return Record(
-        name=declared.name,
-        what=declared.what,
-        made=made_of(declared.command, matrix.made, behaviour, {}),
-        printed=Printed(columns=columns, rows=tuple(cells)),
-    )
+    return _Table(Printed(columns=columns, rows=tuple(cells)), matrix.made)
+
+
+def _roofline(out: Path) -> _Table:
+    """Return the computers of a roofline, one a row."""
+    path = out / ROOFLINE_FILE
+    data = read_json(path, ROOFLINE_SCHEMA, "roofline")
+    found = Roofline.model_validate({name: data[name] for name in Roofline.model_fields})
+    shown: dict[str, Callable[[RooflinePoint], str]] = {
+        "computer": lambda point: f"`{point.computer}`",
+        "F-1": lambda point: f"{point.f1_m_s:.2f} m/s",
+        "measured": lambda point: f"{point.measured_m_s:.2f} m/s",
+        "flown": lambda point: f"{point.flown_m_s:.2f} m/s",
+        "roof (F-1)": lambda point: f"{point.roof_m_s:.2f} ({point.f1_roof_m_s:.2f}) m/s",
+        "T": lambda point: f"{point.reaction_s:.2f} s",
+        "knee": lambda point: f"{point.knee_hz:.1f} Hz",
+        "binds": lambda point: point.binds,
+        "missions of 100 m": lambda point: f"{point.missions_per_charge:.0f}",
+    }
+    rows = tuple(tuple(cell(point) for cell in shown.values()) for point in found.points)
+    return _Table(Printed(columns=tuple(shown), rows=rows), data, frozenset({found.policy}))
+
+
+def _table(out: Path) -> _Table:
+    """Return the table that a script has left."""
+    saved = read_table(out)
+    printed = Printed(columns=saved.columns, rows=saved.rows)
+    return _Table(printed, saved.made, frozenset(saved.policies))
+
+
+_TABLES: Mapping[str, Callable[[Path], _Table]] = {
+    "faults": _fault_matrix,
+    "roofline": _roofline,
+    "table": _table,
+}
+"""By kind: what is no comparison of runs."""
 
 
 def made_of(
@@ -93,7 +145,9 @@ def made_of(
     )
 
 
-def made_by(command: str, infos: list[RunInfo], policies: set[str], behaviour: str | None) -> Made:
+def made_by(
+    command: str, infos: list[RunInfo], policies: AbstractSet[str], behaviour: str | None
+) -> Made:
     """Return with what runs were made: of one command, by one version, on one machine.
 
     Raises:
@@ -103,9 +157,13 @@ def made_by(command: str, infos: list[RunInfo], policies: set[str], behaviour: s
     if len(commits) > 1:
         raise UsageError(f"{command}: flown by {len(commits)} commits; accepted: one")
     last = max(infos, key=lambda info: info.created_utc)
+    return made_of(command, vars(last), behaviour, _shipped(policies))
+
+
+def _shipped(policies: AbstractSet[str]) -> dict[str, str]:
+    """Return the digests of those policies that are shipped, by name."""
     shipped = shipped_policies()
-    used = {name: shipped[name] for name in sorted(policies) if name in shipped}
-    return made_of(command, vars(last), behaviour, used)
+    return {name: shipped[name] for name in sorted(policies) if name in shipped}
 
 
 def _single(out: Path) -> tuple[dict[str, FlownRun], dict[str, Gap], list[RunInfo]]:

@@ -19,7 +19,9 @@ from published.record import RESULTS
 
 DECLARED_FILE = RESULTS / "results.toml"
 
-Kind = Literal["gap", "matrix", "ladder", "degradation", "compare", "run", "faults"]
+Kind = Literal[
+    "gap", "matrix", "ladder", "degradation", "compare", "run", "faults", "roofline", "table"
+]
 
 
 class Declared(ProfileModel):
@@ -30,9 +32,12 @@ class Declared(ProfileModel):
     command: str = Field(description="as a person types it; --out is added")
     quick: str = Field(default="--episodes 20", description="what --quick adds to the command")
     kind: Kind = Field(
-        description="file of the comparison; run: the folder is a single run; faults: its matrix"
+        description="file of the comparison; run: the folder is a single run; the others: a table"
     )
     within: tuple[str, ...] = Field(default=(".",), description="folders of comparisons, in --out")
+    pictures: dict[str, str] = Field(
+        default={}, description="pictures of the pages, path from the root by file in --out"
+    )
     cards: bool = Field(default=False, description="its runs go onto the cards of their policies")
     minutes: float = Field(gt=0, description="on two cores, about")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -64,8 +65,30 @@ def fly_result(declared: Declared, *, quick: bool) -> Path:
     if done and not (declared.kind == "faults" and done == EXIT_NOT_MET):
         hint = f"; {out} may hold other code's flights" if done == EXIT_USAGE else ""
         raise UsageError(f"{declared.name}: {declared.command}: exit status {done}{hint}")
-    record = collect(declared, out, behaviour_today())
-    return write_record(record, RUNS / "quick" if quick else RESULTS)
+    if quick:
+        return write_record(collect(declared, out, behaviour_today()), RUNS / "quick")
+    return take_result(declared, out, behaviour_today())
+
+
+def take_result(declared: Declared, out: Path, behaviour: str | None, root: Path = ROOT) -> Path:
+    """Write the file of a result that lies in a folder, and its pictures; return the file.
+
+    Args:
+        declared: What it is.
+        out: Where its command has flown.
+        behaviour: Fingerprint of the flight behaviour of the code that flew it.
+        root: Checkout whose results and pages these are.
+
+    Raises:
+        UsageError: The folder does not hold it, or its flights are not all there.
+    """
+    record = collect(declared, out, behaviour)
+    for picture in declared.pictures:
+        if not (out / picture).is_file():
+            raise UsageError(f"{declared.name}: pictures: {picture}: accepted: a file of {out}")
+    for picture, page in declared.pictures.items():
+        shutil.copyfile(out / picture, root / page)
+    return write_record(record, root / RESULTS.relative_to(ROOT))
 
 
 def _program(command: str) -> Sequence[str]:

@@ -12,7 +12,17 @@ from airl_mav.profiles.published import (
 )
 from published.blocks import DEFAULT, Records, Render, block
 from published.record import MEASURES, Figure, FlownRun, Gap, Record
-from published.text import NONE, both, change, energy_kj, number, percent, rate, table
+from published.text import (
+    NONE,
+    both,
+    change,
+    energy_kj,
+    interval_cell,
+    number,
+    percent,
+    rate,
+    table,
+)
 
 # --- the gap
 
@@ -149,6 +159,58 @@ def mitigation_gaps(records: Records) -> str:
     return table(("gap", "", *heads), rows, 5)
 
 
+@block("like-for-like", "like-for-like")
+def like_for_like(records: Records) -> str:
+    record = records["like-for-like"]
+    first = record.runs[f"{DEFAULT}-reference"]
+    gaps = [_gap(record, target, "reference") for target in _LIKE_FOR_LIKE]
+    late = [record.runs[f"{DEFAULT}-{target}"] for target in _LIKE_FOR_LIKE]
+    rows = [
+        (
+            "success",
+            f"{rate(first)} %",
+            *(
+                f"{rate(run)} %, {both(gap.success_rate, 1, '+')} points"
+                for run, gap in zip(late, gaps, strict=True)
+            ),
+        ),
+        (
+            "flight time",
+            f"{number(first.flight_time_s, 2)} s",
+            *(percent(gap.flight_time_s) for gap in gaps),
+        ),
+        (
+            "distance",
+            f"{number(first.distance_m, 2)} m",
+            *(percent(gap.distance_m) for gap in gaps),
+        ),
+        ("energy, vehicle", f"{energy_kj(first)} kJ", *(percent(gap.energy_j) for gap in gaps)),
+        ("pairs", "", *(f"{gap.flight_time_s.n}" for gap in gaps)),
+    ]
+    heads = ("undelayed, workstation", "undelayed, Ras-Pi 4", "... compensated in flight")
+    return table(("like for like", *heads, "mitigated, Ras-Pi 4"), rows, 4)
+
+
+_LIKE_FOR_LIKE = ("target", "compensated", "mitigated")
+
+
+@block("intervals", "gap", "gap-lockstep")
+def intervals(records: Records) -> str:
+    rows = []
+    for name in ("gap-lockstep", "gap"):
+        gap = _gap(records[name], "target", "reference")
+        level = records[name].runs[gap.target].level
+        change_of = gap.flight_time_s
+        rows.append(
+            (
+                f"{change_of.n} (`{level}`)",
+                f"{number(change_of, 1, '+')} %",
+                interval_cell(change_of),
+            )
+        )
+    return table(("pairs", "difference in flight time", "95 % interval"), rows)
+
+
 # --- system evaluation
 
 
@@ -236,6 +298,13 @@ def _share(figure: Figure, reference: Figure) -> str:
 
 
 # --- compensation
+
+
+@block("compensation-model", "compensation-model")
+def compensation_model(records: Records) -> str:
+    printed = records["compensation-model"].printed
+    assert printed is not None
+    return table(("396 ms", *printed.columns[1:]), printed.rows, 3)
 
 
 _LATE = ("11ms", "150ms", "396ms", "542ms", "949ms")

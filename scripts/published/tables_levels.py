@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from published.blocks import Records, block
 from published.record import MEASURES, Figure, Record
-from published.text import NONE, both, number, percent, rate, table
+from published.text import both, interval_cell, number, percent, rate, table
 
 # --- levels
 
@@ -38,6 +38,39 @@ def ladder_late(records: Records) -> str:
     return table(("gym to lockstep, 396 ms", *heads), rows, 4)
 
 
+@block("ladder-crowded", "ladder-crowded")
+def ladder_crowded(records: Records) -> str:
+    return _levels((("", records["ladder-crowded"]),))
+
+
+@block("sitl", "sitl")
+def sitl(records: Records) -> str:
+    return _levels((("", records["sitl"]),), "sitl")
+
+
+@block("predicted", "predicted", "predicted-mitigated")
+def predicted(records: Records) -> str:
+    rows = []
+    for title, name in (
+        ("default policy", "predicted"),
+        ("mitigated policy", "predicted-mitigated"),
+    ):
+        record = records[name]
+        (gap,) = record.gaps.values()
+        pair = [record.runs[run] for run in (gap.reference, gap.target)]
+        rows.append(
+            (
+                title,
+                *(f"{number(run.flight_time_s, 2)} s" for run in pair),
+                percent(gap.flight_time_s),
+                *(f"{rate(run)} %" for run in pair),
+                f"{gap.flight_time_s.n}",
+            )
+        )
+    heads = ("flight time at gym, predicted", "in lockstep", "difference")
+    return table(("", *heads, "success, predicted", "in lockstep", "pairs"), rows, 6)
+
+
 @block("quantisation", "quantisation")
 def quantisation(records: Records) -> str:
     record, rows = records["quantisation"], []
@@ -55,7 +88,7 @@ def quantisation(records: Records) -> str:
     return table(("policy", *heads), rows, 6)
 
 
-def _levels(parts: tuple[tuple[str, Record], ...]) -> str:
+def _levels(parts: tuple[tuple[str, Record], ...], target_level: str = "lockstep") -> str:
     """Return the runs of two levels side by side, and their differences over the pairs."""
     rows = []
     for title, record in parts:
@@ -67,7 +100,7 @@ def _levels(parts: tuple[tuple[str, Record], ...]) -> str:
                 f"{head}success",
                 *(f"{rate(run)} %" for run in (reference, target)),
                 f"{number(gap.success_rate, 1, '+')} points",
-                interval(gap.success_rate),
+                interval_cell(gap.success_rate),
             )
         )
         for name, field, unit, scale in (
@@ -84,14 +117,7 @@ def _levels(parts: tuple[tuple[str, Record], ...]) -> str:
                         for r in (reference, target)
                     ),
                     f"{number(change_of, 1, '+')} %",
-                    interval(change_of),
+                    interval_cell(change_of),
                 )
             )
-    return table(("same seeds", "gym", "lockstep", "difference", "95 % interval"), rows)
-
-
-def interval(figure: Figure) -> str:
-    """Return an interval in a cell of its own."""
-    if figure.low is None or figure.high is None:
-        return NONE
-    return f"{figure.low:+.1f} … {figure.high:+.1f}"
+    return table(("same seeds", "gym", target_level, "difference", "95 % interval"), rows)

@@ -6,7 +6,7 @@ from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import load_published
 from published.blocks import DEFAULT, Records, block
 from published.record import FlownRun
-from published.text import energy_kj, number, rate, table
+from published.text import NONE, energy_kj, number, rate, table
 
 # --- the shipped policies
 
@@ -98,3 +98,36 @@ def generalisation(records: Records) -> str:
         cells = [f"**{c}**" if a == trained else c for a, c in zip(arenas, cells, strict=True)]
         rows.append((f"`{policy}`" + (" (classical)" if own is None else ""), *cells))
     return table(("policy", *arenas), rows, len(arenas))
+
+
+# --- without one of its inputs
+
+_ZEROED = ("none", "velocity", "goal", "depth")
+"""Runs of the ablation, by what is made zero; the paper's word for the goal is position."""
+
+_LAYOUTS = {
+    "no-obstacles": "paper-layout-no-obstacles",
+    "static-obstacles": "paper-layout",
+    "dynamic-obstacles": "paper-layout-dynamic-obstacles",
+}
+"""The policies of the paper's layout, by arena; those of ours have the arena's name."""
+
+
+@block("ablation", "ablation")
+def ablation(records: Records) -> str:
+    runs, rows = records["ablation"].runs, []
+    for arena, paper_layout in _LAYOUTS.items():
+        told = load_published().ablation[arena]
+        rows.append((arena, "the paper", *(_told(told.get(z)) for z in _ZEROED), ""))
+        for layout, policy in (("body", arena), ("paper", paper_layout)):
+            flown = [runs[f"{policy}-in-{arena}/{zeroed}"] for zeroed in _ZEROED]
+            times = [number(run.flight_time_s, 2) for run in (flown[0], flown[2])]
+            rows.append(
+                ("", f"ours, layout `{layout}`", *map(rate, flown), f"{times[0]}, {times[1]} s")
+            )
+    heads = ("all inputs", "without velocity", "without position", "without depth")
+    return table(("arena", "", *heads, "flight time: all, without position"), rows, 5)
+
+
+def _told(success_percent: float | None) -> str:
+    return NONE if success_percent is None else f"{success_percent:g}"

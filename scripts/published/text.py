@@ -19,6 +19,13 @@ def interval(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) ->
     return f" [{low}, {high}]"
 
 
+def interval_cell(figure: Figure) -> str:
+    """Return an interval in a cell of its own."""
+    if figure.low is None or figure.high is None:
+        return NONE
+    return f"{figure.low:+.1f} … {figure.high:+.1f}"
+
+
 def number(figure: Figure, digits: int, sign: str = "", scale: float = 1.0) -> str:
     """Return a figure without its interval."""
     return NONE if figure.value is None else _rounded(scale * figure.value, digits, sign)

@@ -4,11 +4,13 @@
 
 A policy flies undelayed, late, and late with its latency compensated: as the vehicle's profile
 says, and with a response, an expected latency and a number of images that are wrong or others. All
-on the same seeds, at level gym. Prints a table, and leaves it as compensation.md.
+on the same seeds, at level gym. Prints a table, and leaves it as compensation.md and table.json.
 """
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -25,6 +27,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
+from airl_mav.core.provenance import provenance
 from airl_mav.envs.evaluation import EpisodeResult, fly_seeds
 from airl_mav.envs.fleet import Verdict
 from airl_mav.experiments.gym_flier import navigation_of, pilots_of
@@ -34,6 +37,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.lateness import REMEMBERED, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.measures import rate_with_interval, with_interval
+from airl_mav.report.saved_table import write_table
 from airl_mav.report.table import NONE, Column, TableView, markdown_table, print_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -176,6 +180,8 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         ]
         reference: dict[int, EpisodeResult] = {}
         rows = []
+        # The commit that flies: another may be checked out before it has flown.
+        made = provenance(shlex.join(["python", *sys.argv]))
         shown = Console(stderr=True)
         for case in track(planned, "flying", console=shown, disable=not shown.is_terminal):
             flown = fly(scenario, case)
@@ -197,7 +203,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         in_terminal="stacked",
     )
     print_table(view, console)
-    root.mkdir(parents=True, exist_ok=True)
+    write_table(view, root, made, (scenario.policy,))
     replace_file(root / "compensation.md", f"{markdown_table(view)}\n".encode())
     return 0
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.provenance import provenance
+from airl_mav.experiments import roofline as roofline_module
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import load_card
+from airl_mav.report.saved_table import write_table
+from airl_mav.report.table import Column, TableView
 from airl_mav.scenario.model import Scenario
 from published import coverage, flying, pages, record, tables_policies
 from published.collect import collect
@@ -88,11 +93,13 @@ def test_another_file_of_a_policy_is_out_of_date(fresh: Record) -> None:
     assert "another file of `static-obstacles`" in record.out_of_date(retrained)
 
 
-def test_printed_tables_without_a_fingerprint_are_marked(records: dict[str, Record]) -> None:
-    without = [each for each in records.values() if each.made.behaviour is None]
-    assert without
-    for each in without:
-        assert "before today's flight behaviour" in record.out_of_date(each.made)
+def test_results_without_a_fingerprint_are_marked(
+    records: dict[str, Record], fresh: Record
+) -> None:
+    made = fresh.made.model_copy(update={"behaviour": None})
+    without = [each.made for each in records.values() if each.made.behaviour is None]
+    for each in (made, *without):
+        assert "before today's flight behaviour" in record.out_of_date(each)
 
 
 # --- marks
@@ -164,6 +171,45 @@ def test_a_table_of_runs_is_collected_and_shown(tmp_path: Path) -> None:
         assert found.runs[name].success_rate.value == pytest.approx(run.quality.success_rate.value)
     with pytest.raises(UsageError, match="no hardware gap here"):
         collect(declare("airl gap", "gap"), tmp_path / "matrix", None)
+
+
+def test_a_roofline_is_collected_as_a_table(tmp_path: Path) -> None:
+    asked = roofline_module.RooflineRequest(
+        computers=("workstation",), sensing_distance_m=8.0, draws=2
+    )
+    with patch.object(roofline_module, "write_document", lambda made, folder: folder):
+        (tmp_path / "roofline").mkdir()
+        (point,) = roofline_module.roofline(asked, out=tmp_path / "roofline").found.points
+    found = collect(declare("airl roofline", "roofline"), tmp_path / "roofline", "f" * 16)
+    assert found.printed is not None
+    (row,) = found.printed.rows
+    cells = dict(zip(found.printed.columns, row, strict=True))
+    assert cells["measured"] == f"{point.measured_m_s:.2f} m/s"
+    assert cells["binds"] == point.binds
+    assert set(found.made.policies) == {"static-obstacles"}
+    assert found.made.behaviour == "f" * 16
+
+
+def test_a_table_of_a_script_is_taken_with_its_pictures(tmp_path: Path) -> None:
+    columns = (Column("what", number=False), Column("success", "%"))
+    view = TableView("x", "A test", columns, (("late", "97.0 [95.0, 98.1]"),))
+    made = provenance("python scripts/x.py")
+    write_table(view, tmp_path / "out", made, ("static-obstacles", "mine"))
+    declared = declare("python scripts/x.py", "table", pictures={"a.png": "docs/b.png"})
+    (tmp_path / "docs").mkdir()
+    with pytest.raises(UsageError, match=r"pictures: a.png"):
+        flying.take_result(declared, tmp_path / "out", "f" * 16, tmp_path)
+    (tmp_path / "out" / "a.png").write_bytes(b"picture")
+    path = flying.take_result(declared, tmp_path / "out", "f" * 16, tmp_path)
+    assert path == tmp_path / "results" / "x.json"
+    assert (tmp_path / "docs" / "b.png").read_bytes() == b"picture"
+    found = record.read_record("x", path.parent)
+    assert found.printed is not None
+    assert found.printed.columns == ("what", "success, %")
+    assert found.printed.rows == view.rows
+    assert found.made.date == made["created_utc"][:10]
+    # Of the policies that flew only a shipped one can be known to have changed.
+    assert set(found.made.policies) == {"static-obstacles"}
 
 
 def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
