@@ -44,25 +44,24 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
     Raises:
         UsageError: The folder does not hold it, or its flights are not all there.
     """
-    if declared.kind in _TABLES:
-        found = _TABLES[declared.kind](out)
-        return Record(
-            name=declared.name,
-            what=declared.what,
-            made=made_of(declared.command, found.made, behaviour, _shipped(found.policies)),
-            printed=found.printed,
-        )
-    if declared.kind == "run":
-        runs, gaps, infos = _single(out)
-    else:
-        runs, gaps, infos = {}, {}, []
-        for within in declared.within:
-            comparison = load_comparison(out / within, declared.kind)
-            prefix = "" if within == "." else f"{within}/"
-            for name, run, info in _runs(comparison, out / within):
-                runs[prefix + name] = run
-                infos.append(info)
-            gaps |= {f"{prefix}{name}": gap for name, gap in _gaps(comparison, prefix)}
+    match declared.kind:
+        case "faults":
+            return _of_table(declared, _fault_matrix(out), behaviour)
+        case "roofline":
+            return _of_table(declared, _roofline(out), behaviour)
+        case "table":
+            return _of_table(declared, _table(out), behaviour)
+        case "run":
+            runs, gaps, infos = _single(out)
+        case kind:
+            runs, gaps, infos = {}, {}, []
+            for within in declared.within:
+                comparison = load_comparison(out / within, kind)
+                prefix = "" if within == "." else f"{within}/"
+                for name, run, info in _runs(comparison, out / within):
+                    runs[prefix + name] = run
+                    infos.append(info)
+                gaps |= {f"{prefix}{name}": gap for name, gap in _gaps(comparison, prefix)}
     return Record(
         name=declared.name,
         what=declared.what,
@@ -119,12 +118,13 @@ def _table(out: Path) -> _Table:
     return _Table(printed, saved.made, frozenset(saved.policies))
 
 
-_TABLES: Mapping[str, Callable[[Path], _Table]] = {
-    "faults": _fault_matrix,
-    "roofline": _roofline,
-    "table": _table,
-}
-"""By kind: what is no comparison of runs."""
+def _of_table(declared: Declared, found: _Table, behaviour: str | None) -> Record:
+    return Record(
+        name=declared.name,
+        what=declared.what,
+        made=made_of(declared.command, found.made, behaviour, _shipped(found.policies)),
+        printed=found.printed,
+    )
 
 
 def made_of(
