@@ -25,14 +25,14 @@ from airl_mav.experiments.fault_matrix import (
     with_cells,
 )
 from airl_mav.faults.catalogue import CASES, MATRIX_PHASES
-from airl_mav.faults.kinds import LINKS, Phase
+from airl_mav.faults.kinds import LINKS, PROCESSES, Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.table import Column, TableView, print_table
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, IN_WORDS, VehicleName
 from airl_mav.scenario.model import GREATEST_SEED, GREATEST_WORKERS
 
-ELSEWHERE = (*LINKS, "camera")
+ELSEWHERE = (*LINKS, *PROCESSES, "camera")
 
 
 class FaultsOptions(ProfileModel):
@@ -134,5 +134,5 @@ def _without_time(fault: Fault) -> str:
     if fault.phase is not None or fault.at_s:
         raise FieldError("faults", str(fault), "without a time: each phase gives it one")
     if fault.part in ELSEWHERE:
-        raise FieldError("faults", str(fault), "a part of the aircraft: nobody is at the link here")
+        raise FieldError("faults", str(fault), "a part of the aircraft: it flies alone here")
     return str(fault)

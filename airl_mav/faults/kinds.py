@@ -29,9 +29,12 @@ Part = Literal[
     "link",
     "uplink",
     "downlink",
+    "companion",
+    "firmware",
 ]
 """What fails. Motors have PX4's numbers: 1 front right, 2 rear left, 3 front left, 4 rear right.
-`uplink` is from the companion to the flight controller, `downlink` the other way, `link` both."""
+`uplink` is from the companion to the flight controller, `downlink` the other way, `link` both.
+`companion` and `firmware` are the processes of a rehearsal."""
 
 Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
 """Phases of a flight that can set a fault off, by what the flight controller flies."""
@@ -39,6 +42,13 @@ Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "lan
 SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps")
 MOTORS: tuple[Part, ...] = ("motor1", "motor2", "motor3", "motor4")
 LINKS: tuple[Part, ...] = ("link", "uplink", "downlink")
+PROCESSES: tuple[Part, ...] = ("companion", "firmware")
+
+ANY_LEVEL = ("gym", "lockstep", "sitl")
+WITH_FIRMWARE = ("lockstep", "sitl")
+"""The batch twin has no such part."""
+WITH_PROCESSES = ("sitl",)
+"""Elsewhere it is no process of its own."""
 
 _SECONDS: Mapping[str, float] = {"s": 1.0, "ms": 1e-3}
 _SHARE: Mapping[str, float] = {"": 1.0, "%": 0.01}
@@ -77,8 +87,8 @@ class Kind:
     lasts: bool = True
     """Whether it can be given a duration; if not, it happens once and is not undone."""
     needs_duration: bool = False
-    gym: bool = False
-    """Whether the batch twin can fly it."""
+    levels: tuple[str, ...] = WITH_FIRMWARE
+    """Rungs of the fidelity ladder at which it acts."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +122,6 @@ _SENSORS: Mapping[Part, _Sensor] = {
             "drift": Kind(
                 "the position drifts away from the true one, and is right again at the end",
                 Amount("velocity, north, east, down", "m/s", -100.0, 100.0, {"m/s": 1.0}, 3),
-                gym=True,
             )
         },
     ),
@@ -123,19 +132,15 @@ def _sensor_kinds(part: Part, sensor: _Sensor) -> dict[tuple[Part, str], Kind]:
     bias = Amount(
         sensor.bias_meaning, sensor.unit, -sensor.bias, sensor.bias, sensor.units, sensor.width
     )
-    twin = part == "gps"
     kinds = {
         "off": Kind(sensor.off),
         "stuck": Kind("it repeats its last sample"),
         "noise": Kind(
             "white noise of this many times the standard deviation that it has",
             Amount("factor", "", 1.0, 1000.0, _TIMES),
-            gym=twin,
         ),
-        "bias": Kind("what it measures is off by this much", bias, gym=twin),
-        "delay": Kind(
-            "its samples come later", Amount("by how much", "s", 0.0, 10.0, _SECONDS), gym=twin
-        ),
+        "bias": Kind("what it measures is off by this much", bias),
+        "delay": Kind("its samples come later", Amount("by how much", "s", 0.0, 10.0, _SECONDS)),
         **sensor.more,
     }
     return {(part, kind): what for kind, what in kinds.items()}
@@ -160,7 +165,6 @@ _MOTOR_KINDS = {
     "weak": Kind(
         "its thrust is less than it should be",
         Amount("share of the thrust that is left", "", 0.0, 1.0, _SHARE),
-        gym=False,
     ),
 }
 _OTHER_KINDS: dict[tuple[Part, str], Kind] = {
@@ -178,21 +182,25 @@ _OTHER_KINDS: dict[tuple[Part, str], Kind] = {
         "a discrete gust: up and down again as 1 - cos over its duration",
         Amount("greatest velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
         needs_duration=True,
-        gym=True,
     ),
     ("wind", "step"): Kind(
         "more wind, at once",
         Amount("velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
-        gym=True,
     ),
     ("camera", "off"): Kind("no frames"),
-    ("camera", "stuck"): Kind("every frame shows the same picture", gym=True),
+    ("camera", "stuck"): Kind("every frame shows the same picture"),
     ("camera", "noise"): Kind(
         "noise of the depth, growing with its square as of a stereo camera",
         Amount("sd at 10 m as a share", "", 0.0, 0.9, _SHARE),
-        gym=True,
     ),
     ("camera", "delay"): Kind("frames come later", Amount("by how much", "s", 0.0, 60.0, _SECONDS)),
+    ("companion", "stopped"): Kind("it stands still (SIGSTOP), and goes on at the end (SIGCONT)"),
+    ("companion", "killed"): Kind("it ends at once (SIGKILL)", lasts=False),
+    ("firmware", "stopped"): Kind(
+        "flight controller and plant stand still (SIGSTOP), and simulated time with them",
+        levels=WITH_PROCESSES,
+    ),
+    ("firmware", "killed"): Kind("it ends at once (SIGKILL)", lasts=False, levels=WITH_PROCESSES),
 }
 KINDS: Mapping[tuple[Part, str], Kind] = {
     **{k: v for part, sensor in _SENSORS.items() for k, v in _sensor_kinds(part, sensor).items()},

@@ -89,6 +89,11 @@ class Fault(ProfileModel):
         return KINDS[self.part, self.kind]
 
     @property
+    def for_good(self) -> bool:
+        """Whether nothing comes after it in a flight: a process that does not go on."""
+        return self.kind == "killed" or (self.kind == "stopped" and self.for_s is None)
+
+    @property
     def amount(self) -> float:
         """The one number of its value. Raises ValueError where it has none, or three."""
         (number,) = self.value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.faults.model import Fault
 
 FOREVER_US = 1 << 62
@@ -26,6 +26,8 @@ def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | 
     if origin_us is None:
         return None
     begin_us = origin_us + round(fault.at_s * US_PER_S)
+    if fault.part == "firmware":
+        return begin_us, begin_us + TICK_US  # Simulated time stands still with it.
     if fault.for_s is None:
         return begin_us, FOREVER_US
     return begin_us, begin_us + max(1, round(fault.for_s * US_PER_S))

@@ -87,6 +87,7 @@ def host_figures(
     lateness_us: NDArray[np.int64],
     decisions: Mapping[str, NDArray[Any]],
     frame_period_us: int,
+    excused: Sequence[tuple[int, int]] = (),
 ) -> HostFigures:
     """Work out what the host did to a flight.
 
@@ -98,6 +99,8 @@ def host_figures(
         lateness_us: (n,) how late each tick began [simulated µs].
         decisions: Stamps (k,) by column, as in `latency.npz` [simulated µs].
         frame_period_us: Between two camera frames [simulated µs].
+        excused: From when to when decisions may be late for what was asked for: faults of the
+            camera, a link or a process [simulated µs].
     """
     kept = None
     if wall_s and speed:
@@ -110,9 +113,9 @@ def host_figures(
         if lateness_us.size
         else None,
         speed=kept,
-        stale_frames=_share_beyond(decisions, "capture_us", "infer_start_us", late_us),
+        stale_frames=_share_beyond(decisions, "capture_us", "infer_start_us", late_us, excused),
         late_decisions=_share_beyond(
-            _shifted(decisions), "held_until_us", "infer_start_us", late_us
+            _shifted(decisions), "held_until_us", "infer_start_us", late_us, excused
         ),
     )
 
@@ -146,13 +149,22 @@ def _shifted(decisions: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _share_beyond(
-    stamps: Mapping[str, NDArray[Any]], start: str, end: str, limit_us: float
+    stamps: Mapping[str, NDArray[Any]],
+    start: str,
+    end: str,
+    limit_us: float,
+    excused: Sequence[tuple[int, int]],
 ) -> float | None:
-    """Return the share of intervals longer than a limit; None where there is none."""
+    """Return the share of intervals longer than a limit; None where there is none.
+
+    Those that any of the excused times falls into are not counted.
+    """
     if start not in stamps or end not in stamps:
         return None
     first, last = stamps[start], stamps[end]
     both = (first != NO_STAMP) & (last != NO_STAMP)
+    for from_us, to_us in excused:
+        both &= (last < from_us) | (first > to_us)
     if not both.any():
         return None
     return float(np.mean((last - first)[both] > limit_us))

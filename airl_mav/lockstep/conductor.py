@@ -51,6 +51,8 @@ class Conductor:
         self.clock = clock or SimClock()
         self.ended = False
         """Whether the companion has ended."""
+        self._standing = False
+        """Whether the companion stands still."""
         self._vehicle = vehicle
         self._partner = partner
         self._digest = digest or FlightDigest()
@@ -70,6 +72,16 @@ class Conductor:
         if self._vehicle.answers_later:
             self._vehicle.take()  # What real firmware has sent while it booted is out of date.
         self._turn = Turn(at_us)
+
+    def stand_still(self) -> None:
+        """Let the companion stand still: it has no turns, and MAVSDK repeats nothing."""
+        self._standing = True
+
+    def go_on(self) -> None:
+        """Let it go on: it has at once the turn that is overdue, and all telemetry since."""
+        if self._standing:
+            self._standing = False
+            self._inbound.go_on(self.clock.time_us())
 
     @property
     def heard(self) -> bool:
@@ -97,6 +109,9 @@ class Conductor:
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
         self._collect_telemetry()
+        if self._standing:
+            self.clock.sleep_until(tick_us)
+            return tick_us
         interrupt = self._turn.interrupt
         if interrupt is not None and interrupt.is_set():
             self._turn = Turn(self.clock.time_us())

@@ -154,7 +154,14 @@ class _Flight:
         ) as self._stage:
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
-            simulation = self._stage.run(setup, self._program, tlog=tlog, begun=self._begun)
+            simulation = self._stage.run(
+                setup,
+                self._program,
+                tlog=tlog,
+                begun=self._begun,
+                stop=self._stop,
+                judged=lambda: self._supervisor.verdict is not None,
+            )
             return self._flown(simulation)
 
     def _begun(self, started_us: int) -> None:
@@ -217,7 +224,7 @@ class _Flight:
         battery = self._judge.battery
         if referee.verdict is None:
             battery = simulation.plant.battery_remaining
-            referee.abort(simulation.time_us, result.reason)
+            referee.abort(simulation.time_us, self._stage.out or result.reason)
         arrays = simulation.arrays()
         trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
         setpoints = part_of(arrays, "setpoints")

@@ -21,6 +21,7 @@ from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.interfaces import LinkError
 from companion.mavsdk_link import RAW_TIMEOUT_S, RAW_URL, MavsdkLink
+from firmware_sim.autopilot.commander import Phase
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -30,6 +31,8 @@ HEARD_TIMEOUT_S = 10.0
 
 CUT_TIMEOUT_S = 0.5
 """MAVSDK's own time-out of a command, before it asks again [wall s]."""
+
+STOPPED = "stopped"
 
 
 class Stage:
@@ -69,6 +72,8 @@ class Stage:
         )
         self.unheard = ""
         """Why the companion never began: a fault has kept it from hearing the vehicle."""
+        self.out = ""
+        """The fault after which the companion flies no more, as `companion killed`."""
         self._open = ExitStack()
 
     def __enter__(self) -> Stage:
@@ -98,8 +103,13 @@ class Stage:
         *,
         tlog: Path | None = None,
         begun: Callable[[int], None] = lambda _started_us: None,
+        stop: threading.Event | None = None,
+        judged: Callable[[], bool] = lambda: False,
     ) -> Simulation:
         """Fly until the companion's program has ended.
+
+        One that a fault has killed, or stopped for good, never ends: without it the flight is over
+        when it is judged, or the motors stop.
 
         Args:
             setup: The episode.
@@ -107,6 +117,8 @@ class Stage:
                 simulated time moves only while it sleeps by `clock`.
             tlog: Where the MAVLink log goes; None: no log.
             begun: Called with the simulated time of the reset [µs].
+            stop: What ends the program early when it is set; None: it is not to be ended so.
+            judged: Asked whether the flight is judged, when nobody flies any more.
 
         Returns:
             The simulation as it stands at the end; closed with the stage.
@@ -121,6 +133,7 @@ class Stage:
         simulation = firmware.simulation
         if simulation is not None and simulation.faults is not None:
             self._give_up_when_cut(simulation.faults)
+            self._let_companion_fail(simulation.faults)
 
         def connected() -> None:
             try:
@@ -134,8 +147,16 @@ class Stage:
 
         self._partner.start(connected)
         conductor.begin(started_us + self._vehicle.heard_after_us + COMPANION_STARTS_US)
-        while not conductor.ended:
+        while not conductor.ended and not (self.out and (judged() or self._down())):
             firmware.step()
+        if self.out.endswith(STOPPED):
+            # It says what it knows, and flies no more.
+            self.abandon.set()
+            if stop is not None:
+                stop.set()
+            conductor.go_on()
+            while not conductor.ended:
+                firmware.step()
         self._raise_what_broke()
         assert firmware.simulation is not None  # noqa: S101 (loaded above)
         return firmware.simulation
@@ -151,6 +172,27 @@ class Stage:
             self.link.set_timeout(CUT_TIMEOUT_S if cut else RAW_TIMEOUT_S)
 
         faults.on_change(changed)
+
+    def _let_companion_fail(self, faults: FaultTimeline) -> None:
+        """Withhold the companion's turns while it stands still, and from when it is killed."""
+
+        def changed() -> None:
+            acting = [each.fault for each in faults.acting("companion")]
+            for_good = next((fault for fault in acting if fault.for_good), None)
+            if for_good is not None:
+                self.out = self.out or f"{for_good.part} {for_good.kind}"
+            if acting:
+                self.conductor.stand_still()
+            elif not self.out:
+                self.conductor.go_on()
+
+        changed()
+        faults.on_change(changed)
+
+    def _down(self) -> bool:
+        """Return whether the motors stand."""
+        simulation = self.firmware.simulation
+        return simulation is None or simulation.autopilot.flight.phase < Phase.GROUND
 
     def _raise_what_broke(self) -> None:
         error = self._partner.error

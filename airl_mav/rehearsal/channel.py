@@ -146,6 +146,19 @@ class Text(_Line):
     text: str
 
 
+class Due(_Line):
+    """A fault of a process begins or ends now: the rehearsal carries it out.
+
+    The firmware has saved the episode's arrays, as at `FinishEpisode`, when it is to be killed.
+    """
+
+    type: Literal["due"] = "due"
+    time_us: int
+    fault: str
+    """In words (docs/how-to/faults.md)."""
+    begins: bool
+
+
 class Saved(_Line):
     """The episode's arrays are on disk."""
 
@@ -191,7 +204,7 @@ Request = Annotated[
     Begin | LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
-    Ready | Loaded | State | Text | Saved | Progress | Ended | Failed,
+    Ready | Loaded | State | Text | Due | Saved | Progress | Ended | Failed,
     Field(discriminator="type"),
 ]
 _REQUESTS: TypeAdapter[Any] = TypeAdapter(Request)

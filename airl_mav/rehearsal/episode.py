@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.faults.kinds import LINKS, PROCESSES
+from airl_mav.faults.model import Fault
 from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, FaultActed
@@ -20,6 +22,7 @@ from airl_mav.flight.validity import host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import Ended, Loaded, State
+from airl_mav.rehearsal.process_faults import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -28,6 +31,9 @@ from companion.interfaces import CAMERA_SILENT, LINK_LOST
 SEPARATED = (LINK_LOST, CAMERA_SILENT)
 """Why a mission ends when both processes live but no longer hear each other: one of them stood
 still for seconds, or the host has too much to do."""
+
+DISTURBING = (*PROCESSES, *LINKS, "camera")
+"""Parts without which a companion sees or commands late, or not at all."""
 
 
 @dataclass
@@ -39,14 +45,17 @@ class Episode:
     loaded: Loaded
     supervisor: Supervisor
     stopwatch: WallClock
+    faults: ProcessFaults
+    notes: list[str]
     wall_us: int | None = None
     """Wall time from the reset to the verdict."""
+    paused_us: int = 0
+    """How long the firmware stood still in it, as asked for [simulated µs]."""
     state: State | None = None
     verdict_state: State | None = None
     ended: Ended | None = None
     navigating_us: int | None = None
     """When navigation began, by the companion's clock, which has given up no time [µs]."""
-    notes: list[str] = field(default_factory=list)
 
     @property
     def referee(self) -> Referee:
@@ -88,14 +97,18 @@ def join_episode(
         )
     record = _record(episode, scenario, trajectory, latency, arrays["tick/slips_us"])
     record = replace(record, faults=faults_of(arrays))
+    wall_s = record.wall_s
+    if wall_s is not None and scenario.speed:
+        wall_s -= episode.paused_us / US_PER_S / scenario.speed
     figures = host_figures(
         flight_us=record.ended_us - record.started_us,
-        slipped_us=record.slipped_us,
-        wall_s=record.wall_s,
+        slipped_us=max(0, record.slipped_us - episode.paused_us),
+        wall_s=wall_s,
         speed=scenario.speed,
         lateness_us=latency[TICK_LATENESS],
         decisions=latency,
         frame_period_us=scenario.vehicle.camera.period_us,
+        excused=[(each.from_us, each.to_us) for each in disturbances(record.faults)],
     )
     if scenario.scenario.validity:
         strangers = arrays["commands/strangers"].tolist()
@@ -189,6 +202,16 @@ def faults_of(arrays: Mapping[str, NDArray[Any]]) -> tuple[FaultActed, ...]:
         return ()
     lines = zip(*(told[name].tolist() for name in ("fault", "from_us", "to_us")), strict=True)
     return tuple(FaultActed(*line) for line in lines)
+
+
+def disturbing(faults: Iterable[Fault]) -> list[Fault]:
+    """Return the faults of which a companion may decide late, or lose the vehicle."""
+    return [fault for fault in faults if fault.part in DISTURBING]
+
+
+def disturbances(acted: Sequence[FaultActed]) -> list[FaultActed]:
+    """Return of what has acted the faults of which a companion may decide late, or be lost."""
+    return [each for each in acted if disturbing([Fault.model_validate(each.fault)])]
 
 
 COMPANION_STAMPS = tuple(name for name in STAMPS if name != "capture_us")

@@ -18,11 +18,13 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing_key import StoredSigning
-from airl_mav.faults.model import link_fails
+from airl_mav.faults.kinds import PROCESSES
+from airl_mav.faults.model import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.channel import (
     Begin,
     ChildChannel,
+    Due,
     FinishEpisode,
     Loaded,
     LoadEpisode,
@@ -39,6 +41,7 @@ from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.crash_detector import CrashDetector
 from firmware_sim.external.compose import Wanted, real_firmware
 from firmware_sim.faults.link import FailingEndpoint
+from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.firmware import BuiltinFlightStack, Firmware, FlightStack
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.kept_parameters import KeptParameters
@@ -144,6 +147,8 @@ class Service:
         self._record = Path()
         self._reported = 0
         self._crash = CrashDetector()
+        self._due: dict[int, Fault] = {}
+        """The faults of processes that the rehearsal was told to carry out, by their number."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             LoadEpisode: self._load,
             FinishEpisode: self._finish,
@@ -176,6 +181,7 @@ class Service:
         episode = EpisodeSetup(scenario.vehicle, arena, request.seed, scenario.scenario, computer_w)
         tlog = Path(request.tlog) if request.tlog else None
         self._crash = CrashDetector()
+        self._due.clear()
         loaded = self._firmware.load(episode, tlog, unix_us())
         self._record = Path(request.record)
         self._channel.send(
@@ -194,11 +200,26 @@ class Service:
         self._channel.send(Saved(path=str(self._record)))
 
     def _report(self, simulation: Simulation) -> None:
+        if simulation.faults is not None:
+            self._tell_faults(simulation.faults, simulation.time_us)
         period = simulation.time_us // STATE_EVERY_US
         if not self._crash.look(simulation) and period == self._reported:
             return
         self._reported = period
         self._channel.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
+
+    def _tell_faults(self, timeline: FaultTimeline, now_us: int) -> None:
+        """Tell the faults of processes that begin or end."""
+        acting = {each.number: each.fault for each in timeline.acting(*PROCESSES)}
+        if acting.keys() == self._due.keys():
+            return
+        for number in acting.keys() ^ self._due.keys():
+            fault, begins = (acting | self._due)[number], number in acting
+            if begins and (fault.part, fault.kind) == ("firmware", "killed"):
+                # What is true is known until then; nobody could ask for it afterwards.
+                self._firmware.save(self._record)
+            self._channel.send(Due(time_us=now_us, fault=str(fault), begins=begins))
+        self._due = acting
 
     def _tell(self, message: Message) -> None:
         simulation = self._firmware.simulation

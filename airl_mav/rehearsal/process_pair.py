@@ -122,6 +122,12 @@ class ProcessPair:
         self._scratch = ""
         """Folder of the companion's temporary files. MAVSDK makes one for each system that it
         hears, and leaves it behind when its process is killed."""
+        self._clock = WallClock()
+        self._still: dict[str, tuple[int, int | None]] = {}
+        """Since when each process stands still that does, and when it goes on [wall µs]; None: when
+        it is told to."""
+        self._stood_us: dict[str, int] = {}
+        """How long each has stood still before [wall µs]."""
 
     def start(self, begin: Begin, logs: Path, keeps: Sequence[int]) -> None:
         """Start both processes and wait until they are ready.
@@ -176,6 +182,39 @@ class ProcessPair:
         """Return whether a process is there and meant to be."""
         return not self._children[name].ending
 
+    def stand_still(self, name: str, for_s: float | None = None) -> None:
+        """Stop a process, as a computer that hangs.
+
+        Args:
+            name: Which one.
+            for_s: It goes on after so long, while events are waited for [wall s]; None: when it is
+                told to.
+        """
+        now_us = self._clock.time_us()
+        until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
+        self._children[name].stand_still()
+        self._still[name] = now_us, until_us
+
+    def go_on(self, name: str) -> None:
+        """Let a process go on, if it stands still."""
+        if name in self._still:
+            stood_us = self.stood_us(name)
+            del self._still[name]
+            self._stood_us[name] = stood_us
+            self._children[name].go_on()
+
+    def stood_us(self, name: str) -> int:
+        """Return how long a process has stood still in all [wall µs]."""
+        before_us = self._stood_us.get(name, 0)
+        if name not in self._still:
+            return before_us
+        return before_us + self._clock.time_us() - self._still[name][0]
+
+    def kill(self, name: str) -> None:
+        """End a process at once (SIGKILL), on purpose: its end is no loss."""
+        self._still.pop(name, None)
+        self._children[name].kill()
+
     def send(self, name: str, request: BaseModel) -> None:
         """Send a request; a dead process's end is found by who waits for the answer."""
         self._children[name].send(request)
@@ -215,7 +254,7 @@ class ProcessPair:
             if left_s <= 0.0:
                 raise LostError(f"gave up waiting for {what} after {timeout_s:.0f} s")
             try:
-                name, event = self._events.get(timeout=min(left_s, LOOK_S))
+                name, event = self._events.get(timeout=min(left_s, self._look_s()))
             except queue.Empty:
                 continue
             if isinstance(event, Exited):
@@ -224,6 +263,18 @@ class ProcessPair:
                 self._failed(name, event)
             elif take(name, event):
                 return
+
+    def _look_s(self) -> float:
+        """Let those go on whose time is over; return how long there is nothing to do [wall s]."""
+        now_us, look_us = self._clock.time_us(), round(LOOK_S * US_PER_S)
+        for name, (_, until_us) in list(self._still.items()):
+            if until_us is None:
+                continue
+            if until_us <= now_us:
+                self.go_on(name)
+            else:
+                look_us = min(look_us, until_us - now_us)
+        return look_us / US_PER_S
 
     def _failed(self, name: str, event: Failed) -> None:
         self._children[name].ending = True

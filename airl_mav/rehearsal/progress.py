@@ -10,7 +10,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import State, Text
 
-_WARNING = 4
+WARNING = 4
 """MAV_SEVERITY_WARNING: texts of this severity and graver are shown."""
 
 OUTCOME_STYLES = {
@@ -88,7 +88,7 @@ class LiveObserver(Observer):
 
     def text(self, text: Text) -> None:
         """Print what the autopilot says, if it is a warning or graver."""
-        if text.severity <= _WARNING:
+        if text.severity <= WARNING:
             self._progress.note(f"  autopilot: {text.text}", "yellow")
 
     def finished(self, record: EpisodeRecord) -> None:

@@ -16,6 +16,7 @@ from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.rehearsal.channel import (
     Abort,
     Begin,
+    Due,
     Ended,
     Event,
     FinishEpisode,
@@ -27,9 +28,16 @@ from airl_mav.rehearsal.channel import (
     State,
     Text,
 )
-from airl_mav.rehearsal.episode import Episode, join_episode
-from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, LostError, ProcessPair
-from airl_mav.rehearsal.progress import Observer
+from airl_mav.rehearsal.episode import Episode, disturbances, disturbing, join_episode
+from airl_mav.rehearsal.process_faults import KILLED, ProcessFaults
+from airl_mav.rehearsal.process_pair import (
+    COMPANION,
+    FIRMWARE,
+    REPLY_TIMEOUT_S,
+    LostError,
+    ProcessPair,
+)
+from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -37,6 +45,8 @@ from firmware_sim.external.programs import load_timeout_s
 
 WRAP_UP_S = 90.0
 """Longest time from the verdict to the companion's report: landing included [simulated s]."""
+
+SEPARATED_BY = "firmware and companion lost each other"
 
 
 class RehearsalError(Exception):
@@ -159,7 +169,8 @@ class Rehearsal:
         )
         loaded = pair.wait_for(Loaded, self._look, load_timeout_s(scenario.scenario))
         supervisor = Supervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
-        episode = Episode(index, seed, loaded, supervisor, WallClock(), notes=list(notes))
+        faults = ProcessFaults(pair, self._speed)
+        episode = Episode(index, seed, loaded, supervisor, WallClock(), faults, list(notes))
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
             COMPANION,
@@ -171,28 +182,61 @@ class Rehearsal:
                 record=str(decisions_path.absolute()),
             ),
         )
-        limit_s = (TAKEOFF_LIMIT_S + scenario.scenario.time_limit_s + WRAP_UP_S) / self._speed
         try:
-            pair.pump(lambda _, event: self._follow(pair, episode, event), limit_s, "the flight")
+            pair.pump(
+                lambda _, event: self._follow(pair, episode, event) or self._over_alone(episode),
+                self._longest_s(),
+                "the flight",
+            )
+            self._call_back(pair, episode)
         except LostError as error:
             if not pair.lives(FIRMWARE):
                 raise
             # The firmware still flies. Whatever is wrong with the companion, its setpoints end
             # here; see the failsafe through.
+            faults.undo()
             pair.stop_one(COMPANION)
             seen = self._watch_failsafe(pair, episode)
             raise LostError("; ".join((error.what, *seen)), error.detail) from None
-        if (reason := episode.separated) is not None:
-            raise LostError(f"firmware and companion lost each other ({reason})")
-        pair.send(FIRMWARE, FinishEpisode())
-        pair.wait_for(Saved, self._look)
-        return join_episode(episode, scenario, record_path, decisions_path)
+        if (reason := episode.separated) is not None and not disturbing(scenario.scenario.faults):
+            raise LostError(f"{SEPARATED_BY} ({reason})")
+        if pair.lives(FIRMWARE):
+            pair.send(FIRMWARE, FinishEpisode())
+            pair.wait_for(Saved, self._look)
+        flown = join_episode(episode, scenario, record_path, decisions_path)
+        if not (pair.lives(FIRMWARE) and pair.lives(COMPANION)):
+            self._dismiss()
+        if reason is not None and not disturbances(flown.record.faults):
+            raise LostError(f"{SEPARATED_BY} ({reason})")
+        return flown
+
+    def _longest_s(self) -> float:
+        """Return the longest time that a flight may take [wall s]."""
+        asked = self._scenario.scenario
+        stands_s = sum(fault.for_s or 0.0 for fault in asked.faults if fault.part == FIRMWARE)
+        flown_s = TAKEOFF_LIMIT_S + asked.time_limit_s + WRAP_UP_S
+        return (flown_s + stands_s) / self._speed
+
+    def _call_back(self, pair: ProcessPair, episode: Episode) -> None:
+        """Let those go on that still stand; a companion that flies no more says what it knows."""
+        episode.faults.undo()
+        if episode.ended is None and pair.lives(COMPANION):
+            pair.send(COMPANION, Abort(land=False))
+            try:
+                pair.pump(
+                    lambda _, event: self._follow(pair, episode, event), REPLY_TIMEOUT_S, "its end"
+                )
+            except LostError:
+                # It was not to fly any more anyway: what it knows of its decisions is lost.
+                pair.stop_one(COMPANION)
 
     def _follow(self, pair: ProcessPair, episode: Episode, event: Event) -> bool:
-        """Take one event of a flight; True when it is over."""
+        """Take one event of a flight; True when the companion has ended it."""
         referee = episode.referee
         if isinstance(event, State):
             self._see(pair, episode, event)
+        elif isinstance(event, Due):
+            self._carry_out(episode, event)
         elif isinstance(event, Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
@@ -200,14 +244,37 @@ class Rehearsal:
                 referee.start_navigation(event.time_us - episode.slipped_us)
         elif isinstance(event, Text):
             self._observer.text(event)
+            if episode.faults.out(COMPANION) and event.severity <= WARNING:
+                episode.notes.append(_said(event))
         elif isinstance(event, Ended):
             episode.ended = event
             episode.notes.extend(event.notes)
-            if referee.verdict is None:
-                now_us = episode.state.time_us if episode.state else episode.loaded.time_us
-                self._judge(episode, referee.abort(now_us, event.reason))
+            self._end(episode, episode.faults.reason or event.reason)
             return True
         return False
+
+    def _end(self, episode: Episode, reason: str) -> None:
+        """Abort a flight that is not judged yet."""
+        if episode.referee.verdict is None:
+            now_us = episode.state.time_us if episode.state else episode.loaded.time_us
+            self._judge(episode, episode.referee.abort(now_us, reason))
+
+    def _carry_out(self, episode: Episode, due: Due) -> None:
+        """Stop a process, kill it, or let it go on, as asked for."""
+        faults = episode.faults
+        if (done := faults.carry_out(due)) is not None:
+            episode.notes.append(done)
+        if faults.out(FIRMWARE) == KILLED and faults.reason is not None:
+            self._end(episode, faults.reason)
+
+    def _over_alone(self, episode: Episode) -> bool:
+        """Return whether a flight is over whose companion flies no more: judged, or down."""
+        faults, state = episode.faults, episode.state
+        if not faults.out(COMPANION) or faults.reason is None:
+            return False
+        if state is not None and not state.armed:
+            self._end(episode, faults.reason)
+        return episode.referee.verdict is not None
 
     def _see(self, pair: ProcessPair, episode: Episode, state: State) -> None:
         episode.state = state
@@ -225,6 +292,7 @@ class Rehearsal:
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
             episode.wall_us = episode.stopwatch.time_us()
+            episode.paused_us = episode.faults.paused_us
             episode.verdict_state = episode.state
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
@@ -240,7 +308,7 @@ class Rehearsal:
         def down(_name: str, event: Event) -> bool:
             if isinstance(event, Text):
                 self._observer.text(event)
-                said.append(f"autopilot at {event.time_us / US_PER_S:.2f} s: {event.text}")
+                said.append(_said(event))
             if isinstance(event, State):
                 self._observer.state(event, episode.loaded.time_us)
                 return not event.armed
@@ -256,3 +324,7 @@ class Rehearsal:
         """Take an event that nobody waits for."""
         if isinstance(event, Text):
             self._observer.text(event)
+
+
+def _said(text: Text) -> str:
+    return f"autopilot at {text.time_us / US_PER_S:.2f} s: {text.text}"

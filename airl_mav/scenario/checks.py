@@ -45,9 +45,11 @@ def check_level(scenario: Scenario) -> None:
 def check_faults(asked: Aircraft, level: LevelName) -> None:
     """Raise FieldError for a fault that the level, or the firmware, cannot have."""
     for fault in asked.faults:
-        part = fault.part
-        if level == "gym":
-            raise FieldError("faults", str(fault), "at level lockstep or sitl; the twin has none")
+        part, levels = fault.part, fault.about.levels
+        if level not in levels:
+            raise FieldError("faults", str(fault), f"at level {' or '.join(levels)}")
+        if part == "firmware" and asked.firmware != "builtin":
+            raise FieldError("faults", str(fault), "with firmware builtin")
         if part in LINKS and asked.firmware != "builtin":
             raise FieldError(
                 "faults", str(fault), "with firmware builtin: real firmware has links of its own"

@@ -11,6 +11,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
+from airl_mav.faults.kinds import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import check_faults, check_firmware, check_ports
@@ -211,6 +212,11 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
             "without lockstep; PX4 is flown in lockstep by airl-sitl and from Python",
         )
     check_faults(asked, level)
+    for fault in asked.faults:
+        if fault.part in PROCESSES:
+            raise FieldError(
+                "faults", str(fault), "in a rehearsal (airl-sitl), whose process it is"
+            )
     low, high = LOCKSTEP_SPEEDS if asked.lockstep else SPEEDS
     if isinstance(speed, float) and not (low < speed <= high or low == speed > 0.0):
         sign = "<=" if asked.lockstep else "<"

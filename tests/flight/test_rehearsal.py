@@ -23,6 +23,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.rehearsal import process_pair, rehearsal
 from airl_mav.rehearsal.channel import (
     Abort,
+    Due,
     Ended,
     Event,
     Failed,
@@ -43,6 +44,8 @@ from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load, open_fo
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.faults.timeline import Acted
+from firmware_sim.recording import fault_arrays
 from tests.support.run_demo import demo_arena, demo_episode
 
 GOAL = (10.0, 0.0)
@@ -74,6 +77,12 @@ def phase(name: str, seconds: float) -> Item:
     return COMPANION, Progress(phase=name, time_us=START_US + round(seconds * 1e6))
 
 
+WARNED: Item = (
+    FIRMWARE,
+    Text(time_us=START_US + 4_000_000, severity=2, text="Failsafe activated"),
+)
+
+
 def ended(reason: str = "goal reached", *notes: str) -> Item:
     return COMPANION, Ended(reason=reason, notes=notes, path="")
 
@@ -91,6 +100,10 @@ class Stage:
         self.saves = True
         self.slips: list[tuple[int, int]] = []
         self.strangers: list[str] = []
+        self.faults: list[tuple[str, int, int]] = []
+        """What has acted, from when to when [µs]."""
+        self.goes_on: list[Item] = []
+        """What is said when a process goes on."""
         """When the firmware has given up time, and how much [µs]."""
         self.starts: list[list[Item]] = []
         """What is said at each start; both are ready when nothing is left of it."""
@@ -121,6 +134,7 @@ class FakeChild:
         assert (name == COMPANION) == bool(environment)
         self.name, self.ending, self.stopped, self.log = name, False, 0, Path(f"{name}.log")
         self.requests: list[Any] = []
+        self.standing: list[bool] = []
         stage = self.stage
         stage.events = arguments[-1]
         stage.children[name] = self
@@ -158,8 +172,19 @@ class FakeChild:
         elif isinstance(request, Abort):
             stage.put(*stage.on_abort(request))
         elif isinstance(request, FinishEpisode) and stage.saves:
-            write_record(self.record, stage.slips, stage.strangers)
+            self.save()
             stage.put((FIRMWARE, Saved(path=str(self.record))))
+
+    def save(self) -> None:
+        stage = self.stage
+        write_record(self.record, stage.slips, stage.strangers, stage.faults)
+
+    def stand_still(self) -> None:
+        self.standing.append(True)
+
+    def go_on(self) -> None:
+        self.standing.append(False)
+        self.stage.put(*self.stage.goes_on)
 
     def stop(self) -> None:
         self.ending = True
@@ -172,7 +197,12 @@ class FakeChild:
         return "last words"
 
 
-def write_record(path: Path, slips: Sequence[tuple[int, int]], strangers: Sequence[str]) -> None:
+def write_record(
+    path: Path,
+    slips: Sequence[tuple[int, int]],
+    strangers: Sequence[str],
+    faults: Sequence[tuple[str, int, int]],
+) -> None:
     """What the firmware leaves of an episode: 100 s at 10 m/s to the north."""
     n = 5001
     time_us = START_US + np.arange(n, dtype=np.int64) * 20_000
@@ -192,6 +222,8 @@ def write_record(path: Path, slips: Sequence[tuple[int, int]], strangers: Sequen
         "tick/slips_us": np.array(slips, np.int64).reshape(-1, 2),
         "commands/strangers": np.array(strangers, np.str_),
     }
+    acted = [Acted(*each) for each in faults]
+    arrays |= fault_arrays(acted)
     np.savez(path, **arrays)
 
 
@@ -233,9 +265,11 @@ class Run:
         self.stage = stage
         self.observer = Silent()
 
-    def fly(self, episodes: int | None = None, done: Collection[int] = ()) -> list[EpisodeRecord]:
+    def fly(
+        self, episodes: int | None = None, done: Collection[int] = (), **more: Any
+    ) -> list[EpisodeRecord]:
         if episodes is not None:
-            self.scenario = asked(episodes=episodes)
+            self.scenario = asked(episodes=episodes, **more)
         with Rehearsal(self.scenario, self.folder, self.observer, keeps=(7,)) as flown:
             flown.run(done)
         assert all(child.stopped for child in self.stage.all)
@@ -573,6 +607,87 @@ def test_processes_that_lost_each_other_fly_again(play: Callable[..., Run], reas
     assert record.outcome == "success"
     assert record.notes == (f"flown again: firmware and companion lost each other ({reason})",)
     assert len(run.stage.all) == 4
+
+
+# --- faults of the processes, as asked for
+
+
+def due(fault: str, seconds: float, *, begins: bool = True) -> Item:
+    return FIRMWARE, Due(time_us=START_US + round(seconds * 1e6), fault=fault, begins=begins)
+
+
+def test_a_killed_companion_is_no_loss(play: Callable[..., Run]) -> None:
+    """The flight controller's failsafe lands the vehicle; the next flight has two new processes."""
+    fault = "companion killed at 3s"
+    down = [due(fault, 3.0), (COMPANION, Exited(-9)), WARNED, at(6.0, 4.0, armed=False)]
+    run = play([phase("navigating", 2.0), at(2.9, 1.0), *down], FLOWN)
+    run.stage.faults = [(fault, START_US + 3_000_000, START_US + 6_000_000)]
+    lost, flown = run.fly(2, faults=(fault,))
+    assert (lost.outcome, lost.reason, lost.invalid) == ("aborted", "companion killed", ())
+    assert lost.ended_us == START_US + 6_000_000
+    assert lost.notes == (
+        "companion killed at 4.00 s, as asked for",
+        "autopilot at 5.00 s: Failsafe activated",
+    )
+    assert [each.fault for each in lost.faults] == [fault]
+    assert (flown.outcome, run.observer.losses, len(run.stage.all)) == ("success", [], 4)
+
+
+def test_a_companion_that_stood_to_the_end_says_what_it_knows(play: Callable[..., Run]) -> None:
+    fault = "companion stopped at 3s"
+    run = play([phase("navigating", 2.0), at(2.9, 1.0), due(fault, 3.0), at(6.0, 4.0, armed=False)])
+    (record,) = run.fly(1, faults=(fault,))
+    assert (record.outcome, record.reason) == ("aborted", "companion stopped")
+    assert run.stage.children[COMPANION].standing == [True, False]
+    assert run.stage.requests(COMPANION, Abort) == [Abort(land=False)]
+
+
+def test_a_companion_that_stood_for_a_while_flies_on(play: Callable[..., Run]) -> None:
+    fault = "companion stopped at 3s for 1s"
+    stood = [due(fault, 3.0), at(3.5, 2.0), due(fault, 4.0, begins=False)]
+    run = play([phase("navigating", 2.0), at(2.9, 1.0), *stood, at(9.0, 8.0), ended()])
+    (record,) = run.fly(1, faults=(fault,))
+    assert record.outcome == "success"
+    assert run.stage.children[COMPANION].standing == [True, False]
+
+
+def test_a_killed_firmware_leaves_what_was_flown(play: Callable[..., Run]) -> None:
+    fault = "firmware killed at 3s"
+    begun: Script = [phase("navigating", 2.0), at(2.9, 1.0)]
+    run = play(begun, FLOWN)
+    begun += [
+        lambda: run.stage.children[FIRMWARE].save(),
+        *(due(fault, 3.0), (FIRMWARE, Exited(-9)), ended("link lost")),
+    ]
+    run.stage.faults = [(fault, START_US + 3_000_000, START_US + 3_000_000)]
+    lost, flown = run.fly(2, faults=(fault,))
+    assert (lost.outcome, lost.reason) == ("aborted", "firmware killed")
+    assert (flown.outcome, run.observer.losses, len(run.stage.all)) == ("success", [], 4)
+    assert len(run.stage.requests(FIRMWARE, FinishEpisode)) == 1
+
+
+def test_a_stopped_firmware_goes_on_by_the_wall_clock(play: Callable[..., Run]) -> None:
+    """Its simulated time stands: nobody but the rehearsal can tell when it is over."""
+    fault = "firmware stopped at 3s for 50ms"
+    run = play([phase("navigating", 2.0), at(2.9, 1.0), due(fault, 3.0)])
+    run.stage.goes_on = [at(9.0, 8.0), ended()]
+    (record,) = run.fly(1, faults=(fault,))
+    assert record.outcome == "success"
+    assert run.stage.children[FIRMWARE].standing == [True, False]
+
+
+@pytest.mark.parametrize("acted", [True, False])
+def test_a_companion_that_a_fault_kept_from_hearing_is_not_flown_again(
+    play: Callable[..., Run], *, acted: bool
+) -> None:
+    """Unless the fault had not begun yet."""
+    fault = "camera off at 3s"
+    run = play([phase("navigating", 2.0), at(3.0, 1.0), ended("camera silent")], FLOWN)
+    if acted:
+        run.stage.faults = [(fault, START_US + 3_000_000, START_US + 9_000_000)]
+    (record,) = run.fly(1, faults=(fault,))
+    assert record.outcome == ("aborted" if acted else "success")
+    assert len(run.observer.losses) == (0 if acted else 1)
 
 
 @pytest.mark.parametrize("reason", ["watchdog", "policy failed: RuntimeError: out of ideas"])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,12 +12,13 @@ from typing import Any
 
 import pytest
 
+from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE
 from airl_mav.rehearsal.channel import Begin, Failed, parse_event
 from airl_mav.rehearsal.process_pair import MODULES
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from tests.support.processes import ROOT
+from tests.support.processes import ROOT, wait_until
 
 
 def told(module: str, first: bytes, folder: Path) -> subprocess.CompletedProcess[bytes]:
@@ -68,3 +71,53 @@ def test_something_else_is_refused_in_one_line(
 def test_a_pipe_that_ends_at_once_ends_the_process(module: str, tmp_path: Path) -> None:
     done = told(module, b"", tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (EXIT_BROKEN, b"", b"")
+
+
+SLEEPS = "import time; time.sleep(60)"
+STOPS_IT_AND_IS_KILLED = f"""
+import os, signal, sys
+from pathlib import Path
+from airl_mav.core.child_process import ChildProcess
+child = ChildProcess([sys.executable, "-c", {SLEEPS!r}], Path(sys.argv[1]))
+child.stand_still()
+print(child.pid, flush=True)
+sys.stdin.readline()
+"""
+
+
+def state_of(pid: int) -> str:
+    """Return the kernel's letter for what a process does; T: it is stopped."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def test_a_child_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> None:
+    child = ChildProcess([sys.executable, "-c", SLEEPS], tmp_path / "log")
+    try:
+        child.stand_still()
+        wait_until(lambda: state_of(child.pid) == "T", "stopped")
+        child.go_on()
+        wait_until(lambda: state_of(child.pid) != "T", "going on")
+        child.go_on()  # harmless
+        child.stand_still()
+        child.kill()
+        assert child.wait().code == -signal.SIGKILL
+    finally:
+        child.stop()
+
+
+def test_a_child_goes_on_when_who_stopped_it_is_killed(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", STOPS_IT_AND_IS_KILLED, str(tmp_path / "log")]
+    with subprocess.Popen(
+        words,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    ) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        try:
+            wait_until(lambda: state_of(pid) == "T", "stopped")
+            parent.kill()
+            wait_until(lambda: state_of(pid) != "T", "going on")
+        finally:
+            os.kill(pid, signal.SIGKILL)

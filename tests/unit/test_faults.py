@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from airl_mav.cli import sitl
 from airl_mav.cli.options import read_options, scenario_of
+from airl_mav.core.constants import TICK_US
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.faults.kinds import KINDS, Part, Phase
@@ -19,6 +20,7 @@ from airl_mav.faults.schedule import FOREVER_US, active, gust_share, next_change
 from airl_mav.scenario.file import read_scenario_file, save_scenario
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 
 TIMES = st.floats(min_value=0.0, max_value=99_999.0, allow_nan=False)
 
@@ -65,6 +67,8 @@ def test_words_and_fields_are_the_same_fault(fault: Fault) -> None:
         ("gyro noisy 5x", "gyro noise 5"),
         ("wind gust 6,0,0m/s at climb for 3s", "wind gust 6,0,0m/s at climb for 3s"),
         ("battery drop 95% at 3s", "battery drop 0.95 at 3s"),
+        ("companion stopped at offboard+1s for 2s", "companion stopped at offboard+1s for 2s"),
+        ("firmware killed at hold", "firmware killed at hold"),
     ],
 )
 def test_what_people_write(written: str, meant: str) -> None:
@@ -95,6 +99,8 @@ def test_what_people_write(written: str, meant: str) -> None:
         ("gps off at 1e9s", "0 <= value <= 100000 s"),
         ("battery drop 10% for 2s", "happens once"),
         ("wind gust 1,1,1m/s", "it has a duration"),
+        ("companion killed for 1s", "happens once"),
+        ("companion off", "no such fault of companion; accepted: stopped, killed"),
     ],
 )
 def test_wrong_words_get_one_line_that_says_what_is_accepted(written: str, said: str) -> None:
@@ -148,6 +154,11 @@ def test_what_is_wrong_on_a_command_line_names_the_option() -> None:
             {"firmware": "px4", "real": {"px4_connect": True}, "faults": ["link cut"]},
             "with firmware builtin",
         ),
+        ({"level": "lockstep", "faults": ["firmware stopped"]}, "accepted: at level sitl"),
+        (
+            {"firmware": "px4", "real": {"px4_connect": True}, "faults": ["firmware killed"]},
+            "with firmware builtin",
+        ),
     ],
 )
 def test_what_a_level_cannot_do_is_refused(fields: dict[str, Any], line: str) -> None:
@@ -168,6 +179,24 @@ def test_a_window_counts_from_the_start_or_from_the_phase() -> None:
     later = fault("gps off at hold+2s for 1s")
     assert window_us(later, {}) is None
     assert window_us(later, {"hold": 3_000_000}) == (5_000_000, 6_000_000)
+
+
+def test_no_simulated_time_passes_while_the_firmware_stands() -> None:
+    begin_us, end_us = window_us(fault("firmware stopped at 2.001s for 3s"), {}) or (0, 0)
+    assert (begin_us, end_us - begin_us) == (2_001_000, TICK_US)
+
+
+def test_after_some_faults_of_a_process_nothing_comes() -> None:
+    assert fault("companion killed").for_good
+    assert fault("companion stopped").for_good
+    assert not fault("companion stopped for 3s").for_good
+    assert not fault("gps off").for_good
+
+
+def test_only_a_rehearsal_can_stop_its_processes() -> None:
+    asked = StandAloneVehicle(faults=(fault("companion stopped at hold"),))
+    with pytest.raises(FieldError, match="in a rehearsal"):
+        check_vehicle(asked)
 
 
 def test_what_acts_is_a_function_of_time_and_phases() -> None:

@@ -77,6 +77,21 @@ def test_late_ticks_are_those_of_the_hundredth() -> None:
     )
 
 
+def test_what_a_fault_makes_late_is_not_the_host_s() -> None:
+    infer = np.arange(10, dtype=np.int64) * 550_000
+    infer[5:] += 2_000_000  # the companion stood still from 2.3 s to 4.6 s
+    decisions = {
+        "capture_us": infer - 20_000,
+        "infer_start_us": infer,
+        "held_until_us": np.arange(10) * 550_000 + 520_000,
+    }
+    assert figures(decisions=decisions).late_decisions == pytest.approx(5 / 9)
+    decisions["held_until_us"][5:] += 2_000_000
+    assert figures(decisions=decisions).late_decisions == pytest.approx(1 / 9)
+    assert figures(decisions=decisions, excused=[(2_300_000, 4_600_000)]).late_decisions == 0.0
+    assert figures(decisions=decisions, excused=[(5_300_000, 5_400_000)]).late_decisions == 1 / 8
+
+
 def test_old_frames_and_late_decisions_are_counted() -> None:
     infer = np.arange(10, dtype=np.int64) * 550_000
     old = infer - 20_000

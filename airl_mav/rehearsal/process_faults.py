@@ -1,0 +1,68 @@
+"""Faults of the two processes in one episode: stopped, going on again, killed, as asked for.
+
+The firmware says when (`channel.Due`); it knows the time and the phases of the flight.
+"""
+
+from __future__ import annotations
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.faults.model import Fault
+from airl_mav.rehearsal.channel import Due
+from airl_mav.rehearsal.process_pair import COMPANION, FIRMWARE, ProcessPair
+
+KILLED = "killed"
+
+
+class ProcessFaults:
+    """Carries out what is due."""
+
+    def __init__(self, pair: ProcessPair, speed: float) -> None:
+        """Take the processes, and simulated seconds per wall second."""
+        self._pair = pair
+        self._speed = speed
+        self._stood_before_us = pair.stood_us(FIRMWARE)
+        self._out: dict[str, str] = {}
+
+    def out(self, name: str) -> str | None:
+        """Return what became of a process that flies no more in this episode, as "killed"."""
+        return self._out.get(name)
+
+    @property
+    def reason(self) -> str | None:
+        """Why a flight ends that one of them flies no more, in words; None: both fly."""
+        return "; ".join(f"{name} {kind}" for name, kind in self._out.items()) or None
+
+    @property
+    def paused_us(self) -> int:
+        """How long the firmware has stood still, as asked for [simulated µs]."""
+        return round((self._pair.stood_us(FIRMWARE) - self._stood_before_us) * self._speed)
+
+    def carry_out(self, due: Due) -> str | None:
+        """Begin or end a fault.
+
+        Returns:
+            What was done, for the records; None: nothing.
+        """
+        fault = Fault.model_validate(due.fault)
+        name, kind, at_s = fault.part, fault.kind, due.time_us / US_PER_S
+        if name in self._out:
+            return None
+        if not due.begins:
+            # The firmware, which stands still itself, is timed by the wall clock.
+            if name == COMPANION:
+                self._pair.go_on(name)
+                return f"{name} goes on at {at_s:.2f} s"
+            return None
+        if fault.for_good:
+            self._out[name] = kind
+        if kind == KILLED:
+            self._pair.kill(name)
+        else:
+            for_s = fault.for_s if name == FIRMWARE else None
+            self._pair.stand_still(name, None if for_s is None else for_s / self._speed)
+        return f"{name} {kind} at {at_s:.2f} s, as asked for"
+
+    def undo(self) -> None:
+        """Let those go on that still stand."""
+        for name in (FIRMWARE, COMPANION):
+            self._pair.go_on(name)
