@@ -297,6 +297,16 @@ def _share(figure: Figure, reference: Figure) -> str:
     return f"{100.0 * (figure.value - reference.value) / reference.value:+.0f} %"
 
 
+# --- roofline
+
+
+@block("roofline", "roofline")
+def roofline(records: Records) -> str:
+    printed = records["roofline"].printed
+    assert printed is not None
+    return table(printed.columns, printed.rows, 8)
+
+
 # --- compensation
 
 

@@ -28,6 +28,7 @@ from airl_mav.profiles.loading import load_profile, profile_digest, profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.training.config import TrainingConfig
 from tests.support.flight_rig import NAN, flight, velocity_setpoint
+from tests.support.processes import ROOT
 
 QUAD = load_vehicle("quad")
 PI = {"computer": "ras-pi-4", "workload": "template-5x32"}
@@ -38,6 +39,19 @@ SOURCES = (("1ms", 0.5), ("150ms", 0.5), ("ras-pi-4/template-5x32", 0.25))
 def task_of(hold_s: float, distance_m: float = 8.0) -> StoppingTask:
     loop = DecisionLoop(QUAD.camera.period_us / 1e6, 0.005, hold_s, 0.004)
     return StoppingTask(QUAD, loop, distance_m)
+
+
+def test_the_page_has_the_safe_velocities() -> None:
+    page = (ROOT / "docs" / "how-to" / "latency.md").read_text(encoding="utf-8")
+    table = page[page.index("| quad, D = 8 m |") :].split("\n\n")[0].splitlines()[2:]
+    told = [[cell.strip() for cell in line.strip("|").split("|")] for line in table]
+    for (title, reaction, velocity), (source, hold_s) in zip(told, SOURCES, strict=True):
+        latency = parse_latency(source).latency
+        assert latency is not None
+        task, t2_s = task_of(hold_s), longest_ms(latency) / 1e3
+        assert title.endswith(f"hold {hold_s:g} s")
+        assert reaction == f"{task.loop.reaction_s(t2_s):.2f} s"
+        assert velocity == f"{task.safe_velocity(t2_s):.2f} m/s"
 
 
 # --- braking
