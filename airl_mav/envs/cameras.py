@@ -5,7 +5,7 @@ One compiled call renders the images of all vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,14 +16,20 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import is_noisy, noisy_frame
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
-from airl_mav.core.constants import TICK_US
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.saved_state import Stateful
+from airl_mav.faults.kinds import NOISE_SEED
+from airl_mav.faults.model import Fault
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
+
+NEVER = 1 << 40
+"""More ticks than any flight has."""
 
 
 class Lens(NamedTuple):
@@ -47,8 +53,23 @@ def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
 class Cameras(Stateful):
     """Frames come at the camera's rate; their phase to the decisions is drawn from the seed."""
 
-    def __init__(self, n: int, camera: Camera, transport_us: int, noise: SensorNoise) -> None:
-        """Make n cameras; `transport_us` is the time from capture to decoded [µs]."""
+    def __init__(
+        self,
+        n: int,
+        camera: Camera,
+        transport_us: int,
+        noise: SensorNoise,
+        faults: Sequence[Fault] = (),
+    ) -> None:
+        """Make n cameras.
+
+        Args:
+            n: Number of cameras.
+            camera: The camera.
+            transport_us: From capture to decoded [µs].
+            noise: Of their images.
+            faults: Those of the camera happen to all of them.
+        """
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
         """(n, h, w) newest frames, Z16 [mm]."""
@@ -60,16 +81,88 @@ class Cameras(Stateful):
         )
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._first_us = np.zeros(n, np.int64)
+        failing = twin_faults(faults, "camera")
+        self._late = [each for each in failing if each.fault.kind == "delay"]
+        self._changed = [each for each in failing if each.fault.kind != "delay"]
+        """What changes pictures, in the order of the episode's faults."""
+        stuck = [each.number for each in failing if each.fault.kind == "stuck"]
+        self._frozen = {number: np.zeros_like(self.image) for number in stuck}
+        """The picture that a camera shows that is stuck, by the fault's number."""
+        self._freeze_us = {number: np.zeros(n, np.int64) for number in stuck}
+        """When it was taken, or will be [µs]."""
+
+    @property
+    def latest_us(self) -> int:
+        """Longest time from capture to decoded [µs]."""
+        late_s = sum(each.fault.amount for each in self._late)
+        return self.transport_us + round(late_s * US_PER_S)
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
         self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.period_us)
+        for each in self._changed:
+            if each.number in self._frozen:
+                # The first frame after its begin; of the start there is one, whenever it was taken.
+                since_us = each.from_us - int(self._first_us[i])
+                wait_us = -since_us % self.period_us if each.from_us else 0
+                self._freeze_us[each.number][i] = each.from_us + wait_us
 
     def age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return how old the newest decoded frame is at a time (n,) [µs] of each episode."""
         since_us = time_us - self.transport_us - self._first_us
         age: NDArray[np.int64] = self.transport_us + since_us % self.period_us
+        for late in self._late:
+            age = self._delayed(age, time_us, late)
         return age
+
+    def delay_us(self, capture_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return by how much frames come later that were taken at a time (n,) [µs]."""
+        return later_us(self._late, capture_us)
+
+    def _delayed(
+        self, age_us: NDArray[np.int64], time_us: NDArray[np.int64], late: TwinFault
+    ) -> NDArray[np.int64]:
+        """Return the age of the newest frame where those of a time come later, all in order."""
+        delay_us = round(late.fault.amount * US_PER_S)
+
+        def newest(at_us: Any) -> Any:
+            return at_us - (at_us - self._first_us) % self.period_us
+
+        healthy = time_us - age_us
+        last = newest(late.to_us - 1)
+        # A frame of after the fault waits for the last one of it.
+        waits = (healthy >= late.from_us) & (time_us - self.transport_us < last + delay_us)
+        arrived = newest(time_us - self.transport_us - delay_us)
+        if late.from_us != BEFORE_US:
+            arrived = np.maximum(arrived, newest(late.from_us - 1))
+        found: NDArray[np.int64] = time_us - np.where(waits, arrived, healthy)
+        return found
+
+    def ticks_to_freeze(self, time_us: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        """Return the ticks (n,) until the next picture is kept, after these times [µs].
+
+        None: no camera is ever stuck.
+        """
+        if not self._freeze_us:
+            return None
+        due = np.stack(
+            [(at - time_us + TICK_US // 2) // TICK_US for at in self._freeze_us.values()]
+        )
+        ticks: NDArray[np.int64] = np.where(due > 0, due, NEVER).min(axis=0)
+        return ticks
+
+    def freeze(
+        self,
+        fleet: Fleet,
+        arenas: ArenaBatch,
+        seeds: NDArray[np.int64],
+    ) -> None:
+        """Keep the pictures that are due to be: a stuck camera shows them from now on."""
+        for number, at_us in self._freeze_us.items():
+            who = np.abs(fleet.time_us - at_us) <= TICK_US // 2
+            if who.any():
+                render_images(fleet, arenas, who, self._mount, self._lens, self._frozen[number])
+                self._make_noisy(self._frozen[number], self._noise, who, seeds, fleet.time_us)
 
     def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return when the next frame is decoded after a time (n,) [µs] of each episode."""
@@ -89,10 +182,30 @@ class Cameras(Stateful):
         The noise is drawn from the episodes' `seeds` (n,).
         """
         render_images(fleet, arenas, who, self._mount, self._lens, self.image)
+        self._make_noisy(self.image, self._noise, who, seeds, fleet.time_us)
+        for each in self._changed:
+            acts = who & each.at(fleet.time_us)
+            if each.number in self._frozen:
+                taken = acts & (fleet.time_us + TICK_US // 2 >= self._freeze_us[each.number])
+                self.image[taken] = self._frozen[each.number][taken]
+            elif acts.any():
+                noise = SensorNoise(depth_noise=each.fault.amount)
+                own = NOISE_SEED * (each.number + 1) + seeds
+                self._make_noisy(self.image, noise, acts, own, fleet.time_us)
+
+    def _make_noisy(
+        self,
+        image: NDArray[np.uint16],
+        noise: SensorNoise,
+        who: NDArray[np.bool_],
+        seeds: NDArray[np.int64],
+        time_us: NDArray[np.int64],
+    ) -> None:
+        """Add noise to the images of `who` (n,), taken at these times (n,) [µs]."""
         # Frames are taken at whole ticks, up to half of one before their time.
-        frame = (fleet.time_us + TICK_US // 2 - self._first_us) // self.period_us
-        for i in np.flatnonzero(who).tolist() if is_noisy(self._noise) else ():
-            self.image[i] = noisy_frame(self.image[i], self._noise, int(seeds[i]), int(frame[i]))
+        frame = (time_us + TICK_US // 2 - self._first_us) // self.period_us
+        for i in np.flatnonzero(who).tolist() if is_noisy(noise) else ():
+            image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frame[i]))
 
     def _held(self) -> Mapping[str, Any]:
         return {"image": self.image, "first_us": self._first_us}

@@ -30,6 +30,7 @@ from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.encoding import shrink
 from airl_mav.envs.estimation import Telemetry
+from airl_mav.envs.faults import later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import advance
 from airl_mav.envs.saved_state import State, Stateful
@@ -37,6 +38,8 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, ticks_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.winds import Winds
+from airl_mav.faults.model import Fault
+from airl_mav.faults.twin import check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
@@ -96,6 +99,7 @@ class Navigation(Stateful):
         computer_w: float = 0.0,
         battery_charge: float = 1.0,
         compensator: Compensator | None = None,
+        faults: Sequence[Fault] = (),
     ) -> None:
         """Load the profiles.
 
@@ -113,9 +117,12 @@ class Navigation(Stateful):
             battery_charge: State of charge at the start of every flight, 1 full to 0 empty.
             compensator: Carries forward what is seen, of n companions; None: that of the vehicle,
                 where `spec` compensates.
+            faults: What happens in every flight, of what the twin has (`envs.faults`); no part of
+                a saved state.
 
         Raises:
-            UsageError: A profile cannot be used, or the camera does not serve the layout.
+            UsageError: A profile cannot be used, or the camera does not serve the layout; a fault
+                is none that the twin can fly.
         """
         self.spec = spec
         self.n = n
@@ -166,14 +173,16 @@ class Navigation(Stateful):
         check_spread(self.vehicle, randomisation, "randomisation")
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
-        self._winds = Winds(n, spec.wind)
-        self.cameras = Cameras(n, self.camera, self._transport_us, randomisation)
+        check_twin(faults, pipelined=spec.decisions == "pipelined")
+        self._winds = Winds(n, spec.wind, faults)
+        self.cameras = Cameras(n, self.camera, self._transport_us, randomisation, faults)
+        self._uplink = twin_faults(faults, "uplink")
         self._timing: SequentialTiming | PipelinedTiming
         if spec.decisions == "pipelined":
             self._timing = PipelinedTiming(n, self._link_us)
         else:
             self._timing = SequentialTiming(
-                self.cameras, self._link_us, self._hold_us, self._hover_us
+                self.cameras, self._link_us, self._hold_us, self._hover_us, self._uplink
             )
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
@@ -307,7 +316,13 @@ class Navigation(Stateful):
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
         if self._trace is not None:
-            self._trace.decided(self.fleet, setpoints, t2_us, self._transport_us, self._link_us)
+            self._trace.decided(
+                self.fleet,
+                setpoints,
+                t2_us,
+                self._transport_us + self.cameras.delay_us(self._trace.seen_us),
+                self._link_us + later_us(self._uplink, began_us + t2_us),
+            )
         sent_us = began_us + TICK_US * ticks_of(t2_us)
         stop_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
         self._companions.decided(setpoints, t2_us, sent_us, stop_us)
@@ -373,6 +388,16 @@ class Navigation(Stateful):
 
     def advance(self, ticks: NDArray[np.int64]) -> None:
         """Advance all flights by ticks (n,); the only place where time passes."""
+        to_freeze = self.cameras.ticks_to_freeze(self.fleet.time_us)
+        while to_freeze is not None and (to_freeze <= ticks).any():
+            part = np.minimum(ticks, to_freeze)
+            self._advance(part)
+            self.cameras.freeze(self.fleet, self._batch, self.seeds)
+            ticks = ticks - part
+            to_freeze = self.cameras.ticks_to_freeze(self.fleet.time_us)
+        self._advance(ticks)
+
+    def _advance(self, ticks: NDArray[np.int64]) -> None:
         if self._trace is not None:
             self._trace.advance(self.fleet, ticks, self._fly)
         else:
@@ -388,4 +413,6 @@ class Navigation(Stateful):
         """Take the frames of those in `who` (n,), from where they are now."""
         if self._trace is not None:
             self._trace.captured(self.fleet, who)
+        if (self.fleet.time_us[who] == 0).any():
+            self.cameras.freeze(self.fleet, self._batch, self.seeds)
         self.cameras.capture(self.fleet, self._batch, who, self.seeds)

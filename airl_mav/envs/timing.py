@@ -6,15 +6,16 @@ decision begins with the newest frame as soon as the last one is ready; nothing 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import TICK_US
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.cameras import Cameras
+from airl_mav.envs.faults import TwinFault, later_us
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.saved_state import Stateful
 
@@ -73,7 +74,14 @@ class Timing(Protocol):
 class SequentialTiming(Stateful):
     """After its hold, a decision is followed by the next."""
 
-    def __init__(self, cameras: Cameras, link_us: int, hold_us: int, hover_us: int | None) -> None:
+    def __init__(
+        self,
+        cameras: Cameras,
+        link_us: int,
+        hold_us: int,
+        hover_us: int | None,
+        uplink: Sequence[TwinFault] = (),
+    ) -> None:
         """Take the times.
 
         Args:
@@ -82,17 +90,20 @@ class SequentialTiming(Stateful):
             hold_us: How long an action is held before the next observation [µs].
             hover_us: The velocity is zeroed so long after the hold when no new action has come;
                 None: the last one persists [µs].
+            uplink: Faults by which setpoints arrive later.
 
         Raises:
             UsageError: The hold is so short that a decision would have to wait for its frame.
         """
         self._link_us, self._hold_us, self._hover_us = link_us, hold_us, hover_us
-        least_us = link_us + cameras.transport_us + cameras.period_us
+        self._uplink = uplink
+        late_us = round(sum(each.fault.amount for each in uplink) * US_PER_S)
+        least_us = link_us + late_us + cameras.latest_us + cameras.period_us
         if hold_us < least_us:
             raise UsageError(
                 f"episode.hold_s = {hold_us / 1e6:g}: accepted: value >= {least_us / 1e6:g} s "
                 f"(delay.link_ms, delay.transport_ms and {cameras.period_us / 1e3:g} ms between two"
-                " frames)"
+                " frames, and what faults delay)"
             )
 
     def begin(self, i: int) -> None:
@@ -102,10 +113,14 @@ class SequentialTiming(Stateful):
         """Fly one decision of every vehicle; see `Timing`."""
         fleet = vehicles.fleet
         # Ticks are counted from the observation that is being decided on.
-        sent, accepted = ticks_of(t2_us), ticks_of(t2_us + self._link_us)
-        self._wait(vehicles, np.zeros_like(sent), sent)
+        arrives_us = t2_us + self._link_us
+        if self._uplink:
+            arrives_us += later_us(self._uplink, fleet.time_us + t2_us)
+        sent, accepted = ticks_of(t2_us), ticks_of(arrives_us)
+        stop = self._stop(fleet.time_us)
+        self._wait(vehicles, np.zeros_like(sent), sent, stop)
         setpoints[:, 2] = vehicles.holding_altitude()
-        self._wait(vehicles, sent, accepted)
+        self._wait(vehicles, sent, accepted, stop)
         give(fleet, setpoints, np.ones(len(sent), np.bool_))
         left = sent + self._hold_us // TICK_US - accepted
         age_us = vehicles.cameras.age_us(fleet.time_us + left * TICK_US)
@@ -116,14 +131,22 @@ class SequentialTiming(Stateful):
         aged: Times = TICK_US * age
         return aged
 
-    def _wait(self, vehicles: Vehicles, start: Times, end: Times) -> None:
-        """Fly on the last setpoint from one tick to another; it may expire in between."""
+    def _stop(self, began_us: Times) -> Times | None:
+        """Return the ticks (n,) after which the last setpoint expires; None: it never does."""
         if self._hover_us is None:
+            return None
+        # The stop takes as long to arrive as any setpoint.
+        stop_us = np.full(len(began_us), self._hover_us + self._link_us)
+        if self._uplink:
+            stop_us += later_us(self._uplink, began_us + self._hover_us)
+        return ticks_of(stop_us)
+
+    def _wait(self, vehicles: Vehicles, start: Times, end: Times, stop: Times | None) -> None:
+        """Fly on the last setpoint from one tick to another; it may expire in between."""
+        if stop is None:
             vehicles.advance(end - start)
             return
         fleet = vehicles.fleet
-        # The stop takes as long to arrive as any setpoint.
-        stop = ticks_of(np.full(len(start), self._hover_us + self._link_us))
         reached = np.clip(stop, start, end)
         vehicles.advance(reached - start)
         over = (stop >= start) & (stop < end)

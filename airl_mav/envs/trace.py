@@ -70,7 +70,9 @@ class Trace:
         self._sampled_us = np.zeros(n, np.int64)
         self._sampled_j = np.zeros(n)
         self._capture_us = np.zeros(n, np.int64)
-        self._deciding = self._started_us = self._seen_us = np.zeros(0, np.int64)
+        self._deciding = self._started_us = np.zeros(0, np.int64)
+        self.seen_us = np.zeros(n, np.int64)
+        """(n,) when the frames were taken that are being decided on [µs]."""
 
     def begin(self, i: int, fleet: Fleet) -> None:
         """Begin the record of slot i, whose vehicle is at the start."""
@@ -117,15 +119,15 @@ class Trace:
         """Note that every flight that goes on begins a decision, on its newest frame."""
         self._deciding = np.flatnonzero(fleet.verdict == Verdict.FLYING)
         self._started_us = fleet.time_us.copy()
-        self._seen_us = self._capture_us.copy()
+        self.seen_us = self._capture_us.copy()
 
     def decided(
         self,
         fleet: Fleet,
         setpoint: NDArray[np.float64],
         t2_us: NDArray[np.int64],
-        transport_us: int,
-        link_us: int,
+        transport_us: NDArray[np.int64],
+        link_us: NDArray[np.int64],
     ) -> None:
         """Note the decision that `deciding` began, once it has been flown.
 
@@ -133,15 +135,15 @@ class Trace:
             fleet: As it is when the next decision begins.
             setpoint: (n, 4) what was decided: forward, right, down [m/s], yaw rate [rad/s].
             t2_us: (n,) inference as modelled, before it was rounded to ticks [µs].
-            transport_us: Capture to decoded [µs].
-            link_us: Setpoint sent to first motor command [µs].
+            transport_us: (n,) capture to decoded [µs].
+            link_us: (n,) setpoint sent to first motor command [µs].
         """
         who = self._deciding
-        capture, start, end = self._seen_us[who], self._started_us[who], fleet.time_us[who]
+        capture, start, end = self.seen_us[who], self._started_us[who], fleet.time_us[who]
         # The frame of the start is there at once.
-        decoded = np.minimum(capture + transport_us, start)
+        decoded = np.minimum(capture + transport_us[who], start)
         sent = start + t2_us[who]
-        rows = np.column_stack([capture, decoded, start, sent, sent, sent + link_us, end])
+        rows = np.column_stack([capture, decoded, start, sent, sent, sent + link_us[who], end])
         # What lies behind the end of the flight never came; nor does a hold without its action.
         rows[rows > end[:, None]] = NO_STAMP
         rows[sent > end, -1] = NO_STAMP

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,9 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
 from airl_mav.core.streams import sensors_and_gusts
 from airl_mav.envs.draws import DrawnAhead
+from airl_mav.envs.faults import gusts, lasting, twin_faults
 from airl_mav.envs.fleet import Fleet, Verdict
+from airl_mav.faults.model import Fault
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.vehicle.wind import BLOCK, Wind, wind_of_episode
 
@@ -19,13 +21,15 @@ from airl_mav.vehicle.wind import BLOCK, Wind, wind_of_episode
 class Winds(DrawnAhead):
     """The wind of n episodes; from the seed of each the same history of gusts as the plant's."""
 
-    def __init__(self, n: int, settings: WindSettings) -> None:
-        """Prepare n slots."""
+    def __init__(self, n: int, settings: WindSettings, faults: Sequence[Fault] = ()) -> None:
+        """Prepare n slots; what is added by `faults` of the wind blows in all of them."""
         super().__init__(n)
-        self.calm = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
+        self._faults = twin_faults(faults, "wind")
+        still = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
+        self.calm = still and not self._faults
         """Whether no wind blows in any episode."""
         self._settings = settings
-        self._gusty = settings.gust_m_s > 0.0
+        self._gusty = settings.gust_m_s > 0.0 or bool(self._faults)
         self._winds: list[Wind | None] = [None] * n
         self._air = np.zeros((n, BLOCK if self._gusty else 1, 3))
         """As `flight.advance` takes it: the present block."""
@@ -36,7 +40,7 @@ class Winds(DrawnAhead):
         wind = Wind(wind_of_episode(self._settings, seed), rng)
         self._winds[i], self._seeds[i], self._blocks[i] = wind, seed, 0
         self._draw_block(i)
-        return wind.steady
+        return wind.steady + lasting(self._faults) if self._faults else wind.steady
 
     def fly(
         self,
@@ -68,4 +72,6 @@ class Winds(DrawnAhead):
         wind = self._winds[i]
         if wind is not None:
             self._air[i] = wind.ahead()
+            if self._faults:
+                self._air[i] += gusts(self._faults, int(self._blocks[i]) * BLOCK, BLOCK)
             self._blocks[i] += 1

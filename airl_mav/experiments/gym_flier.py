@@ -18,14 +18,16 @@ from airl_mav.envs.evaluation import (
     SinglePilots,
     fly_seeds,
 )
+from airl_mav.envs.faults import acted
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import Stop
 from airl_mav.experiments.fliers import FlyEpisodes
+from airl_mav.faults.twin import check_twin
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
@@ -112,6 +114,7 @@ def navigation_of(
         computer_w=scenario.computer.onboard_watts,
         battery_charge=asked.battery_charge,
         compensator=compensator,
+        faults=asked.faults,
     )
 
 
@@ -126,7 +129,9 @@ class GymFlier:
 
     def __post_init__(self) -> None:
         """Raise UsageError for rules that the batch twin cannot fly by."""
-        environment_of(self.scenario)
+        environment = environment_of(self.scenario)
+        pipelined = environment.decisions == "pipelined"
+        check_twin(self.scenario.scenario.faults, pipelined=pipelined)
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return how many episodes make a job; see `fliers.Flier`."""
@@ -186,6 +191,9 @@ class GymFlier:
                 self.scenario.pack_j,
                 decisions=latency,
                 hold_s=rules.hold_s,
+            ),
+            faults=tuple(
+                FaultActed(*each) for each in acted(self.scenario.scenario.faults, ended_us)
             ),
         )
         return FlownEpisode(record, trajectory, latency)

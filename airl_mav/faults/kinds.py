@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from airl_mav.core.constants import GRAVITY_M_S2
@@ -182,18 +182,25 @@ _OTHER_KINDS: dict[tuple[Part, str], Kind] = {
         "a discrete gust: up and down again as 1 - cos over its duration",
         Amount("greatest velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
         needs_duration=True,
+        levels=ANY_LEVEL,
     ),
     ("wind", "step"): Kind(
         "more wind, at once",
         Amount("velocity, north, east, down", "m/s", -50.0, 50.0, {"m/s": 1.0}, 3),
+        levels=ANY_LEVEL,
     ),
     ("camera", "off"): Kind("no frames"),
-    ("camera", "stuck"): Kind("every frame shows the same picture"),
+    ("camera", "stuck"): Kind("every frame shows the same picture", levels=ANY_LEVEL),
     ("camera", "noise"): Kind(
         "noise of the depth, growing with its square as of a stereo camera",
         Amount("sd at 10 m as a share", "", 0.0, 0.9, _SHARE),
+        levels=ANY_LEVEL,
     ),
-    ("camera", "delay"): Kind("frames come later", Amount("by how much", "s", 0.0, 60.0, _SECONDS)),
+    ("camera", "delay"): Kind(
+        "frames come later",
+        Amount("by how much", "s", 0.0, 60.0, _SECONDS),
+        levels=ANY_LEVEL,
+    ),
     ("companion", "stopped"): Kind("it stands still (SIGSTOP), and goes on at the end (SIGCONT)"),
     ("companion", "killed"): Kind("it ends at once (SIGKILL)", lasts=False),
     ("firmware", "stopped"): Kind(
@@ -207,8 +214,15 @@ KINDS: Mapping[tuple[Part, str], Kind] = {
     **{(part, kind): what for part in MOTORS for kind, what in _MOTOR_KINDS.items()},
     **_OTHER_KINDS,
     **{(part, kind): what for part in LINKS for kind, what in _LINK_KINDS.items()},
+    # The twin has setpoints, and no telemetry or commands that could be late.
+    ("uplink", "delay"): replace(_LINK_KINDS["delay"], levels=ANY_LEVEL),
 }
 """All faults, by part and kind."""
+
+
+NOISE_SEED = 1 << 32
+"""Times a fault's number from 1 this is added to the episode's seed where it makes a camera noisy:
+that noise is not the healthy camera's."""
 
 
 def kind_of(part: str, kind: str) -> Kind | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
+from airl_mav.faults.twin import TWIN, check_twin
 from airl_mav.scenario.aircraft import GREATEST_PORT, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
 
@@ -44,6 +45,8 @@ def check_level(scenario: Scenario) -> None:
 
 def check_faults(asked: Aircraft, level: LevelName) -> None:
     """Raise FieldError for a fault that the level, or the firmware, cannot have."""
+    if level == TWIN:
+        check_twin(asked.faults)
     for fault in asked.faults:
         part, levels = fault.part, fault.about.levels
         if level not in levels:

@@ -13,12 +13,10 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.noise import noisy_frame
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.faults.timeline import Acting, FaultTimeline
 from firmware_sim.plant.camera_server import DepthCamera
-
-NOISE_SEED = 1 << 32
-"""Added to a fault's number in the episode: its noise is not that of the healthy camera."""
 
 
 class FailingCamera:

@@ -1,0 +1,92 @@
+"""Faults in the batch twin: those of wind, camera and uplink, whose parts it has.
+
+Its flights begin where the policy takes over: time counts from there, the phase `offboard`. A fault
+is the same for all vehicles; what is random of it has the seed of each episode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.faults.kinds import Part
+from airl_mav.faults.model import Fault
+from airl_mav.faults.schedule import FOREVER_US, gust_share, window_us
+
+BEGINS = {"offboard": 0}
+"""Phases that have begun when a flight of the twin does [µs]."""
+
+BEFORE_US = -FOREVER_US
+"""Begin of what has acted since before the flight."""
+
+
+class TwinFault(NamedTuple):
+    """A fault with its times in a flight of the twin."""
+
+    number: int
+    """Which one of the episode it is, from 0."""
+    fault: Fault
+    from_us: int
+    """`BEFORE_US`: since before the flight."""
+    to_us: int
+
+    def at(self, time_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return whether it acts at each of these times [µs]."""
+        acts: NDArray[np.bool_] = (time_us >= self.from_us) & (time_us < self.to_us)
+        return acts
+
+
+def twin_faults(faults: Sequence[Fault], *parts: Part) -> list[TwinFault]:
+    """Return the faults of these parts, of those that the twin has, in the episode's order."""
+    found = []
+    for number, fault in enumerate(faults):
+        if fault.part not in parts:
+            continue
+        from_us, to_us = window_us(fault, BEGINS) or (0, FOREVER_US)
+        found.append(TwinFault(number, fault, BEFORE_US if fault.phase is None else from_us, to_us))
+    return found
+
+
+def gusts(faults: Sequence[TwinFault], first_tick: int, ticks: int) -> Vector:
+    """Return the wind (ticks, 3) NED [m/s] that faults add, from the tick with this number on."""
+    time_us = TICK_US * np.arange(first_tick, first_tick + ticks)
+    more = np.zeros((ticks, 3))
+    for each in faults:
+        share = each.at(time_us).astype(float)
+        if each.fault.kind == "gust":
+            whole_s = (each.to_us - each.from_us) / US_PER_S
+            elapsed_s = (time_us - each.from_us) / US_PER_S
+            share *= [gust_share(elapsed, whole_s) for elapsed in elapsed_s.tolist()]
+        more += share[:, None] * np.array(each.fault.value)
+    return more
+
+
+def lasting(faults: Sequence[TwinFault]) -> Vector:
+    """Return the wind (3,) NED [m/s] of faults that has blown since before the flight."""
+    since = [each.fault.value for each in faults if each.from_us == BEFORE_US]
+    total: Vector = np.sum(np.array(since).reshape(-1, 3), axis=0)
+    return total
+
+
+def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return by how much what is sent at each of these times comes later, for faults `delay`."""
+    more = np.zeros_like(time_us)
+    for each in faults:
+        more += np.where(each.at(time_us), round(each.fault.amount * US_PER_S), 0)
+    return more
+
+
+def acted(faults: Sequence[Fault], ended_us: int) -> list[tuple[str, int, int]]:
+    """Return what has acted in a flight that ended at a time [µs]: in words, from when to when."""
+    told = []
+    for fault in faults:
+        (each,) = twin_faults([fault], fault.part)
+        from_us = max(each.from_us, 0)
+        if from_us <= ended_us:
+            told.append((str(fault), from_us, min(each.to_us, ended_us)))
+    return sorted(told, key=lambda span: span[1])
