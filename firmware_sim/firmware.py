@@ -197,6 +197,10 @@ class Firmware:
         """Called after every tick, if set."""
         self.on_message: Callable[[Message], None] | None = None
         """Called with every text of the autopilot for its operator, if set."""
+        self.on_log_lost: Callable[[str], None] | None = None
+        """Called when a log of the flight cannot be written any more, if set: which, and why."""
+        self.logs_lost: list[str] = []
+        """What was said so of the present episode."""
         self._camera = camera
         self._pacing = pacing
         self._recording = recording
@@ -236,6 +240,7 @@ class Firmware:
             FirmwareLostError: External firmware died while it booted.
         """
         self.discard()
+        self.logs_lost.clear()
         autopilot = self.flight_stack.boot(setup)
         autopilot.on_message = self._hear
         start_us = (self.clock.time_us() // TICK_US + 1) * TICK_US
@@ -262,7 +267,7 @@ class Firmware:
             start_us = simulation.start_us
         self._sockets = self.flight_stack.filenos()
         if tlog is not None:
-            self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us)
+            self._tlog = TlogWriter(tlog, start_unix_us - simulation.time_us, self._lose_log)
             self.flight_stack.log_to(self._tlog)
             self._open_flight_log(tlog.with_suffix(ULOG_SUFFIX), start_unix_us)
         if self.epoch_ns is not None:
@@ -281,10 +286,16 @@ class Firmware:
         if simulation is not None and internals is not None:
             now_us = simulation.time_us
             self._flight_log = log = FlightLog(
-                path, internals.parameters, now_us, start_unix_us - now_us
+                path, internals.parameters, now_us, start_unix_us - now_us, self._lose_log
             )
             self._stop_listening = internals.parameters.on_change(log.parameters_changed)
             internals.logs = self._log_folder = LogFolder(path.parent, log)
+
+    def _lose_log(self, what: str) -> None:
+        """A log cannot be written any more: the flight goes on without it."""
+        self.logs_lost.append(what)
+        if self.on_log_lost is not None:
+            self.on_log_lost(what)
 
     def _hear(self, message: Message) -> None:
         if self._flight_log is not None and self.simulation is not None:
@@ -334,9 +345,10 @@ class Firmware:
         if self.simulation is not None:
             strangers = np.array(self.flight_stack.strangers(), np.str_)
             save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})
-            self._close_logs()
+            self.close_logs()
 
-    def _close_logs(self) -> None:
+    def close_logs(self) -> None:
+        """Complete the logs of the episode; harmless when called again."""
         if self._flight_log is not None:
             self._stop_listening()
             self._flight_log.close()
@@ -348,7 +360,7 @@ class Firmware:
 
     def discard(self) -> None:
         """Forget the episode."""
-        self._close_logs()
+        self.close_logs()
         if self._log_folder is not None:
             self._log_folder.close()
             self._log_folder = None

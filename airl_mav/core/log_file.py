@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
@@ -18,11 +20,25 @@ class LogFile:
 
     A killed process leaves a valid log under the temporary name that lacks its last second at
     most. Nothing is kept in memory for longer.
+
+    A log that cannot be written any more, on a full disk, ends with its last whole record: whoever
+    logs goes on without it.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open the file, whose final name is `path`."""
+    def __init__(self, path: Path, on_lost: Callable[[str], None] = lambda _: None) -> None:
+        """Open the file.
+
+        Args:
+            path: Its final name.
+            on_lost: Called once when it cannot be written any more: which file, and why.
+
+        Raises:
+            OSError: It cannot be opened.
+        """
         self.path = path
+        self.on_lost = on_lost
+        self.lost = False
+        """Whether it ended early."""
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
         self._written = 0
@@ -46,6 +62,8 @@ class LogFile:
 
     def add(self, time_us: int, *parts: bytes) -> None:
         """Add one record, in parts, at simulated `time_us` [µs]."""
+        if self.lost:
+            return
         for part in parts:
             self._buffer += part
         if self._flushed_us is None:
@@ -56,17 +74,39 @@ class LogFile:
 
     def flush(self) -> None:
         """Write out what is buffered."""
+        whole = self._written
         view = memoryview(bytes(self._buffer))
-        while view:
-            count = self._file.write(view)
-            self._written += count
-            view = view[count:]
         self._buffer.clear()
+        try:
+            while view:
+                count = self._file.write(view)
+                self._written += count
+                view = view[count:]
+        except OSError as error:
+            self._end(error, whole)
 
     def close(self) -> None:
-        """Complete the log and give it its final name; harmless when called again."""
+        """Complete the log and give it its final name; harmless when called again.
+
+        Of one that never had a record nothing is left.
+        """
         if self._file.closed:
             return
         self.flush()
-        self._file.close()
-        self.partial_path.replace(self.path)
+        try:
+            self._file.close()
+            if self.lost and not self._written:
+                self.partial_path.unlink()
+            else:
+                self.partial_path.replace(self.path)
+        except OSError as error:
+            self._end(error, self._written)
+
+    def _end(self, error: OSError, whole: int) -> None:
+        """Write nothing any more, and leave the whole records, of so many bytes."""
+        with suppress(OSError, ValueError):  # not a file that could be cut, or closed by now
+            self._file.truncate(whole)
+        self._written = whole
+        if not self.lost:
+            self.lost = True
+            self.on_lost(f"{self.path}: {error.strerror}; the log ends after {whole} bytes")

@@ -218,6 +218,7 @@ class _Flight:
         self._observer.text(Text(time_us=now_us, severity=severity, text=message.text))
 
     def _flown(self, simulation: Simulation) -> FlownEpisode:
+        self._stage.firmware.close_logs()
         # Nothing broke: where no mission was flown, a fault has kept the companion from beginning.
         result = self._result or MissionResult(self._stage.unheard, (), DecisionLog())
         referee = self._supervisor.referee
@@ -244,7 +245,7 @@ class _Flight:
             wall_s=None,
             slipped_us=0,
             battery_remaining=battery,
-            notes=(*self._notes, *result.notes),
+            notes=(*self._notes, *result.notes, *self._stage.firmware.logs_lost),
             faults=faults_of(arrays),
             sha256=self._fingerprint(),
         )

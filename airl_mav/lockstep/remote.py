@@ -170,6 +170,7 @@ def fly_vehicle_in_lockstep(
         stage = RemoteStage(asked, endpoint, camera, broken_off=stop.is_set, say=listener.say)
         with closing(stage):
             stage.firmware.on_message = listener.text
+            stage.firmware.on_log_lost = listener.say
             start_us = stage.load(episode, asked.tlog).time_us
             listener.ready(camera.endpoint, goal)
             end_us = None

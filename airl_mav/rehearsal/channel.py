@@ -146,6 +146,14 @@ class Text(_Line):
     text: str
 
 
+class LogLost(_Line):
+    """A log of the flight cannot be written any more; the flight goes on."""
+
+    type: Literal["log_lost"] = "log_lost"
+    what: str
+    """Which file, and why."""
+
+
 class Due(_Line):
     """A fault of a process begins or ends now: the rehearsal carries it out.
 
@@ -204,7 +212,7 @@ Request = Annotated[
     Begin | LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
-    Ready | Loaded | State | Text | Due | Saved | Progress | Ended | Failed,
+    Ready | Loaded | State | Text | LogLost | Due | Saved | Progress | Ended | Failed,
     Field(discriminator="type"),
 ]
 _REQUESTS: TypeAdapter[Any] = TypeAdapter(Request)

@@ -28,6 +28,7 @@ from airl_mav.rehearsal.channel import (
     FinishEpisode,
     Loaded,
     LoadEpisode,
+    LogLost,
     Ready,
     Saved,
     Shutdown,
@@ -144,6 +145,7 @@ class Service:
         self._channel = channel
         self._scenario = scenario
         firmware.on_tick, firmware.on_message = self._report, self._tell
+        firmware.on_log_lost = lambda what: channel.send(LogLost(what=what))
         self._record = Path()
         self._reported = 0
         self._crash = CrashDetector()

@@ -23,6 +23,7 @@ from airl_mav.rehearsal.channel import (
     Fly,
     Loaded,
     LoadEpisode,
+    LogLost,
     Progress,
     Saved,
     State,
@@ -167,10 +168,13 @@ class Rehearsal:
                 record=str(record_path.absolute()),
             ),
         )
-        loaded = pair.wait_for(Loaded, self._look, load_timeout_s(scenario.scenario))
+        known = list(notes)
+        loaded = pair.wait_for(
+            Loaded, lambda event: self._look(event, known), load_timeout_s(scenario.scenario)
+        )
         supervisor = Supervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
         faults = ProcessFaults(pair, self._speed)
-        episode = Episode(index, seed, loaded, supervisor, WallClock(), faults, list(notes))
+        episode = Episode(index, seed, loaded, supervisor, WallClock(), faults, known)
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
             COMPANION,
@@ -202,7 +206,7 @@ class Rehearsal:
             raise LostError(f"{SEPARATED_BY} ({reason})")
         if pair.lives(FIRMWARE):
             pair.send(FIRMWARE, FinishEpisode())
-            pair.wait_for(Saved, self._look)
+            pair.wait_for(Saved, lambda event: self._look(event, episode.notes))
         flown = join_episode(episode, scenario, record_path, decisions_path)
         if not (pair.lives(FIRMWARE) and pair.lives(COMPANION)):
             self._dismiss()
@@ -235,6 +239,8 @@ class Rehearsal:
         referee = episode.referee
         if isinstance(event, State):
             self._see(pair, episode, event)
+        elif isinstance(event, LogLost):
+            episode.notes.append(event.what)
         elif isinstance(event, Due):
             self._carry_out(episode, event)
         elif isinstance(event, Progress):
@@ -320,10 +326,12 @@ class Rehearsal:
             said.append(error.what)
         return said
 
-    def _look(self, event: Event) -> None:
-        """Take an event that nobody waits for."""
+    def _look(self, event: Event, notes: list[str]) -> None:
+        """Take an event that nobody waits for; what is to be recorded of it is added to `notes`."""
         if isinstance(event, Text):
             self._observer.text(event)
+        elif isinstance(event, LogLost):
+            notes.append(event.what)
 
 
 def _said(text: Text) -> str:

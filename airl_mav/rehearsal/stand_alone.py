@@ -78,6 +78,7 @@ def fly_vehicle(
     )
     with closing(firmware):
         firmware.on_message = listener.text
+        firmware.on_log_lost = listener.say
         episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle)
         if (hint := how_to_start(asked, vehicle)) is not None:

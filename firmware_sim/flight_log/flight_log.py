@@ -30,7 +30,12 @@ class FlightLog:
     """Writes what a vehicle does to a .ulg, tick after tick."""
 
     def __init__(
-        self, path: Path, parameters: ParameterStore, start_us: int, boot_unix_us: int
+        self,
+        path: Path,
+        parameters: ParameterStore,
+        start_us: int,
+        boot_unix_us: int,
+        on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Open the log; see `UlogWriter`.
 
@@ -39,6 +44,7 @@ class FlightLog:
             parameters: Of the vehicle, as they are when the log begins.
             start_us: Simulated time now [µs].
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970].
+            on_lost: Called once when it cannot be written any more; see `LogFile`.
         """
         self._boot_unix_us = boot_unix_us
         self.began_unix_us = boot_unix_us + start_us
@@ -55,6 +61,7 @@ class FlightLog:
             (SENSOR_COMBINED, *(logged.topic for logged in TOPICS)),
             _info(),
             self._known.items(),
+            on_lost,
         )
 
     @property
@@ -97,6 +104,8 @@ class FlightLog:
 
     def after_tick(self, sample: SensorSample, state: Callable[[], AutopilotState]) -> None:
         """Log what is due; the sample is that which the tick took."""
+        if self._writer.lost:
+            return
         now_us, truth = sample.time_us, self._truth
         self._writer.sample(_SAMPLES, now_us, sensor_combined(sample))
         if truth is not None:

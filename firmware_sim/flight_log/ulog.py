@@ -7,7 +7,7 @@ message is the length of its content, its type, and its content.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -72,6 +72,7 @@ class UlogWriter(LogFile):
         topics: Iterable[Topic],
         info: Iterable[tuple[str, str | int]],
         parameters: Iterable[tuple[str, int | float]],
+        on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Open the file, whose final name is `path`, and write its head.
 
@@ -81,8 +82,9 @@ class UlogWriter(LogFile):
             topics: What can be written by `sample`, by their place in this order.
             info: Facts of the vehicle by ULog's keys; a number is written as uint32_t.
             parameters: Every parameter's name and value; an int is written as int32_t.
+            on_lost: See `LogFile`.
         """
-        super().__init__(path)
+        super().__init__(path, on_lost)
         topics = tuple(topics)
         self._samples = [topic.sample for topic in topics]
         self._now_us = start_us

@@ -6,6 +6,7 @@ A record is an 8-byte big-endian time [µs since 1970, UTC] and one frame.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 from airl_mav.core.log_file import LogFile
@@ -18,12 +19,14 @@ _LINK_BITS = 0b11
 class TlogWriter(LogFile):
     """Writes a log of MAVLink frames."""
 
-    def __init__(self, path: Path, start_unix_us: int) -> None:
-        """Open the file, whose final name is `path`.
+    def __init__(
+        self, path: Path, start_unix_us: int, on_lost: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Open the file, whose final name is `path`; see `LogFile`.
 
         `start_unix_us` is the calendar time of simulated time 0 [µs since 1970, UTC].
         """
-        super().__init__(path)
+        super().__init__(path, on_lost)
         self._start_unix_us = start_unix_us
 
     def beside(self, name: str) -> TlogWriter:
@@ -32,7 +35,7 @@ class TlogWriter(LogFile):
         Raises OSError.
         """
         path = self.path.with_name(f"{self.path.stem}.{name}{self.path.suffix}")
-        return TlogWriter(path, self._start_unix_us)
+        return TlogWriter(path, self._start_unix_us, self.on_lost)
 
     def write(self, time_us: int, *frames: bytes) -> None:
         """Add frames, sent or received at simulated `time_us` [µs]."""

@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
+from pyulog import ULog
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
@@ -39,10 +41,12 @@ from companion.mission import fly_mission
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit
+from tests.support.full_disk import largest_file
 from tests.support.lockstep_kit import BEGINS, SEED, demo_scenario
 
 LONG_MS = 200.0
 RERUNS, STOPPED = 2, 2
+LOGS = "flight.tlog", "flight.ulg"
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +86,23 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
     assert set(record.sha256) == {"flight", *LANES}
     assert len(set(record.sha256.values())) == len(LANES) + 1
     assert np.all(reference.latency["accepted_us"] > 0), "every decision reached the autopilot"
+
+
+def test_a_flight_on_a_full_disk_goes_on_without_its_logs(
+    scenario: ResolvedScenario, reference: FlownEpisode, tmp_path: Path
+) -> None:
+    """The very same flight; what was logged before can be read."""
+    tlog = tmp_path / "flight.tlog"
+    with largest_file(65_536):
+        episode = fly(scenario, scenario.fresh_policy(SEED), 0, SEED, tlog=tlog)
+    assert episode.record.sha256 == reference.record.sha256
+    lost = [note.partition(";")[0] for note in episode.record.notes]
+    assert sorted(lost) == [f"{tmp_path / name}: File too large" for name in LOGS]
+    frames = mavutil.mavlogfile(str(tlog))
+    while (message := frames.recv_match()) is not None:
+        assert message.get_type() != "BAD_DATA"
+    frames.close()
+    assert ULog(str(tmp_path / "flight.ulg")).data_list
 
 
 def test_reruns_under_load_are_the_same(

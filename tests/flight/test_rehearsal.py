@@ -31,6 +31,7 @@ from airl_mav.rehearsal.channel import (
     Fly,
     Loaded,
     LoadEpisode,
+    LogLost,
     Progress,
     Ready,
     Saved,
@@ -607,6 +608,12 @@ def test_processes_that_lost_each_other_fly_again(play: Callable[..., Run], reas
     assert record.outcome == "success"
     assert record.notes == (f"flown again: firmware and companion lost each other ({reason})",)
     assert len(run.stage.all) == 4
+
+
+def test_a_log_on_a_full_disk_is_a_note(play: Callable[..., Run]) -> None:
+    what = "run/flight-000.tlog: No space left on device; the log ends after 9 bytes"
+    (record,) = play([*FLOWN[:-1], (FIRMWARE, LogLost(what=what)), ended()]).fly()
+    assert (record.outcome, record.notes) == ("success", (what,))
 
 
 # --- faults of the processes, as asked for
