@@ -24,6 +24,7 @@ class TrainOptions(TrainRequest):
     Examples:
         airl train static-obstacles --out runs/mine
         airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
+        airl train my.toml --initial runs/mine --out runs/finer
     """
 
     config: Annotated[str, POSITIONAL] = Field(

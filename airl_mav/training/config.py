@@ -226,6 +226,11 @@ class TrainingConfig(ProfileModel):
         "decisions of all vehicles together", "1", ge=1, le=10**10, default=100_000
     )
     vehicles: int = quantity("flights at a time", "1", ge=1, le=100_000, default=32)
+    initial: str | None = Field(
+        default=None,
+        description="folder of a training run whose best weights this one begins with; left out:"
+        " with fresh ones",
+    )
     checkpoint_every: int = quantity(
         "steps between checkpoints", "1", ge=1, le=10**9, default=20_000
     )
@@ -255,6 +260,7 @@ def configured(
     workload: str | None = None,
     latency: tuple[str, ...] = (),
     sensing_distance_m: float | None = None,
+    initial: str | None = None,
 ) -> TrainingConfig:
     """Return a configuration with some of its values changed.
 
@@ -266,6 +272,7 @@ def configured(
         workload: Whose t2 is drawn in every decision.
         latency: Sources of t2 in place of computer and workload.
         sensing_distance_m: Bounds the speed by the safe velocity [m].
+        initial: Folder of the training run whose best weights are begun with.
 
     Raises:
         UsageError: A value is out of range, or lacks the other that it needs.
@@ -278,7 +285,8 @@ def configured(
     if computer is not None and latency:
         raise FieldError("latency", latency, "without computer")
     values: dict[str, Any] = config.model_dump(exclude_unset=True)
-    values |= {k: v for k, v in {"seed": seed, "steps": steps}.items() if v is not None}
+    given = {"seed": seed, "steps": steps, "initial": initial}
+    values |= {k: v for k, v in given.items() if v is not None}
     environment = values.setdefault("environment", {})
     if computer is not None or latency:
         kept = environment.get("delay", {})

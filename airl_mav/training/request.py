@@ -51,6 +51,11 @@ class TrainRequest(BaseModel):
         default=None,
         description="decisions of all vehicles together; by default the configuration's",
     )
+    initial: str | None = Field(
+        default=None,
+        description="begin with the best weights of the training run in this folder; by default"
+        " the configuration's, or with fresh ones",
+    )
     name: str | None = Field(
         default=None, description="name of the policy on its card; by default the configuration's"
     )

@@ -33,6 +33,7 @@ from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig, check_actions, kind_of
 from airl_mav.training.export import export_sb3
+from airl_mav.training.initial import begin_with
 from airl_mav.training.recurrent import GreedyDecisions
 from airl_mav.training.store import BEST_MODEL, Evaluation, TrainingFolder, TrainingProgress
 
@@ -107,7 +108,8 @@ def fit(
         The evaluation of the best weights, which lie in `folder.best_model`.
 
     Raises:
-        UsageError: The algorithm does not fit the environment, an arena cannot be made.
+        UsageError: The algorithm does not fit the environment, an arena cannot be made, there are
+            no such weights to begin with.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment))
@@ -119,6 +121,8 @@ def fit(
     if meta is not None:
         callback.restore(meta)
         folder.forget_after(model.num_timesteps)
+    elif config.initial is not None:
+        begin_with(model, Path(config.initial))
     left = config.steps - model.num_timesteps
     if left > 0 and not callback.done:
         model.learn(
