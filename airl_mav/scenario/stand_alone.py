@@ -204,6 +204,8 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
     check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
     level: LevelName = "lockstep" if asked.lockstep else "sitl"
+    if asked.signing_key is not None and (asked.lockstep or asked.firmware != "builtin"):
+        raise FieldError("signing_key", asked.signing_key, "without lockstep, firmware builtin")
     check_firmware(asked, "sitl", speed)
     if asked.lockstep and asked.firmware != "builtin":
         raise FieldError(

@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.signing import (
     EPOCH_UNIX_US,
     LATE,
@@ -21,6 +21,14 @@ from airl_mav.core.signing import (
     frames_of,
 )
 from airl_mav.core.signing_key import SAVE_EVERY_US, StoredSigning, read_key, write_key
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.stand_alone import (
+    StandAloneCompanion,
+    StandAloneVehicle,
+    check_companion,
+    check_vehicle,
+)
 
 KEY = bytes(range(32))
 OTHER = bytes(range(1, 33))
@@ -212,3 +220,35 @@ def test_key_and_newest_time_stamp_outlive_the_program(tmp_path: Path) -> None:
     assert StoredSigning(path).signing.timestamp == 7
     stored.signing.change(None)
     assert not path.exists()
+
+
+# --- where nobody would sign
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"level": "gym"},
+        {"level": "lockstep"},
+        {"firmware": "px4", "real": {"px4_connect": True}},
+        {"level": "lockstep", "firmware": "px4", "real": {"px4_connect": True}},
+        {"firmware": "ardupilot", "real": {"ardupilot_connect": True}},
+    ],
+)
+def test_a_rehearsal_in_which_nobody_signs_refuses_the_key(asked: dict[str, Any]) -> None:
+    with pytest.raises(FieldError, match="accepted: at level sitl, with firmware builtin"):
+        resolve(Scenario.model_validate({"signing_key": Path("key"), **asked}))
+
+
+@pytest.mark.parametrize(
+    "asked", [{"lockstep": True}, {"firmware": "px4", "real": {"px4_connect": True}}]
+)
+def test_a_vehicle_that_does_not_sign_refuses_the_key(asked: dict[str, Any]) -> None:
+    with pytest.raises(FieldError, match=r"signing_key .*without lockstep, firmware builtin"):
+        check_vehicle(StandAloneVehicle.model_validate({"signing_key": Path("key"), **asked}))
+
+
+def test_a_companion_in_lockstep_refuses_the_key() -> None:
+    asked = StandAloneCompanion.model_validate({"signing_key": Path("key"), "lockstep": True})
+    with pytest.raises(FieldError, match=r"signing_key .*without lockstep"):
+        check_companion(asked)
