@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, get_args
 
@@ -112,14 +113,19 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
         )
         bar.close()
     replace_file(out / "faults.md", markdown(cells).encode())
+    print_table(table_of(faults, phases, cells), console, wrap=True)
+    console.print(f"{out}", soft_wrap=True)
+    return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
+
+
+def table_of(faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[Cell]) -> TableView:
+    """Return the matrix as a table, a fault a row, for a terminal of any width."""
     rows = tuple(
         (fault, *(cell_text(cell) for cell in cells if cell.fault == fault)) for fault in faults
     )
     columns = (Column("fault", number=False), *(Column(p, number=False) for p in phases))
     note = "!: a flight ended otherwise than documented. In brackets: fastest touch-down."
-    print_table(TableView("fault-matrix", "Faults", columns, rows, (note,)), console)
-    console.print(f"{out}", soft_wrap=True)
-    return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
+    return TableView("fault-matrix", "Faults", columns, rows, (note,))
 
 
 def _phase(name: str) -> Phase:

@@ -134,7 +134,9 @@ def rich_table(view: TableView, *, wrap: bool = False) -> Table:
         column = view.columns[i]
         title = f"{column.title} [{column.unit}]" if column.unit else column.title
         side: Literal["left", "right"] = "right" if column.number else "left"
-        table.add_column(Text(title), justify=side, no_wrap=not wrap)
+        # A word that is longer than its column is broken, too: nothing is left out.
+        overflow: Literal["fold", "ellipsis"] = "fold" if wrap else "ellipsis"
+        table.add_column(Text(title), justify=side, no_wrap=not wrap, overflow=overflow)
     for row in view.rows:
         cells = [row[i] for i in shown]
         if view.in_terminal == "stacked":

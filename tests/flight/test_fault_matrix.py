@@ -17,6 +17,7 @@ from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES, End
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.report.table import print_table
 from tests.support.flight_rig import quad
 
 
@@ -67,6 +68,22 @@ def test_the_estimator_copes_with_sensors_that_fail(fault: str, phase: Phase, en
 
 def flight(end: End, touchdown_m_s: float | None = None) -> FaultFlight:
     return FaultFlight("baro off", "hold", 1, end, touchdown_m_s, 5.0, "LAND", ())
+
+
+def test_six_phases_are_whole_in_a_terminal_of_eighty_columns() -> None:
+    cases = ["wind gust 6,0,0m/s for 4s", "accel bias 0.5,0.5,0.5m/s2", "motor1 off"]
+    ends = (*[flight("landed", 0.7)] * 19, flight("crashed"))
+    cells = [Cell(fault, phase, ends) for fault in cases for phase in MATRIX_PHASES]
+    console = Console(record=True, width=80)
+    print_table(faults.table_of(cases, MATRIX_PHASES, cells), console, wrap=True)
+    text = console.export_text()
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= 80
+    words = text.split()
+    for word in ("gust", *MATRIX_PHASES):
+        assert word in words
+    assert words.count("crashed") == len(cells)
+    assert text.count("m/s)") == len(cells)
 
 
 def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
