@@ -54,7 +54,7 @@ class ZmqFrameSource:
         of its own. Raises FieldError for an unusable endpoint.
         """
         self.malformed = 0
-        """Messages that were no frames."""
+        """Messages that were no frames, or frames of another size than the first one's."""
         self._clock = clock
         self._newest: ReceivedFrame | None = None
         self._owns_context = context is None
@@ -73,14 +73,25 @@ class ZmqFrameSource:
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame so far, without waiting; None before the first."""
         while self._socket.poll(0):
+            # Parts of a message are messages: nobody who speaks this format sends any.
             data = self._socket.recv()
             try:
-                frame = Frame.from_bytes(data)
+                frame = self._known(Frame.from_bytes(data))
             except FrameError:
                 self.malformed += 1
             else:
                 self._newest = ReceivedFrame(frame, self._clock.time_us())
         return self._newest
+
+    def _known(self, frame: Frame) -> Frame:
+        """Return a frame of this camera.
+
+        Whoever flies by its images keeps some of them: they have one size for a whole flight.
+        Raises FrameError for one of another size than the first.
+        """
+        if self._newest is not None and frame.intrinsics != self._newest.frame.intrinsics:
+            raise FrameError("another camera's frame")
+        return frame
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
         """Wait for a frame that is not the one already seen; see `FrameSource`.

@@ -19,6 +19,9 @@ _HEADER = struct.Struct("<4sQqHHddd")
 MM_PER_M = 1000.0
 MAX_MM = 65_535
 
+LEAST_PX, MOST_PX = 1e-3, 1e6
+"""Bounds of a focal length, and of how far the optical axis is from the image's corner [px]."""
+
 
 class FrameError(ValueError):
     """Bytes that are no frame of this version."""
@@ -49,7 +52,11 @@ class Frame:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Frame:
-        """Read the wire form. Raises FrameError for anything else."""
+        """Read the wire form.
+
+        Raises FrameError for anything else, also for what no camera takes: an image without pixels,
+        a focal length or a centre out of bounds, or not a number.
+        """
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
         magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
@@ -57,6 +64,11 @@ class Frame:
             raise FrameError(f"magic {magic!r}, expected {MAGIC!r}")
         if len(data) != _HEADER.size + 2 * width * height:
             raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels")
+        if not (width and height):
+            raise FrameError(f"{width}x{height} pixels are no image")
+        # Written so that NaN fails.
+        if not (LEAST_PX <= focal <= MOST_PX and abs(cx) <= MOST_PX and abs(cy) <= MOST_PX):
+            raise FrameError(f"focal {focal}, centre {cx}, {cy}: no pinhole camera")
         pixels = np.frombuffer(data, "<u2", offset=_HEADER.size).reshape(height, width)
         return cls(sequence, time_us, pixels, Intrinsics(width, height, focal, cx, cy))
 

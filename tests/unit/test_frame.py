@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 import numpy as np
@@ -10,16 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from airl_mav.camera.frame import MAX_MM, Frame, FrameError, depth_to_z16
+from airl_mav.camera.frame import LEAST_PX, MAX_MM, MOST_PX, Frame, FrameError, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 
-lengths = st.floats(allow_nan=False)
+lengths = st.floats(-MOST_PX, MOST_PX)
+focals = st.floats(LEAST_PX, MOST_PX)
 
 
 @st.composite
 def frames(draw: st.DrawFn) -> Frame:
-    width, height = draw(st.integers(0, 12)), draw(st.integers(0, 12))
-    k = Intrinsics(width, height, draw(lengths), draw(lengths), draw(lengths))
+    width, height = draw(st.integers(1, 12)), draw(st.integers(1, 12))
+    k = Intrinsics(width, height, draw(focals), draw(lengths), draw(lengths))
     depth = draw(arrays(np.uint16, (height, width)))
     sequence = draw(st.integers(0, 2**64 - 1))
     return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), depth, k)
@@ -70,6 +72,25 @@ def test_a_size_that_the_pixels_do_not_fill_is_refused() -> None:
     struct.pack_into("<HH", wire, 20, 65535, 65535)
     with pytest.raises(FrameError, match="65535x65535"):
         Frame.from_bytes(bytes(wire))
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [
+        (Intrinsics(0, 2, 1.0, 1.0, 1.0), "0x2 pixels"),
+        (Intrinsics(3, 0, 1.0, 1.0, 1.0), "3x0 pixels"),
+        (Intrinsics(1, 1, 0.0, 1.0, 1.0), "focal 0"),
+        (Intrinsics(1, 1, -2.0, 1.0, 1.0), "focal -2"),
+        (Intrinsics(1, 1, math.nan, 1.0, 1.0), "focal nan"),
+        (Intrinsics(1, 1, math.inf, 1.0, 1.0), "focal inf"),
+        (Intrinsics(1, 1, 1.0, math.nan, 1.0), "centre nan"),
+        (Intrinsics(1, 1, 1.0, 1.0, -math.inf), "centre 1.0, -inf"),
+    ],
+)
+def test_what_no_camera_takes_is_refused(lens: Intrinsics, said: str) -> None:
+    pixels = np.zeros((lens.height, lens.width), np.uint16)
+    with pytest.raises(FrameError, match=said):
+        Frame.from_bytes(Frame(0, 0, pixels, lens).to_bytes())
 
 
 def test_z16_rounds_clips_and_keeps_no_return() -> None:

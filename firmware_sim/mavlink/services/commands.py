@@ -9,6 +9,7 @@ with commands has a table `ACTIONS` of its own, which is taken into the one here
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
@@ -36,6 +37,9 @@ from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
+
+# Names made anew for each message would stay in the interpreter's cache of attributes.
+_PARAMS = attrgetter(*(f"param{number}" for number in range(1, 8)))
 
 _RELATIVE_FRAMES = (
     dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
@@ -103,8 +107,7 @@ ACTIONS: dict[int, Action] = {
 
 def handle_command_long(message: WireMessage, context: Context) -> bool:
     """Carry out and acknowledge a COMMAND_LONG."""
-    params = tuple(getattr(message, f"param{number}") for number in range(1, 8))
-    return _handle(Command(message.command, params, sender(message)), context)
+    return _handle(Command(message.command, _PARAMS(message), sender(message)), context)
 
 
 def handle_command_int(message: WireMessage, context: Context) -> bool:
