@@ -315,6 +315,19 @@ class BuiltinAutopilot:
         self._snapshot = None
         return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
 
+    def set_origin(self, place: Geodetic) -> Result:
+        """Let local NED be zero at another place; refused while armed.
+
+        PX4 moves it in flight, too, and shifts all that it flies by.
+        """
+        if self.flight.phase >= _GROUND:
+            self.say(Message(Severity.WARNING, "Origin is not moved while armed"))
+            return Result.TEMPORARILY_REJECTED
+        self.estimator.move_origin(place)
+        self._home.find()
+        self._snapshot = None
+        return Result.ACCEPTED
+
     def look_at(self, place: Geodetic | None) -> None:
         """Turn to a place while a mission is flown; None = to none."""
         roi = self._navigator.mission.roi

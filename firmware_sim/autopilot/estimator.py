@@ -14,7 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, quat_from_euler
+from airl_mav.core.frames import (
+    Geodetic,
+    Vector,
+    geodetic_to_local,
+    local_to_geodetic,
+    quat_from_euler,
+)
 from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
@@ -128,6 +134,8 @@ class Estimator:
         self._seen: set[str] = set()
         """Which of the slower sensors have measured since alignment began."""
         self._origin_altitude_baro = 0.0
+        self._chosen_origin: Geodetic | None = None
+        """Where local NED shall be zero, chosen before alignment; None = where the vehicle is."""
         self._time_us = 0
         self._aligned_us: int | None = None
         self._estimate: Estimate | None = None
@@ -175,6 +183,19 @@ class Estimator:
                 healthy=self.healthy,
             )
         return self._estimate
+
+    def move_origin(self, origin: Geodetic) -> None:
+        """Let local NED be zero at another place of the globe; the vehicle stays where it is.
+
+        Source: PX4 1.16, Ekf::setEkfGlobalOrigin.
+        """
+        before, self._chosen_origin = self.origin, origin
+        if before is None:
+            return
+        here = local_to_geodetic(self.state[es.P : es.V], before)
+        self.state[es.P : es.V] = geodetic_to_local(here, origin)
+        self._origin_altitude_baro += origin.altitude_m - before.altitude_m
+        self.origin, self._estimate = origin, None
 
     # --- what is known (PX4: EKF2's dead reckoning)
 
@@ -236,7 +257,10 @@ class Estimator:
         baro = [altitude_m(s.pressure_hpa) for s in self._resting if s.pressure_hpa is not None]
         self._origin_altitude_baro = float(np.mean(baro))
         fixes = [s.gps.position for s in self._resting if s.gps is not None]
-        self.origin = Geodetic(*(float(c) for c in np.mean(fixes, axis=0)))
+        here = Geodetic(*(float(c) for c in np.mean(fixes, axis=0)))
+        self.origin = here
+        if self._chosen_origin is not None:
+            self.move_origin(self._chosen_origin)
         self._aligned_us = sample.time_us
         self._resting.clear()
 

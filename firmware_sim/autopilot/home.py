@@ -60,11 +60,17 @@ class Home:
 
     def set_to(self, place: Geodetic) -> bool:
         """Set it to a chosen place; return False without a fix."""
-        origin = self._estimator.origin
-        if origin is None:
+        if self._estimator.origin is None:
             return False
         self.place, self._is_chosen = place, True
+        self.find()
+        return True
+
+    def find(self) -> None:
+        """Tell guidance where it is in local NED: it, or the origin, has moved."""
+        origin, place = self._estimator.origin, self.place
+        if origin is None or place is None:
+            return
         north, east, down = geodetic_to_local(place, origin).tolist()
         self._guidance.context.home = north, east, down
         self._guidance.context.home_amsl_m = place.altitude_m
-        return True

@@ -200,6 +200,10 @@ class AutopilotPort(Protocol):
         """Move home; None = to the present place."""
         ...
 
+    def set_origin(self, place: Geodetic) -> Result:
+        """Let local NED be zero at another place of the globe."""
+        ...
+
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
         ...

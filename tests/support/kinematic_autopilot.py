@@ -204,6 +204,10 @@ class KinematicAutopilot:
         self.home = place or local_to_geodetic(self.position, self.origin)
         return Result.ACCEPTED
 
+    def set_origin(self, place: Geodetic) -> Result:
+        self.origin = place
+        return Result.ACCEPTED
+
     def start_mission(self, index: int) -> Result:
         self.commands.append(f"mission from {index}")
         return Result.ACCEPTED if self.plans.mission else Result.DENIED
