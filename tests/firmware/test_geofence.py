@@ -7,16 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Mode
 from firmware_sim.autopilot.navigation.fence import Circle, Polygon, all_allow, areas
 from firmware_sim.autopilot.navigation.fence_monitor import PERIOD_US, FenceMonitor
+from firmware_sim.autopilot.navigation.fence_prediction import braking_distance
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.rally import destination
+from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
 
 N = NavCommand
@@ -171,6 +173,68 @@ def test_missions_are_checked_against_it() -> None:
         watch.monitor.inside(place(*p), ORIGIN) for p in ((0, 0, 10), (31, 0, 10), (0, 0, 25))
     ]
     assert allowed == [True, False, False]
+
+
+# --- GF_PREDICT
+
+
+@pytest.mark.parametrize(
+    ("speed", "limit", "most", "jerk", "expected"),
+    [
+        (0.0, 3.0, 0.0, 4.0, 0.0),
+        # Without acceleration and with hardly limited jerk: v²/2a, and a fifth of a second more.
+        (6.0, 3.0, 0.0, 1e6, 6.0 + 1.2),
+        # From 3 m/s² down to -3: the speed first rises by a²/2j, then it falls.
+        (6.0, 3.0, 3.0, 1e6, 6.0 + 1.2),
+    ],
+)
+def test_how_far_a_vehicle_flies_until_it_stands(
+    speed: float, limit: float, most: float, jerk: float, expected: float
+) -> None:
+    assert braking_distance(speed, limit, most, jerk) == pytest.approx(expected, abs=1e-3)
+
+
+@settings(max_examples=15)
+@given(speed=st.floats(0.0, 15.0), limit=st.floats(2.0, 10.0), jerk=st.floats(1.0, 40.0))
+def test_braking_against_small_steps(speed: float, limit: float, jerk: float) -> None:
+    """Bang-bang jerk, integrated: at full jerk until the limit, and back when it is time."""
+    at_m, v, a, dt = 0.0, speed, limit, 2e-3
+    while v > 0.0 or a > 0.0:
+        turn_back = v <= 0.5 * a * a / jerk and a < 0.0
+        a = min(0.0, a + jerk * dt) if turn_back else max(-limit, a - jerk * dt)
+        if a == 0.0 and turn_back:
+            break
+        v += a * dt
+        at_m += v * dt
+    wanted = at_m + 0.2 * speed
+    assert braking_distance(speed, limit, limit, jerk) == pytest.approx(wanted, rel=0.02, abs=0.1)
+
+
+@pytest.mark.parametrize(("predict", "breached"), [(0, False), (1, True)])
+def test_a_breach_begins_where_braking_would_end(predict: int, breached: bool) -> None:
+    watch = Watch(*polygon(SQUARE), GF_ACTION=1, GF_PREDICT=predict, GF_MAX_VER_DIST=20.0)
+    watch.now = watch.now._replace(velocity=(3.0, 0.0, 0.0))
+    assert watch.at(0, 0) == (False, False, False)
+    assert watch.at(15, 0) == (False, False, breached)
+    assert watch.at(-15, 0) == (False, False, False)  # it flies away from that side
+    watch.now = watch.now._replace(velocity=(0.0, 0.0, -3.0))
+    assert watch.at(0, 0, 17) == (False, breached, False)
+    watch.now = watch.now._replace(velocity=(0.0, 0.0, 3.0))
+    assert watch.at(0, 0, 17) == (False, False, False)
+
+
+@pytest.mark.parametrize("predict", [pytest.param(0, marks=pytest.mark.nightly), 1])
+def test_a_vehicle_that_looks_ahead_stays_inside(predict: int) -> None:
+    limits = {"GF_MAX_HOR_DIST": 40.0, "GF_ACTION": 2, "GF_PREDICT": predict}
+    rig = Rig(seed=2, parameters=limits)
+    rig.take_off(5.0)
+    rig.go_offboard(velocity_setpoint(6.0, 0.0, 0.0))
+    farthest_m = [0.0]
+    rig.run(
+        10.0, lambda: farthest_m.__setitem__(0, max(farthest_m[0], float(rig.truth.position[0])))
+    )
+    assert rig.mode is Mode.HOLD
+    assert (farthest_m[0] < 40.0) is bool(predict)
 
 
 # --- rally points

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import FenceStatus, Message, Mode, Severity
 from firmware_sim.autopilot.navigation.fence import Area, all_allow, allows, areas
+from firmware_sim.autopilot.navigation.fence_prediction import point_ahead
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.geography import distance_m
 from firmware_sim.autopilot.navigation.plan import Kind, Plans
@@ -58,6 +59,8 @@ class FenceMonitor:
                 self.status = self.status._replace(distance=False, altitude=False, custom=False)
             return
         where = place()
+        if self._value("GF_PREDICT") > 0.0:
+            where = point_ahead(where, now.velocity, self._value)
         far, high = self._limits(where, now.home)
         found = (far, high, not all_allow(self._areas, where))
         before = self.status

@@ -67,6 +67,8 @@ class Situation(NamedTuple):
     home: Geodetic
     origin: Geodetic
     """Where local NED is zero."""
+    velocity: Vec = (0.0, 0.0, 0.0)
+    """NED [m/s]."""
 
     def local(self, place: Geodetic) -> Vec:
         """Return a place in local NED [m]."""

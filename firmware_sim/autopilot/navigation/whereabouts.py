@@ -8,7 +8,7 @@ from airl_mav.core.frames import Geodetic, local_to_geodetic
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.home import Home
-from firmware_sim.autopilot.modes.interface import here
+from firmware_sim.autopilot.modes.interface import here, triple
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 
@@ -32,8 +32,9 @@ class Whereabouts:
         sample, home, origin = self._sensors.sample, self._home.place, self._estimator.origin
         if sample is None or home is None or origin is None:
             return None
-        place = here(self._estimator.state)
-        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin)
+        state = self._estimator.state
+        place, velocity = here(state), triple(state, V)
+        return Situation(sample.time_us, place.position, place.yaw, landed, home, origin, velocity)
 
     def fenced_place(self) -> Geodetic:
         """Return where the vehicle is, by GF_SOURCE: the estimate, or the GPS.
