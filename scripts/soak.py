@@ -223,6 +223,9 @@ def verdict(lines: list[dict[str, float | int]], allowed_mb: float) -> str | Non
 
 
 def main(asked: Soak) -> int:
+    # However it is ended, the vehicle ends with it.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     lines: list[dict[str, float | int]] = []
     client = Client(asked.instance)
     with tempfile.TemporaryDirectory() as folder, asked.out.open("w", encoding="utf-8") as out:
@@ -254,7 +257,7 @@ def main(asked: Soak) -> int:
         finally:
             program.send_signal(signal.SIGINT)
             program.wait()
-    wrong = verdict(lines, asked.allowed_mb)
+    wrong = verdict(lines, asked.allowed_mb) if lines else "nothing was flown"
     print(wrong or f"flat over {lines[-1]['simulated_h']:.1f} h")
     return 1 if wrong else 0
 
