@@ -18,6 +18,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
     "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
     "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
+    "dense-obstacles-fast": ("dense-obstacles-fast", "run"),
     "crowded": ("generalisation", "crowded-crowded"),
     "crowded-pipelined": ("crowded-pipelined", "run"),
 }
