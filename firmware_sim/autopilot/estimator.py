@@ -27,6 +27,7 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
 from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.interfaces import GpsFix, SensorSample
 
 ALIGN_S = 0.5
@@ -148,6 +149,8 @@ class Estimator:
         """Sees inertial sensors that have gone wrong."""
         self.compass = Compass()
         """Whether the compass is believed."""
+        self._field: Vector | None = None
+        """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
     def step(self, sample: SensorSample) -> None:
         """Take one tick's sensors."""
@@ -161,6 +164,7 @@ class Estimator:
             if sample.pressure_hpa is not None:
                 self._fuse_baro(sample.pressure_hpa)
             if sample.mag is not None:
+                self._field = sample.mag
                 self._fuse_heading(sample.mag)
         converged = es.converged(self.state, self.filter.covariance)
         self.healthy = converged and self.origin is not None
@@ -226,6 +230,13 @@ class Estimator:
         restarted = self.consistency.restarted_us
         return restarted is not None and now_us - restarted < PROBATION_US
 
+    @property
+    def field_disturbed(self) -> bool:
+        """Whether the compass measures something else than the earth's field, by EKF2_MAG_CHECK."""
+        if self._field is None:
+            return False
+        return FieldCheck.read(self._value).disturbed(self._field, es.attitude(self.state))
+
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
         north, east = self.state[es.SIGMA : es.SIGMA + 2].tolist()
@@ -252,6 +263,11 @@ class Estimator:
         roll, pitch = math.atan2(-ay, -az), math.atan2(ax, math.hypot(ay, az))
         field = np.mean([s.mag for s in self._resting if s.mag is not None], axis=0)
         level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
+        self._field = field
+        if FieldCheck.read(self._value).disturbed(field, level):
+            # A heading by it would be wrong, and nothing would tell before the vehicle moves.
+            self._forget()
+            return
         heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
         self.state[es.Q : es.RATES] = quat_from_euler(roll, pitch, heading)
         baro = [altitude_m(s.pressure_hpa) for s in self._resting if s.pressure_hpa is not None]

@@ -36,6 +36,7 @@ class ArmingSettings(NamedTuple):
     """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
 
     com_arm_bat_min: float = -1.0
+    com_arm_mag_str: int = 2
     com_arm_mis_req: int = 0
     com_arm_wo_gps: int = 1
     com_rc_in_mode: int = 3
@@ -68,6 +69,8 @@ class Readiness(NamedTuple):
     """The estimator knows well enough where the vehicle is and how it points."""
     compass_agrees: bool = True
     """The estimator has not given up the compass."""
+    field_disturbed: bool = False
+    """The compass measures something else than the earth's field."""
     gyro: bool = True
     """Whether its data are valid, as of all sensors here."""
     accel: bool = True
@@ -105,6 +108,10 @@ def _sensor(part: Part, name: str, fails: Callable[[Readiness], bool]) -> Check:
     return Check(part, fails, f"Preflight Fail: No valid data from {name}")
 
 
+def _field_fails(r: Readiness, as_asked: int) -> bool:
+    return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
+
+
 def _battery(level: BatteryWarning, text: str) -> Check:
     return Check(
         Part.BATTERY,
@@ -138,6 +145,8 @@ def _battery_blocks(r: Readiness) -> bool:
     return r.conditions.battery_warning >= BatteryWarning.CRITICAL
 
 
+_FIELD_REQUIRED, _FIELD_WARNED = 1, 2
+"""COM_ARM_MAG_STR: 1 refuses to arm in a disturbed magnetic field, 2 warns, 0 says nothing."""
 _GLOBAL_REQUIRED = 0
 """COM_ARM_WO_GPS: 0 refuses to arm without a global position, 1 warns, 2 says nothing."""
 _FENCE_RETURN = 3
@@ -188,6 +197,21 @@ CHECKS: tuple[Check, ...] = (
         Part.ESTIMATOR,
         lambda r: not r.compass_agrees and not r.armed,
         "Preflight Fail: heading estimate not stable",
+    ),
+    Check(
+        Part.ESTIMATOR,
+        lambda r: (
+            r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == _FIELD_REQUIRED
+        ),
+        "Preflight Fail: Strong magnetic interference",
+    ),
+    Check(
+        Part.ESTIMATOR,
+        lambda r: _field_fails(r, _FIELD_WARNED),
+        "Preflight: Strong magnetic interference",
+        # Before the estimator has a heading, that field is what it waits for the end of.
+        blocks=lambda r: not r.converged,
+        severity=Severity.WARNING,
     ),
     Check(
         Part.SYSTEM,

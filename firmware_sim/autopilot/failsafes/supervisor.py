@@ -128,6 +128,7 @@ class Supervisor:
             self._arming,
             converged=self._estimator.healthy,
             compass_agrees=not self._estimator.compass.given_up,
+            field_disturbed=flight.phase < _GROUND and self._estimator.field_disturbed,
             gyro=sensors.gyro.has_data(now_us),
             accel=sensors.accel.has_data(now_us),
             mag=sensors.mag.has_data(now_us),

@@ -1,0 +1,68 @@
+"""Whether a compass measures the earth's field: by its strength, and by how steeply it dips.
+
+Source: PX4 1.16, EKF2 `checkMagField` and its parameters; the field that is expected is that of the
+place (`core.location`), in PX4 by the World Magnetic Model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntFlag
+from typing import NamedTuple
+
+import numpy as np
+
+from airl_mav.core.frames import Vector
+from airl_mav.core.location import MAGNETIC_FIELD_NED
+from airl_mav.vehicle.rotation import Quat, rotate
+
+STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))
+INCLINATION_RAD = math.asin(MAGNETIC_FIELD_NED[2] / STRENGTH_GAUSS)
+"""Downwards positive."""
+
+_LEAST_GAUSS = 1e-4
+"""A weaker field points nowhere."""
+
+
+class Checked(IntFlag):
+    """Bits of EKF2_MAG_CHECK."""
+
+    STRENGTH = 1
+    INCLINATION = 2
+
+
+class FieldCheck(NamedTuple):
+    """What is expected of the field, and how closely."""
+
+    checked: int
+    strength_gauss: float
+    """Greatest error."""
+    inclination_rad: float
+
+    @classmethod
+    def read(cls, value: Callable[[str], float]) -> FieldCheck:
+        """Read it by a lookup of PX4 parameter names."""
+        return cls(
+            int(value("EKF2_MAG_CHECK")),
+            value("EKF2_MAG_CHK_STR"),
+            math.radians(value("EKF2_MAG_CHK_INC")),
+        )
+
+    def disturbed(self, field: Vector, attitude: Quat) -> bool:
+        """Return whether this is not the earth's field.
+
+        Args:
+            field: As measured (3,) FRD [gauss].
+            attitude: Body to world; its heading does not matter.
+        """
+        strength = float(np.linalg.norm(field))
+        if self.checked & Checked.STRENGTH and not (
+            abs(strength - STRENGTH_GAUSS) <= self.strength_gauss
+        ):
+            return True
+        if not self.checked & Checked.INCLINATION:
+            return False
+        _, _, down = rotate(attitude, (field.item(0), field.item(1), field.item(2)))
+        inclination = math.asin(max(-1.0, min(1.0, down / max(strength, _LEAST_GAUSS))))
+        return not abs(inclination - INCLINATION_RAD) <= self.inclination_rad
