@@ -108,7 +108,7 @@ class Conductor:
         del sockets
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
-        self._collect_telemetry()
+        self._keep(self._vehicle.after_tick(expected=self._asked is not None))
         if self._standing:
             self.clock.sleep_until(tick_us)
             return tick_us
@@ -149,7 +149,7 @@ class Conductor:
                 f"the flight controller did not answer command {self._asked} of the companion"
             )
         self._vehicle.settle()
-        self._collect_telemetry()
+        self._keep(self._vehicle.take())
         self._pass_telemetry()
         self._turn = self._partner.turn(now_us, handle)
         if self._turn.wake_us is None:
@@ -184,9 +184,8 @@ class Conductor:
 
     # --- telemetry
 
-    def _collect_telemetry(self) -> None:
-        """Take what the vehicle has sent in its last tick."""
-        frames = self._vehicle.take()
+    def _keep(self, frames: Sequence[bytes]) -> None:
+        """Keep what the vehicle has sent."""
         if not frames:
             return
         self._heard_us = self.clock.time_us()

@@ -12,7 +12,7 @@ from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.lockstep.digest import FlightDigest, WitnessedPolicy
+from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.link import real_vehicle
 from airl_mav.lockstep.stage import Stage
@@ -128,7 +128,8 @@ class _Flight:
         self._ticks = 0
         self._arena = resolved.arena_of(seed)
         self._goal = (float(self._arena.goal[0]), float(self._arena.goal[1]))
-        self._digest = FlightDigest()
+        self._witnessed = resolved.scenario.firmware == "builtin"
+        self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
         self._supervisor = Supervisor(Referee(resolved.task(self._goal)), 0)
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
@@ -253,6 +254,6 @@ class _Flight:
 
     def _fingerprint(self) -> dict[str, str] | None:
         """Return the fingerprint; None of real firmware, whose threads the host schedules."""
-        if self._resolved.scenario.firmware != "builtin":
+        if not self._witnessed:
             return None
         return {"flight": self._digest.hexdigest(), **self._digest.lanes()}

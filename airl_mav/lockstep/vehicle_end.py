@@ -10,8 +10,8 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 
 SETTLE_EVERY = 5
-"""Real firmware is waited for before a turn, and in between every so many ticks: 20 ms is how old
-its telemetry, and what its modules know, may get on a busy host."""
+"""Real firmware is waited for before a turn, and in between every so many ticks, and what it has
+sent is taken then: 20 ms is how old its telemetry, and what its modules know, may get."""
 
 _HEADER = 10
 _COMMANDS = {
@@ -42,6 +42,10 @@ class VehicleEnd(Protocol):
         """Return what it has sent since the last call: whole MAVLink frames, oldest first."""
         ...
 
+    def after_tick(self, *, expected: bool) -> list[bytes]:
+        """Return the same, once a tick; nobody needs it at once unless an answer is `expected`."""
+        ...
+
     def settle(self) -> None:
         """Return when it has done, and sent, all that is due by now."""
         ...
@@ -62,6 +66,11 @@ class InMemory:
         del echo
         self._endpoint.inbox.append(frame)
         carry_out()
+
+    def after_tick(self, *, expected: bool) -> list[bytes]:
+        """Return what it has sent."""
+        del expected
+        return self.take()
 
     def settle(self) -> None:
         """Return: it has no threads of its own."""
@@ -86,10 +95,16 @@ class RealFirmwareEnd:
             self._link.await_echo()
 
     def take(self) -> list[bytes]:
-        """Return what has come; the firmware is waited for now and then."""
+        """Return what has come."""
+        return self._link.take()
+
+    def after_tick(self, *, expected: bool) -> list[bytes]:
+        """Return what has come, now and then; the firmware is waited for then."""
         self._ticks += 1
         if self._ticks % SETTLE_EVERY == 0:
             self._settle()
+        elif not expected:
+            return []
         return self._link.take()
 
     def settle(self) -> None:

@@ -71,7 +71,7 @@ class ExternalFlightController:
         controls = self._bridge.step(sample)
         m = controls.motors
         a, b, c, d = self._output
-        return controls._replace(motors=(m[a], m[b], m[c], m[d]))
+        return ActuatorControls(controls.time_us, (m[a], m[b], m[c], m[d]), armed=controls.armed)
 
     def close(self) -> None:
         """End it if it was started here; otherwise tell it to reboot or shut down."""
@@ -102,6 +102,7 @@ class ExternalFlightStack:
         timeout_s: float,
         *,
         on_close: Callable[[], None] = lambda: None,
+        look_every_us: int = 0,
     ) -> None:
         """Compose it; nothing is started yet.
 
@@ -110,6 +111,8 @@ class ExternalFlightStack:
             observer: Of its MAVLink.
             timeout_s: Longest wait for each of its answers during the boot sequence [wall s].
             on_close: Called when it is closed, to release what belongs to it.
+            look_every_us: What the observer's link has brought is taken no more often in a flight
+                [µs]. Only where nobody waits for the link to become readable.
         """
         self._on_close = on_close
         self._launcher = launcher
@@ -118,9 +121,16 @@ class ExternalFlightStack:
         self._missing: list[str] = []
         """Parameters that are still missing."""
         self.filenos = observer.filenos
-        self.receive = observer.receive
+        self._look_every_us, self._look_us = look_every_us, 0
         self.send = observer.send
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
+
+    def receive(self, now_us: int) -> int:
+        """Take what has come at simulated `now_us` [µs]; return how many messages counted."""
+        if now_us < self._look_us:
+            return 0
+        self._look_us = now_us + self._look_every_us
+        return self._observer.receive(now_us)
 
     def log_to(self, tlog: TlogWriter | None) -> None:
         """Write the observer's link to a tlog; the firmware's own log of the flight goes beside."""

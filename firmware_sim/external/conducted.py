@@ -31,6 +31,10 @@ STATE_US = US_PER_S // 5
 """The true state is sent no more often [µs]. PX4 asks for it every 5 ms, only to log it."""
 
 
+LOOK_US = US_PER_S // 50
+"""The observer's link is looked at so often [µs]: nothing on it comes faster."""
+
+
 @dataclass(frozen=True)
 class ConductedPx4:
     """PX4 and what a conductor needs of it."""
@@ -111,6 +115,7 @@ def _instance(wanted: Wanted, instance: int) -> ConductedPx4:
         Observer(endpoint, "observer"),
         wanted.aircraft.real.firmware_timeout,
         on_close=link.close,
+        look_every_us=LOOK_US,
     )
     return ConductedPx4(stack, link, settle, instance)
 

@@ -33,6 +33,7 @@ __all__ = [
     "Decoder",
     "Encoder",
     "Layout",
+    "Reader",
     "Values",
     "WireMessage",
     "dialect",
@@ -208,6 +209,38 @@ class Encoder:
         return _MARK_V2 + covered + _checksum(covered + layout.crc_extra).to_bytes(2, "little")
 
 
+class Reader:
+    """Reads one kind of message where a chunk of bytes is one whole frame of it.
+
+    That takes a tenth of what `Decoder` does, which everything else is left to.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Take a name such as "ATTITUDE". Raises AttributeError when unknown."""
+        kind = dialect.mavlink_map[message_id(name)]
+        self.names: tuple[str, ...] = tuple(kind.ordered_fieldnames)
+        """The fields in the order in which they are sent; an array has its name once."""
+        self._wire: struct.Struct = kind.unpacker
+        self._id: bytes = kind.id.to_bytes(3, "little")
+        self._crc_extra = bytes([kind.crc_extra])
+
+    def read(self, chunk: bytes) -> tuple[float, ...] | None:
+        """Return the values in the order in which they are sent, arrays unrolled.
+
+        None where the chunk is anything but one valid, unsigned MAVLink 2 frame of this message.
+        """
+        if len(chunk) < _HEADER_V2 + _CHECKSUM or chunk[0] != _MARKER_V2 or chunk[2] != 0:
+            return None
+        end = _HEADER_V2 + chunk[1]
+        if len(chunk) != end + _CHECKSUM or chunk[7:10] != self._id:
+            return None
+        if _checksum(chunk[1:end] + self._crc_extra) != int.from_bytes(chunk[end:], "little"):
+            return None
+        # Zeros at its end are not sent.
+        size = self._wire.size
+        return self._wire.unpack(chunk[_HEADER_V2:end][:size].ljust(size, b"\0"))
+
+
 class Decoder:
     """Finds MAVLink 1 and 2 frames in arbitrary bytes. Never raises, never grows.
 
@@ -229,6 +262,11 @@ class Decoder:
         self._rest = b""
         self._in_garbage = False
         self._mav = dialect.MAVLink(None)
+
+    @property
+    def between_frames(self) -> bool:
+        """Whether the next chunk begins a frame, as far as is known."""
+        return not self._rest and not self._in_garbage
 
     def feed(self, data: bytes) -> list[WireMessage]:
         """Return the messages completed by a chunk of bytes."""

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 from firmware_sim.mavlink.codec import (
     Decoder,
     Encoder,
+    Reader,
     layout,
     message_id,
     param_value,
@@ -183,3 +184,48 @@ def test_integer_parameters_keep_all_their_bits(value: int) -> None:
     assert frame[10:14] == raw
     assert (message.param_id, message.param_type) == ("SYS_AUTOSTART", 6)
     assert (message.param_count, message.param_index) == (900, 12)
+
+
+# --- one kind of message, alone in a chunk
+
+
+def hil_controls(time_us: int, controls: list[float], mode: int) -> Any:
+    return dialect.MAVLink_hil_actuator_controls_message(time_us, controls, mode, 1)
+
+
+@given(
+    time_us=st.integers(0, 2**64 - 1),
+    controls=st.lists(st.floats(width=32, allow_nan=False), min_size=16, max_size=16),
+    mode=st.integers(0, 255),
+)
+@settings(max_examples=50, deadline=None)
+def test_a_reader_reads_what_was_packed(time_us: int, controls: list[float], mode: int) -> None:
+    chunk = Encoder().pack(hil_controls(time_us, controls, mode))
+    read = Reader("HIL_ACTUATOR_CONTROLS").read(chunk)
+    assert read == (time_us, 1, *controls, mode)
+
+
+def test_a_reader_leaves_everything_else_to_the_decoder() -> None:
+    reader, message = Reader("HIL_ACTUATOR_CONTROLS"), hil_controls(7, [0.5] * 16, 129)
+    frame = Encoder().pack(message)
+    assert reader.names == ("time_usec", "flags", "controls", "mode")
+    assert reader.read(frame) is not None
+    damaged = [frame[:i] + bytes([frame[i] ^ 1]) + frame[i + 1 :] for i in range(len(frame))]
+    version_1 = message.pack(dialect.MAVLink(None), force_mavlink1=True)
+    others = (Encoder().pack(ping(1)), frame + frame, b"\0" + frame, bytes(version_1))
+    cut = (frame[:end] for end in range(len(frame)))
+    for chunk in (*damaged, *others, *cut):
+        assert reader.read(chunk) is None, chunk.hex()
+
+
+def test_a_decoder_knows_whether_it_is_between_frames() -> None:
+    decoder, frame = Decoder(datagrams=False), Encoder().pack(ping(1))
+    assert decoder.between_frames
+    decoder.feed(frame[:5])
+    assert not decoder.between_frames
+    decoder.feed(frame[5:])
+    assert decoder.between_frames
+    decoder.feed(b"garbage")
+    assert not decoder.between_frames
+    decoder.feed(frame)
+    assert decoder.between_frames

@@ -8,17 +8,33 @@ message here: PX4 simulates a battery of its own.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple, TypeAlias
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
 from airl_mav.core.location import HOME
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
-from firmware_sim.mavlink.codec import Values, WireMessage, dialect, layout
+from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
 
 SENSOR = layout("HIL_SENSOR")
 GPS = layout("HIL_GPS")
 STATE = layout("HIL_STATE_QUATERNION")
+
+
+class Answer(NamedTuple):
+    """HIL_ACTUATOR_CONTROLS, in the order in which it is sent; the names are MAVLink's."""
+
+    time_usec: int
+    flags: int
+    controls: tuple[float, ...]
+    mode: int
+
+
+Controls: TypeAlias = "Answer | WireMessage"
+"""HIL_ACTUATOR_CONTROLS, however it was read."""
+
+_ANSWERS = Reader("HIL_ACTUATOR_CONTROLS")
 
 
 def _updated(*fields: str) -> int:
@@ -124,17 +140,26 @@ def state_quaternion(truth: Truth, time_us: int) -> Values:
     )
 
 
-def armed(message: WireMessage) -> bool:
+def armed(message: Controls) -> bool:
     """Return whether HIL_ACTUATOR_CONTROLS says armed."""
     return bool(message.mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
 
-def lockstep(message: WireMessage) -> bool:
+def answer(chunk: bytes) -> Answer | None:
+    """Return the HIL_ACTUATOR_CONTROLS that a chunk of bytes is; None where it is anything else."""
+    values = _ANSWERS.read(chunk)
+    if values is None:
+        return None
+    time_usec, flags, *controls, mode = values
+    return Answer(int(time_usec), int(flags), tuple(controls), int(mode))
+
+
+def lockstep(message: Controls) -> bool:
     """Return whether HIL_ACTUATOR_CONTROLS comes from a build that waits for the simulator."""
     return bool(message.flags & dialect.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP)
 
 
-def controls(message: WireMessage, time_us: int) -> ActuatorControls:
+def controls(message: Controls, time_us: int) -> ActuatorControls:
     """Return the motor commands of HIL_ACTUATOR_CONTROLS, which hold from `time_us` on [µs].
 
     Motors are stopped while disarmed, whatever is commanded: PX4 in HITL sends commands then, too.
@@ -142,21 +167,30 @@ def controls(message: WireMessage, time_us: int) -> ActuatorControls:
     """
     if not armed(message):
         return ActuatorControls(time_us, STILL, armed=False)
-    for i, value in enumerate(message.controls[:MOTORS]):
+    a, b, c, d = message.controls[:MOTORS]
+    if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0:
+        return ActuatorControls(time_us, (a, b, c, d), armed=True)
+    for i, value in enumerate((a, b, c, d)):
         # Written so that NaN fails.
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
             raise ControlsError(
                 f"HIL_ACTUATOR_CONTROLS controls[{i}] = {value:g}, a motor takes 0..1: is its "
                 "airframe a quadrotor?"
             )
-    a, b, c, d = (min(1.0, max(0.0, value)) for value in message.controls[:MOTORS])
+    a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
     return ActuatorControls(time_us, (a, b, c, d), armed=True)
 
 
 def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
     """Return three axes, each within +-limit."""
-    x, y, z = (min(limit, max(-limit, value)) for value in measured.tolist())
-    return x, y, z
+    x, y, z = measured.tolist()
+    if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
+        return x, y, z
+    return _within(x, limit), _within(y, limit), _within(z, limit)
+
+
+def _within(value: float, limit: float) -> float:
+    return min(limit, max(-limit, value))
 
 
 def _geodetic(point: Geodetic) -> tuple[int, int, int]:

@@ -25,9 +25,11 @@ MODEL = "none_iris"
 
 SCRIPT = "etc/init.d-posix/rcS"
 
-UNAWAITED_THREADS = (b"commander", b"navigator", *(b"mavlink_if%d" % i for i in range(4)))
-"""Threads that PX4 does not wait for before it answers a sample: modules with a thread of their
-own. Its controllers and estimator run in work queues, which it waits for."""
+UNAWAITED_THREADS = (b"commander", b"navigator", b"mavlink_if1", b"mavlink_if2")
+"""Threads that PX4 does not wait for before it answers a sample, and that a flight depends on:
+modules with a thread of their own, and the links of companion and observer (px4-rc.mavlink starts
+0 for the ground station, 1 onboard, 2 for a payload, 3 for a gimbal). Its controllers and estimator
+run in work queues, which it waits for."""
 
 LAYOUTS = (".", "build/px4_sitl_default", "usr", "opt/px4")
 """Where below a folder bin/px4 and etc/ are looked for: a build, a source tree, a package."""

@@ -32,6 +32,9 @@ REST_S = 0.1
 Offboard on the ground, without a setpoint, it answers only now and then, by its own clock, which
 does not advance while it is waited for."""
 
+AT_ONCE_S = 0.01
+"""An answer that comes sooner is nothing to look at the clock for [wall s]."""
+
 START_S = 60.0
 """Longest time from the first sample to the first answer [wall s]: PX4's start script runs."""
 
@@ -113,7 +116,7 @@ class Px4Bridge:
         """PX4's time of the newest sample [µs]."""
         self._pace_us = 0
         """Wall time before which no sample is sent, until the first answer [µs]."""
-        self._answer: WireMessage | None = None
+        self._answer: hil.Controls | None = None
         """The newest one."""
         self._waiting: Patience | None = None
         """Since when an answer is due; None: no answer is due."""
@@ -218,18 +221,23 @@ class Px4Bridge:
 
     # --- receiving
 
-    def _answered(self) -> WireMessage:
+    def _answered(self) -> hil.Controls:
         """Wait for the answer to the newest sample, and return the newest there is."""
+        if self._waiting is None and self._due is None:
+            self._receive(AT_ONCE_S)
+        if (answer := self._due) is not None:
+            self._waiting = None
+            return answer
         waiting = self._waiting = self._waiting or Patience()
         asked_s = waited_s = waiting.so_far_s()
-        while (answer := self._answer) is None or self.time_us != self._sent_us:
+        while (answer := self._due) is None:
             left_s = self._answer_s - waited_s
             if left_s <= 0.0:
                 raise self._lost(f"did not answer within {self._answer_s:g} s")
-            if answer is not None and not self.armed:
+            if self._answer is not None and not self.armed:
                 rest_s = REST_S - (waited_s - asked_s)
                 if rest_s <= 0.0:
-                    return answer
+                    return self._answer
                 left_s = min(left_s, rest_s)
             if not self._receive(min(left_s, WATCH_S)):
                 self._alive()
@@ -239,6 +247,11 @@ class Px4Bridge:
         self._waiting = None
         return answer
 
+    @property
+    def _due(self) -> hil.Controls | None:
+        """The answer to the newest sample; None: it has not come."""
+        return self._answer if self.time_us == self._sent_us else None
+
     def _receive(self, timeout_s: float) -> bool:
         """Take what arrives in time; return whether anything did."""
         data = self._tcp.receive(timeout_s)
@@ -247,6 +260,10 @@ class Px4Bridge:
             raise self._lost("closed its connection: it ended, or restarted")
         if not data:
             return False
+        if self._decoder.between_frames and (answer := hil.answer(data)) is not None:
+            self._garbage_bytes = 0
+            self._take_answer(answer)
+            return True
         messages = self._decoder.feed(data)
         self._garbage_bytes = 0 if messages else self._garbage_bytes + len(data)
         for message in messages:
@@ -259,8 +276,10 @@ class Px4Bridge:
         number = message.get_msgId()
         if number == _COMMAND:
             self._command(message)
-        if number != _ANSWER:
-            return
+        elif number == _ANSWER:
+            self._take_answer(message)
+
+    def _take_answer(self, message: hil.Controls) -> None:
         time_us: int = message.time_usec
         if not hil.lockstep(message):
             raise FirmwareMissingError(

@@ -67,8 +67,11 @@ class TcpPort:
     def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
         """Send all of it; False when the connection has ended or does not accept it in time."""
         connection, left = self._connected(), data
+        sent = _send(connection, left)
+        if sent == len(left):
+            return True  # As nearly always: there is nothing to look at the clock for.
         deadline_us = self._deadline_us(timeout_s)
-        while (sent := _send(connection, left)) is not None:
+        while sent is not None:
             left = left[sent:]
             left_s = self._left_s(deadline_us)
             if not left or left_s <= 0.0:
@@ -77,6 +80,7 @@ class TcpPort:
             writable = select.poll()
             writable.register(connection, _WRITE)
             writable.poll(min(left_s, WATCH_S) * MS_PER_S)
+            sent = _send(connection, left)
         return False
 
     def receive(self, timeout_s: float) -> bytes | None:
