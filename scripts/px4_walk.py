@@ -4,14 +4,15 @@
     python scripts/px4_walk.py                              # ours
     python scripts/px4_walk.py --connect udpin://0.0.0.0:14540 --slow   # or a real PX4's
 
-Prints a line for each call; exit status 1 when one answer differs. Calls that a real PX4 does not
-answer take seconds each, and are made with --slow.
+Prints a line for each call, with the wall time that it took; exit status 1 when one answer differs.
+Calls that a real PX4 does not answer take seconds each, and are made with --slow.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import time
 from pathlib import Path
 
 from mavsdk import ComponentType, Configuration, Mavsdk
@@ -42,12 +43,15 @@ def main() -> int:
     for row in ROWS:
         if (row.slow and not asked.slow) or asked.area not in (None, row.area):
             continue
+        began = time.monotonic()
         answer = answered(row, vehicle)
+        took_s = time.monotonic() - began
         made += 1
         differ += not answer.agrees
         mark = "agrees " if answer.agrees else "DIFFERS"
         shown = "" if answer.value is None else f"  {answer.value!s:.60}"
-        print(f"{mark}  {row.name:<55} PX4 {row.expected[0]:<20} here {answer.outcome}{shown}")
+        line = f"{mark}  {row.name:<55} PX4 {row.expected[0]:<20} {took_s:6.2f} s  {answer.outcome}"
+        print(line + shown, flush=True)
     print(f"{made - differ} of {made} calls answered as by PX4 1.16")
     companion.destroy()
     return 1 if differ else 0

@@ -41,7 +41,7 @@ def _returned(vehicle: Vehicle) -> float:
     return max(heights)
 
 
-ROWS = (
+FAILURES = (
     Row(
         "failure",
         "set SYS_FAILURE_EN 1",
@@ -54,6 +54,12 @@ ROWS = (
     *_failures("SYSTEM_RC_SIGNAL", "TIMEOUT"),
     *_failures("SYSTEM_MAVLINK_SIGNAL", "TIMEOUT"),
     Row("failure", "hold after the failures", lambda v: action(v).hold()),
+    Row("failure", "... mode", in_mode(FlightMode.HOLD)),
+)
+"""Before the pilot's sticks: once those were heard and have gone, the vehicle returns after 5 s
+(COM_FAIL_ACT_T, NAV_RCL_ACT), and calls that time out take longer."""
+
+ROWS = (
     Row(
         "rtl",
         "set_return_to_launch_altitude",

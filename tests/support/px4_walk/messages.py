@@ -37,7 +37,7 @@ SENT = {
     380: "TIME_ESTIMATE_TO_TARGET",
 }
 
-STREAMED = ("ATTITUDE", "TIME_ESTIMATE_TO_TARGET")
+STREAMED = ("ATTITUDE", "ESC_STATUS", "TIME_ESTIMATE_TO_TARGET")
 """A real PX4 denies a request when nothing new has come since it streamed the last."""
 
 NOT_SENT = {

@@ -31,6 +31,7 @@ FLIGHT: tuple[Row, ...] = (
     *flight.AIR,
     *offboard.ROWS,
     *plans_flown.ROWS,
+    *ending.FAILURES,
     *pilot.ROWS,
     *ending.ROWS,
 )

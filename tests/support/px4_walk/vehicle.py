@@ -188,8 +188,11 @@ class Vehicle:
             # Once only: a loopback loses nothing, and a second answer would be taken for the next.
             self.send("COMMAND_LONG", command=number, confirmation=0, **fields)
             try:
-                while (ack := acks.get(timeout=wait_s))["command"] != number:
-                    pass
+                # MAVSDK asks on its own, too: answers to that must not prolong the wait.
+                deadline = time.monotonic() + wait_s
+                ack = {"command": None}
+                while ack["command"] != number:
+                    ack = acks.get(timeout=max(0.0, deadline - time.monotonic()))
                 result = _RESULTS[ack["result"]]
             except queue.Empty:
                 return NO_ACK, None
