@@ -13,8 +13,25 @@ CAMERA_SILENT = "camera silent"
 """Why a mission ended: the watchdog saw that no frame came."""
 
 
+TELEMETRY_FROZEN = "telemetry frozen"
+"""Why a mission ended: what the flight controller said did not change any more."""
+
+FRAMES_LATE = "frames late"
+"""Why a mission ended: frames came, but long after they were taken."""
+
+
 class LinkError(Exception):
     """The flight controller refused, or is gone."""
+
+
+class VehicleStatus(NamedTuple):
+    """Who flies, by the newest heartbeat (known up to 1 s late)."""
+
+    armed: bool
+    offboard: bool
+    """Whether it flies our setpoints; on ArduPilot GUIDED."""
+    mode: str
+    """What it flies, in words."""
 
 
 class BodyVelocity(NamedTuple):
@@ -41,8 +58,16 @@ class Link(Protocol):
         """Return the newest telemetry."""
         ...
 
+    def status(self) -> VehicleStatus:
+        """Return who flies."""
+        ...
+
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; it is repeated until the next one."""
+        ...
+
+    def release(self) -> None:
+        """Send nothing more: somebody else flies."""
         ...
 
     def leave_offboard(self) -> None:

@@ -18,13 +18,13 @@ from mavsdk import ComponentType
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
-from mavsdk.plugins.telemetry import Telemetry, TelemetryError
+from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import PX4, Dialect, dialect_of
-from companion.interfaces import STOP, BodyVelocity, LinkError
+from companion.interfaces import STOP, BodyVelocity, LinkError, VehicleStatus
 from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.1
@@ -130,6 +130,8 @@ class MavsdkLink:
             if stopwatch.time_us() > timeout_s * US_PER_S:
                 raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
             self._pause_wall(stop)
+        if self._offboard is None:
+            self._offboard = Offboard(self._system)
         # Telemetry of its own making knows nothing but what comes from now on.
         self._telemetry.destroy()
         self._telemetry = Telemetry(self._system)
@@ -241,6 +243,12 @@ class MavsdkLink:
             np.array([q.w, q.x, q.y, q.z]),
         )
 
+    def status(self) -> VehicleStatus:
+        """Return who flies."""
+        mode = FlightMode(self._telemetry.flight_mode())
+        words = mode.name.lower().replace("_", " ")
+        return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words)
+
     def arm(self, timeout_s: float, stop: threading.Event) -> None:
         """Wait until the flight controller reports good health, then arm.
 
@@ -300,6 +308,13 @@ class MavsdkLink:
     def leave_offboard(self) -> None:
         """Switch to Hold; MAVSDK stops repeating setpoints."""
         self._call("leaving offboard", self._offboard.stop)
+
+    def release(self) -> None:
+        """Send nothing more, and leave the mode as it is: somebody else flies."""
+        # MAVSDK's own end of offboard mode asks for Hold; without the plugin nothing is repeated.
+        if self._offboard is not None:
+            self._offboard.destroy()
+            self._offboard = None
 
     def land(self, timeout_s: float) -> None:
         """Land and return when disarmed."""

@@ -15,10 +15,11 @@ from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.scenario.model import PilotSettings, WatchdogSettings
+from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, LinkError
+from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
 from companion.watchdog import Watchdog
@@ -38,9 +39,10 @@ class MissionResult:
     """How a mission ended."""
 
     reason: str
-    """goal reached, stopped, link lost, camera silent, watchdog, or what was refused or failed."""
+    """goal reached, stopped, link lost, camera silent, watchdog, the limit that was broken
+    (`limits.py`), or what was refused or failed."""
     notes: tuple[str, ...]
-    """What the watchdog did, what went wrong on the way down."""
+    """What the watchdog did, which limit was broken and how, what went wrong on the way down."""
     log: DecisionLog
 
 
@@ -56,9 +58,11 @@ def fly_mission(
     *,
     pilot_settings: PilotSettings,
     watchdog_settings: WatchdogSettings,
+    limit_settings: LimitSettings,
     guard: Guard,
     latency: LatencySampler | None = None,
     compensator: Compensator | None = None,
+    mount_pitch_up_rad: float = 0.0,
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
 
@@ -74,15 +78,19 @@ def fly_mission(
         progress: Called with the name of each phase as it begins.
         pilot_settings: How the policy is flown.
         watchdog_settings: Bounds on silence.
+        limit_settings: What is believed, and how far is flown.
         guard: Who looks after them.
         latency: Where to draw t2 from, to fly as a slower computer.
         compensator: Carries forward what is seen; None: the policy sees what is.
+        mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
+    limits = Limits(limit_settings, goal, pilot_settings, mount_pitch_up_rad)
     pilot = Pilot(
         *(link, frames, policy, watchdog, clock, pilot_settings),
         latency=latency,
         compensator=compensator,
+        limits=limits,
     )
     try:
         progress("arming")
@@ -112,8 +120,12 @@ def fly_mission(
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
     notes = list(watchdog.notes)
+    if limits.ending is not None:
+        notes.append(str(limits.ending))
     try:
-        if abandon.is_set() or lost:
+        if reason in NOT_OURS:
+            link.release()
+        elif abandon.is_set() or lost:
             # A lost link may be lost one way only: MAVSDK must not go on repeating the last
             # setpoint to a vehicle that still hears it.
             link.leave_offboard()

@@ -26,6 +26,7 @@ from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource, ReceivedFrame
 from companion.interfaces import BodyVelocity, Link
+from companion.limits import Limits
 from companion.watchdog import Watchdog
 
 FRAME_WAIT_S = 0.1
@@ -56,6 +57,8 @@ class Pilot:
     """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
     compensator: Compensator | None = None
     """Carries forward what is seen, of one companion; None = as it is."""
+    limits: Limits | None = None
+    """What is believed, and how far is flown; None = everything, and anywhere."""
     memory: DecisionMemory = field(init=False)
     """The setpoints and latencies so far."""
     earlier_mm: deque[NDArray[np.uint16]] = field(
@@ -72,10 +75,14 @@ class Pilot:
     def fly(self, goal: tuple[float, float], stop: Event) -> str:
         """Decide until the goal is reached, or something ends it; return why, in words.
 
+        Where that is a limit, `Limits.ending` has the details.
+
         The goal lies north, east [m] of the start; `stop`, set from outside, ends the flight.
         Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
+        if self.limits is not None:
+            self.limits.begin(self.clock.time_us())
         self.earlier_mm.clear()
         if self.compensator is not None:
             self.compensator.begin(0)
@@ -88,21 +95,30 @@ class Pilot:
                 return "watchdog"
             self.watchdog.doing(WAITING)
             received = self.frames.wait(newer_than_sequence=sequence, timeout_s=FRAME_WAIT_S)
+            state = self.link.kinematics()
+            if (reason := self._broken(state, received)) is not None:
+                return reason
             if received is None:
                 continue
             sequence = received.frame.sequence
-            state = self.link.kinematics()
             away = np.hypot(goal[0] - state.position[0], goal[1] - state.position[1])
             if away < self.settings.goal_radius_m:
                 return "goal reached"
-            if not self._decide(received, state, goal, stop):
-                return "watchdog"
+            if (reason := self._decide(received, state, goal, stop)) is not None:
+                return reason
         return "stopped"
+
+    def _broken(self, state: Kinematics, seen: ReceivedFrame | None) -> str | None:
+        """Return the limit that ends the flight, in words."""
+        if self.limits is None:
+            return None
+        ending = self.limits.broken(self.link.status(), state, seen, self.clock.time_us())
+        return None if ending is None else ending.reason
 
     def _decide(
         self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], stop: Event
-    ) -> bool:
-        """Run one decision; False when the watchdog has ended the flight."""
+    ) -> str | None:
+        """Run one decision; return why the flight has ended meanwhile, in words."""
         clock, settings = self.clock, self.settings
         self.watchdog.doing("inference")
         started_us = clock.time_us()
@@ -118,9 +134,13 @@ class Pilot:
         hold_us = int(settings.hold_s * US_PER_S)
         sent_us = clock.time_us()
         if stop.is_set():
-            return True
+            return None
+        # Somebody may have taken over while this was decided.
+        limits = self.limits
+        if limits is not None and (ending := limits.not_ours(self.link.status(), sent_us)):
+            return ending.reason
         if not self.watchdog.command(setpoint, hold_us):
-            return False
+            return "watchdog"
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)
@@ -145,7 +165,7 @@ class Pilot:
             clock.time_us(),
             setpoint,
         )
-        return True
+        return None
 
     def _observe(
         self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], now_us: int

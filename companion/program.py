@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -15,7 +16,7 @@ from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.model import PilotSettings, WatchdogSettings
+from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
     check_quota,
     decide_piloting,
@@ -29,6 +30,9 @@ from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.signing_proxy import signed
 
+FLIGHT_S = 600.0
+"""Longest navigation where nothing else is asked for [s]."""
+
 
 @dataclass(frozen=True)
 class Mission:
@@ -39,10 +43,13 @@ class Mission:
     policy: Policy
     pilot: PilotSettings
     watchdog: WatchdogSettings
+    limits: LimitSettings
     latency: LatencySampler | None
     """Where t2 is drawn from; None injects nothing."""
     compensator: Compensator | None
     """Carries forward what is seen; None: the policy sees what is."""
+    mount_pitch_up_rad: float
+    """How far the camera looks up, as it is mounted [rad]."""
 
 
 def prepare(asked: StandAloneCompanion) -> Mission:
@@ -59,11 +66,22 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
     loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
-    compensator = None
+    vehicle, compensator = load_vehicle(asked.vehicle), None
     if pilot.compensate:
-        vehicle = load_vehicle(asked.vehicle)
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
-    return Mission(asked.goal, loaded, pilot, watchdog, sampler, compensator)
+    limits = asked.limits
+    if limits.flight_s is None:
+        limits = limits.model_copy(update={"flight_s": FLIGHT_S})
+    return Mission(
+        asked.goal,
+        loaded,
+        pilot,
+        watchdog,
+        limits,
+        sampler,
+        compensator,
+        math.radians(vehicle.camera.pitch_up_deg),
+    )
 
 
 def fly_alone(
@@ -109,7 +127,9 @@ def fly_alone(
             lambda phase: progress(phase, clock.time_us()),
             pilot_settings=mission.pilot,
             watchdog_settings=mission.watchdog,
+            limit_settings=mission.limits,
             guard=ThreadGuard(clock),
             latency=mission.latency,
             compensator=mission.compensator,
+            mount_pitch_up_rad=mission.mount_pitch_up_rad,
         )

@@ -90,7 +90,11 @@ class Watchdog:
                     self.left_offboard = True
                     self.culprit = self._activity
                     self._note("left offboard", now_us)
-                    self._link.leave_offboard()
+                    if self._link.status().offboard:
+                        self._link.leave_offboard()
+                    else:
+                        # A pilot, or a failsafe, has taken over meanwhile.
+                        self._link.release()
                 elif now_us >= self._overdue_us and not self._stopped:
                     self._stopped = True
                     self._hover_us = None

@@ -46,7 +46,7 @@ POSITIONAL = "positional"
 REPEATED = "repeated"
 """Marks a field whose option may be given several times, a value each."""
 
-PREFIXED = ("payload", "sensors", "spread", "wind")
+PREFIXED = ("limits", "payload", "sensors", "spread", "wind")
 """Tables whose options carry the table's name; those of the others are unique by themselves."""
 
 SINGULAR = {"faults": "fault"}

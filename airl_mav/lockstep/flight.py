@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -186,9 +187,11 @@ class _Flight:
             self._announce,
             pilot_settings=resolved.companion_pilot,
             watchdog_settings=resolved.watchdog,
+            limit_settings=resolved.scenario.limits,
             guard=stage.clock,
             latency=resolved.latency_sampler(self._seed, native=False),
             compensator=compensator,
+            mount_pitch_up_rad=math.radians(resolved.vehicle.camera.pitch_up_deg),
         )
 
     def _announce(self, phase: str) -> None:

@@ -81,8 +81,10 @@ def fly_in_lockstep(
                 announce,
                 pilot_settings=mission.pilot,
                 watchdog_settings=mission.watchdog,
+                limit_settings=mission.limits,
                 guard=clock,
                 latency=mission.latency or FixedSampler(NATIVE_T2_US),
                 compensator=mission.compensator,
+                mount_pitch_up_rad=mission.mount_pitch_up_rad,
             )
     return result, {SEEN: digest.lanes()[SEEN]}

@@ -153,8 +153,10 @@ def _fly(
                 lambda _: None,
                 pilot_settings=mission.pilot,
                 watchdog_settings=mission.watchdog,
+                limit_settings=mission.limits,
                 guard=ThreadGuard(clock),
                 compensator=mission.compensator,
+                mount_pitch_up_rad=mission.mount_pitch_up_rad,
             )
         during = link.take_exchanges()
         # `stop` is set by now: it ends the flight.

@@ -5,6 +5,7 @@ Its standard input brings the resolved scenario in one line, then requests; see 
 
 from __future__ import annotations
 
+import math
 import os
 import queue
 import sys
@@ -105,9 +106,11 @@ class Missions:
                     self._announce,
                     pilot_settings=self._scenario.companion_pilot,
                     watchdog_settings=self._scenario.watchdog,
+                    limit_settings=self._scenario.scenario.limits,
                     guard=ThreadGuard(clock),
                     latency=self._scenario.latency_sampler(request.seed, native=True),
                     compensator=compensator,
+                    mount_pitch_up_rad=math.radians(self._scenario.vehicle.camera.pitch_up_deg),
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())

@@ -26,9 +26,9 @@ from airl_mav.rehearsal.process_faults import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
-from companion.interfaces import CAMERA_SILENT, LINK_LOST
+from companion.interfaces import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
-SEPARATED = (LINK_LOST, CAMERA_SILENT)
+SEPARATED = (LINK_LOST, CAMERA_SILENT, TELEMETRY_FROZEN, FRAMES_LATE)
 """Why a mission ends when both processes live but no longer hear each other: one of them stood
 still for seconds, or the host has too much to do."""
 

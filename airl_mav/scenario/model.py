@@ -71,6 +71,46 @@ class WatchdogSettings(ProfileModel):
     )
 
 
+class LimitSettings(ProfileModel):
+    """What the companion believes, and how far it flies; what is beyond ends the flight."""
+
+    silence_s: float = quantity(
+        "telemetry that stays the same for longer, and frames that come later, are not believed",
+        "s",
+        ge=0.5,
+        le=60,
+        default=2.0,
+    )
+    image_s: float = quantity(
+        "new frames that show the same image for longer are not believed",
+        "s",
+        ge=0.1,
+        le=60,
+        default=0.5,
+    )
+    radius_m: float | None = quantity(
+        "farthest from the start, level; by default twice the way to the goal and 50 m",
+        "m",
+        gt=0,
+        le=20_000,
+        default=None,
+    )
+    height_m: float | None = quantity(
+        "highest above the start; by default 10 m above the altitude that is flown",
+        "m",
+        gt=0,
+        le=1000,
+        default=None,
+    )
+    flight_s: float | None = quantity(
+        "longest navigation; by default ten minutes, in a rehearsal its time limit",
+        "s",
+        ge=1,
+        le=36_000,
+        default=None,
+    )
+
+
 @dataclass(frozen=True)
 class PilotSettings:
     """How a policy is flown, decided."""
@@ -156,6 +196,10 @@ class Decisions(Inference):
     )
     watchdog: WatchdogSettings = Field(
         default_factory=WatchdogSettings, description="bounds on silence"
+    )
+    limits: LimitSettings = Field(
+        default_factory=LimitSettings,
+        description="what the companion believes of telemetry and camera, and how far it flies",
     )
     ablate: AblationName | None = Field(
         default=None,
@@ -265,8 +309,8 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
     """All that a rehearsal can be asked for.
 
     The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
-    `real` and `ports`. What is left at None is decided by `airl_mav.scenario.resolve.resolve`,
-    mostly from the policy's card.
+    `limits`, `real` and `ports`. What is left at None is decided by
+    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
 
     Raises:
         FieldError: A field is unknown, of the wrong type, or out of range.

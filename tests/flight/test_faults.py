@@ -26,7 +26,7 @@ from airl_mav.core.errors import EXIT_INVALID
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.scenario.model import PilotSettings, WatchdogSettings
+from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
@@ -299,6 +299,7 @@ def fly_in_thread(ports: TestPorts, policy: Any) -> tuple[threading.Thread, list
                     *(link, frames, policy, (FAR_M, 0.0), clock, stop, abandon, lambda _: None),
                     pilot_settings=PilotSettings(altitude_m=1.5),
                     watchdog_settings=WatchdogSettings(decision_timeout_s=1.5, leave_after_s=1.0),
+                    limit_settings=LimitSettings(),
                     guard=ThreadGuard(clock),
                 )
             )

@@ -33,7 +33,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.scenario.model import PilotSettings, WatchdogSettings
+from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import BodyVelocity
@@ -246,6 +246,7 @@ def policy_hangs(stage: Stage) -> None:
         *(stage.abandon, stage.abandon, lambda _: None),
         pilot_settings=PilotSettings(),
         watchdog_settings=WatchdogSettings(decision_timeout_s=1.0, leave_after_s=1.0),
+        limit_settings=LimitSettings(),
         guard=stage.clock,
         latency=FixedSampler(10 * US_PER_S),
     )

@@ -26,7 +26,7 @@ from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
 from companion.guard import ThreadGuard
-from companion.interfaces import STOP, BodyVelocity, LinkError
+from companion.interfaces import STOP, BodyVelocity, LinkError, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
@@ -44,11 +44,16 @@ class FakeLink:
         self.position = np.array([0.0, 0.0, -2.5])
         self.commands: list[tuple[int, BodyVelocity]] = []
         self.left_us: list[int] = []
+        self.released_us: list[int] = []
+        self.flown = VehicleStatus(armed=True, offboard=True, mode="offboard")
         self.refuse: str | None = None
         self._clock = clock
 
     def kinematics(self) -> Kinematics:
         return Kinematics(self.position.copy(), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def status(self) -> VehicleStatus:
+        return self.flown
 
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         if self.refuse is not None:
@@ -57,6 +62,9 @@ class FakeLink:
 
     def leave_offboard(self) -> None:
         self.left_us.append(self._clock.time_us())
+
+    def release(self) -> None:
+        self.released_us.append(self._clock.time_us())
 
 
 class FakeFrames:

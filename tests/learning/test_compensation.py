@@ -39,7 +39,7 @@ from airl_mav.scenario.model import LevelName, PilotSettings, Scenario, Watchdog
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity
+from companion.interfaces import BodyVelocity, VehicleStatus
 from companion.pilot import Pilot
 from companion.program import prepare
 from companion.watchdog import Watchdog
@@ -124,6 +124,12 @@ class World:
 
     def leave_offboard(self) -> None:
         raise AssertionError("nothing is overdue")
+
+    def status(self) -> VehicleStatus:
+        return VehicleStatus(armed=True, offboard=True, mode="offboard")
+
+    def release(self) -> None:
+        raise AssertionError("nobody takes over")
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
         """Return the newest frame once there is a newer one; time passes until then."""

@@ -34,7 +34,7 @@ from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity
+from companion.interfaces import BodyVelocity, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
@@ -237,6 +237,12 @@ class StillLink:
         """Stands."""
 
     def leave_offboard(self) -> None:
+        """Stands."""
+
+    def status(self) -> VehicleStatus:
+        return VehicleStatus(armed=True, offboard=True, mode="offboard")
+
+    def release(self) -> None:
         """Stands."""
 
 

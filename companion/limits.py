@@ -1,0 +1,331 @@
+"""What the companion believes of its neighbours, and how far it flies on their word.
+
+A learned policy acts on whatever it is told: with a frozen position it flies past its goal, with
+a frozen image into what it cannot see. Each rule here says when telemetry, camera or mode are no
+longer to be trusted. The first one that is broken ends the flight: see `mission.py`.
+
+The bounds are wide: they tell a lie from noise, not a good sensor from a bad one, which is the
+estimator's task.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import Frame
+from airl_mav.core.constants import US_PER_S
+from airl_mav.policy.observation import Kinematics
+from airl_mav.scenario.model import LimitSettings, PilotSettings
+from companion.camera import ReceivedFrame
+from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
+
+TAKEN_OVER = "taken over"
+"""Another one flies: the mode is no longer offboard. Nothing more is sent."""
+
+DISARMED = "disarmed"
+"""The motors were stopped by somebody else. Nothing more is sent."""
+
+TELEMETRY_WRONG = "telemetry wrong"
+CAMERA_FROZEN = "camera frozen"
+CAMERA_WRONG = "camera wrong"
+OUT_OF_BOUNDS = "out of bounds"
+OUT_OF_TIME = "out of time"
+
+NOT_OURS = (TAKEN_OVER, DISARMED)
+"""Why a flight ended in which nothing more may be commanded."""
+
+MODE_KNOWN_S = 3.0
+"""Time until a change of mode must have been reported [s]: three heartbeats of 1 Hz."""
+
+STEP_M = 5.0
+"""A position may jump this far beyond what its velocity explains [m]: more than the resets of an
+estimator that finds its GPS again within its gates."""
+
+DRIFT_M = 8.0
+"""Most by which position and integrated velocity may part, leaking with `DRIFT_S` [m]."""
+
+DRIFT_S = 5.0
+
+SPEEDS = 3.0
+"""A velocity may be this many times the fastest action, and `SPEED_M_S` more: wind, overshoot."""
+
+SPEED_M_S = 10.0
+
+NORM = 0.1
+"""Most by which the norm of an attitude quaternion may differ from 1."""
+
+CLEARANCE_M = 50.0
+"""Default radius around the start: twice the way to the goal, and this much for detours [m]."""
+
+CLIMB_M = 10.0
+"""Default height limit, above the altitude that is flown [m]."""
+
+OWN_CLOCK_S = 1.0
+"""A first frame at most so old is stamped by our clock; else the stamps count from its arrival."""
+
+GROUND_M = 10.0
+"""Ground closer than this along a ray is seen by any depth camera [m]."""
+
+GRAZING_RAD = math.radians(10.0)
+"""A ray flatter than this may miss the ground that the start lies on."""
+
+
+TOLD = ("position", "velocity", "attitude")
+"""What telemetry says of the vehicle, in the order of `Kinematics`."""
+
+
+class Ending(NamedTuple):
+    """Why a flight may not go on."""
+
+    reason: str
+    """One of the constants of this module or of `interfaces`."""
+    detail: str
+    """What was seen, in words."""
+
+    def __str__(self) -> str:
+        """Return it as a note."""
+        return f"{self.reason}: {self.detail}"
+
+
+class _Unchanged:
+    """How long values have been the same, bit for bit."""
+
+    def __init__(self) -> None:
+        self._last: bytes | None = None
+        self._since_us = 0
+
+    def for_us(self, values: NDArray[np.generic], now_us: int) -> int:
+        now = values.tobytes()
+        if now != self._last:
+            self._last, self._since_us = now, now_us
+        return now_us - self._since_us
+
+
+class Limits:
+    """All rules, of one flight. The first that is broken stays."""
+
+    def __init__(
+        self,
+        settings: LimitSettings,
+        goal: tuple[float, float],
+        pilot: PilotSettings,
+        mount_pitch_up_rad: float = 0.0,
+    ) -> None:
+        """Prepare a flight.
+
+        Args:
+            settings: The bounds.
+            goal: North, east of the start [m].
+            pilot: How the policy is flown.
+            mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
+        """
+        self.ending: Ending | None = None
+        """What has ended the flight."""
+        self._vehicle = VehicleLimits(settings, goal, pilot)
+        self._camera = CameraLimits(settings, mount_pitch_up_rad)
+
+    def begin(self, now_us: int) -> None:
+        """Navigation begins."""
+        self._vehicle.begun_us = now_us
+
+    def broken(
+        self,
+        status: VehicleStatus,
+        state: Kinematics,
+        seen: ReceivedFrame | None,
+        now_us: int,
+    ) -> Ending | None:
+        """Return why the flight may not go on; None: it may.
+
+        Args:
+            status: Who flies.
+            state: What telemetry says.
+            seen: A frame that was not looked at before; None: there is none.
+            now_us: The time of the companion's clock [µs].
+        """
+        if self.not_ours(status, now_us) is None:
+            self.ending = self._vehicle.broken(state, now_us)
+        if self.ending is None and seen is not None:
+            self.ending = self._camera.broken(seen, state, now_us)
+        return self.ending
+
+    def not_ours(self, status: VehicleStatus, now_us: int) -> Ending | None:
+        """Return why nothing may be commanded any more; None: the vehicle is ours."""
+        if self.ending is None:
+            self.ending = self._vehicle.not_ours(status, now_us)
+        return self.ending
+
+
+class VehicleLimits:
+    """Rules for what the flight controller says."""
+
+    def __init__(
+        self, settings: LimitSettings, goal: tuple[float, float], pilot: PilotSettings
+    ) -> None:
+        self.begun_us = 0
+        """When navigation began [µs]."""
+        self._silence_us = round(settings.silence_s * US_PER_S)
+        radius_m, height_m = settings.radius_m, settings.height_m
+        self.radius_m = 2.0 * math.hypot(*goal) + CLEARANCE_M if radius_m is None else radius_m
+        """Farthest from the start, level [m]."""
+        self.height_m = pilot.altitude_m + CLIMB_M if height_m is None else height_m
+        """Highest above the start [m]."""
+        self._flight_s = settings.flight_s
+        self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S
+        self._offboard = self._armed = False
+        self._unchanged = [_Unchanged() for _ in TOLD]
+        self._before: tuple[Kinematics, int] | None = None
+        self._drift_m = np.zeros(2)
+
+    def not_ours(self, status: VehicleStatus, now_us: int) -> Ending | None:
+        """Return why nothing may be commanded any more; None: the vehicle is ours."""
+        self._offboard |= status.offboard
+        self._armed |= status.armed
+        # The switch to offboard was acknowledged; the heartbeat that shows it may still be on its
+        # way.
+        late = now_us - self.begun_us > MODE_KNOWN_S * US_PER_S
+        if not status.armed and (self._armed or late):
+            return Ending(DISARMED, "the heartbeat says that the motors are off")
+        if not status.offboard and (self._offboard or late):
+            return Ending(TAKEN_OVER, f"the mode is {status.mode}")
+        return None
+
+    def broken(self, state: Kinematics, now_us: int) -> Ending | None:
+        """Return which rule telemetry breaks; None: it can be flown on."""
+        values = (state.position, state.velocity, state.quaternion)
+        for name, unchanged, value in zip(TOLD, self._unchanged, values, strict=True):
+            if not np.isfinite(value).all():
+                return Ending(TELEMETRY_WRONG, f"{name} is not finite")
+            silent_us = unchanged.for_us(value, now_us)
+            if silent_us > self._silence_us:
+                return Ending(
+                    TELEMETRY_FROZEN, f"{name} has not changed for {silent_us / US_PER_S:.1f} s"
+                )
+        norm = float(np.linalg.norm(state.quaternion))
+        if abs(norm - 1.0) > NORM:
+            return Ending(TELEMETRY_WRONG, f"the attitude quaternion has norm {norm:.2f}")
+        speed = float(np.linalg.norm(state.velocity))
+        if speed > self._fastest_m_s:
+            return Ending(
+                TELEMETRY_WRONG,
+                f"velocity {speed:.1f} m/s; believed: up to {self._fastest_m_s:g} m/s",
+            )
+        return self._moved(state, now_us) or self._outside(state, now_us)
+
+    def _moved(self, state: Kinematics, now_us: int) -> Ending | None:
+        """Return whether position and velocity contradict each other."""
+        if self._before is None:
+            self._before = state, now_us
+            return None
+        last, last_us = self._before
+        if (state.position == last.position).all() and (state.velocity == last.velocity).all():
+            return None  # Nothing new is told: that is no contradiction, and counted elsewhere.
+        self._before = state, now_us
+        dt_s = (now_us - last_us) / US_PER_S
+        explained = 0.5 * (last.velocity + state.velocity) * dt_s
+        rest = (state.position - last.position - explained)[:2]
+        jump_m = float(np.linalg.norm(rest))
+        # Between two looks a vehicle may brake and turn: half its speed is then unexplained.
+        speeds = np.linalg.norm(last.velocity), np.linalg.norm(state.velocity)
+        if jump_m > STEP_M + max(speeds) * dt_s:
+            return Ending(TELEMETRY_WRONG, f"the position jumped by {jump_m:.1f} m")
+        self._drift_m = self._drift_m * math.exp(-dt_s / DRIFT_S) + rest
+        drift_m = float(np.linalg.norm(self._drift_m))
+        if drift_m > DRIFT_M:
+            return Ending(TELEMETRY_WRONG, f"position and velocity have parted by {drift_m:.1f} m")
+        return None
+
+    def _outside(self, state: Kinematics, now_us: int) -> Ending | None:
+        north, east, down = state.position
+        away_m = math.hypot(north, east)
+        if away_m > self.radius_m:
+            return Ending(
+                OUT_OF_BOUNDS, f"{away_m:.1f} m from the start; at most {self.radius_m:g} m"
+            )
+        if -down > self.height_m:
+            return Ending(
+                OUT_OF_BOUNDS, f"{-down:.1f} m above the start; at most {self.height_m:g} m"
+            )
+        flown_s = (now_us - self.begun_us) / US_PER_S
+        if self._flight_s is not None and flown_s > self._flight_s:
+            return Ending(OUT_OF_TIME, f"{flown_s:.0f} s; at most {self._flight_s:g} s")
+        return None
+
+
+class CameraLimits:
+    """Rules for what the camera shows."""
+
+    def __init__(self, settings: LimitSettings, mount_pitch_up_rad: float) -> None:
+        """Begin; the camera is mounted looking up by so much."""
+        self._mount_rad = mount_pitch_up_rad
+        self._silence_us = round(settings.silence_s * US_PER_S)
+        self._same_us = round(settings.image_s * US_PER_S)
+        self._first: Frame | None = None
+        self._last: ReceivedFrame | None = None
+        self._least_us = 0
+        self._image = _Unchanged()
+        self._blank_since_us: int | None = None
+
+    def broken(self, seen: ReceivedFrame, state: Kinematics, now_us: int) -> Ending | None:
+        """Return which rule a frame breaks; None: it can be decided on."""
+        frame = seen.frame
+        if self._first is None:
+            self._first = frame
+        if frame.intrinsics != self._first.intrinsics:
+            return Ending(CAMERA_WRONG, f"{frame.intrinsics}; before: {self._first.intrinsics}")
+        return self._stamped(seen) or self._pictured(frame, state, now_us)
+
+    def _stamped(self, seen: ReceivedFrame) -> Ending | None:
+        """Return whether frames come late, or their stamps jump."""
+        last, self._last = self._last, seen
+        behind_us = seen.received_us - seen.frame.capture_time_us
+        if last is None or last.frame.sequence > seen.frame.sequence:
+            # The first, or the camera was started again.
+            own = 0 <= behind_us <= OWN_CLOCK_S * US_PER_S
+            self._least_us = 0 if own else behind_us
+            return None
+        changed_us = behind_us - (last.received_us - last.frame.capture_time_us)
+        if abs(changed_us) > self._silence_us:
+            return Ending(CAMERA_WRONG, f"stamps jumped by {-changed_us / US_PER_S:+.1f} s")
+        self._least_us = min(self._least_us, behind_us)
+        late_us = behind_us - self._least_us
+        if late_us > self._silence_us:
+            return Ending(FRAMES_LATE, f"{late_us / US_PER_S:.1f} s old")
+        return None
+
+    def _pictured(self, frame: Frame, state: Kinematics, now_us: int) -> Ending | None:
+        """Return whether the image is always the same, or shows nothing where ground must be."""
+        depth = frame.depth_mm
+        blank = bool((depth == depth.flat[0]).all())
+        silent_us = self._image.for_us(depth, now_us)
+        if silent_us > self._same_us and not blank:
+            return Ending(
+                CAMERA_FROZEN, f"the image has not changed for {silent_us / US_PER_S:.1f} s"
+            )
+        if not blank or not ground_in_view(frame, state, self._mount_rad):
+            self._blank_since_us = None
+        elif self._blank_since_us is None:
+            self._blank_since_us = now_us
+        elif now_us - self._blank_since_us > self._silence_us:
+            return Ending(
+                CAMERA_WRONG,
+                f"every pixel reads {int(depth.flat[0])} mm, and the ground must be in view",
+            )
+        return None
+
+
+def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -> bool:
+    """Return whether a camera must see the ground, taken to be as high as the start.
+
+    It must where the ray through the middle of the bottom row meets it within `GROUND_M`.
+    """
+    lens = frame.intrinsics
+    w, x, y, z = state.quaternion
+    pitch_rad = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    down_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal) - pitch_rad - mount_pitch_up_rad
+    height_m = -float(state.position[2])
+    return down_rad > GRAZING_RAD and 0.0 < height_m < GROUND_M * math.sin(down_rad)

@@ -1,0 +1,100 @@
+"""What the companion does when it may not go on: flights in lockstep, with the real MAVSDK."""
+
+from __future__ import annotations
+
+import pytest
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Outcome
+from airl_mav.latency.samplers import FixedSampler
+from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.stage import Stage
+from airl_mav.policy.actions import Action
+from airl_mav.policy.observation import Observation
+from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
+from airl_mav.scenario.piloting import NATIVE_T2_US, TRANSPORT_US
+from companion.mission import MissionResult, fly_mission
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.commander import Phase
+from firmware_sim.simulation import EpisodeSetup, Simulation
+from tests.support.lockstep_kit import demo_scenario
+
+FAR_SEED = 3
+"""A flight of several seconds."""
+
+
+class Creeps:
+    """Flies ahead slowly, and never arrives."""
+
+    def act(self, observation: Observation) -> Action:
+        return Action(0.5, 0.0, 0.0)
+
+
+def flown(**changes: object) -> FlownEpisode:
+    scenario = demo_scenario(policy="greedy", **changes)
+    return fly(scenario, scenario.fresh_policy(FAR_SEED), 0, FAR_SEED)
+
+
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.RETURN])
+def test_who_takes_over_has_the_vehicle(mode: Mode) -> None:
+    """At most one heartbeat later nothing more is sent, and no mode is asked for."""
+    scenario = demo_scenario(policy="greedy")
+    setup = EpisodeSetup(scenario.vehicle, scenario.arena_of(FAR_SEED), FAR_SEED)
+    results: list[MissionResult] = []
+    modes: list[tuple[Mode, int]] = []
+    """What was flown, and since when [µs]."""
+
+    with Stage(transport_us=TRANSPORT_US) as stage:
+
+        def take_over(simulation: Simulation) -> None:
+            autopilot = simulation.autopilot
+            assert isinstance(autopilot, BuiltinAutopilot)
+            flown = autopilot.flight.mode
+            if not modes or modes[-1][0] is not flown:
+                modes.append((flown, simulation.time_us))
+            if flown is Mode.OFFBOARD and simulation.time_us - modes[-1][1] > 3 * US_PER_S:
+                autopilot.set_mode(mode)
+
+        stage.firmware.on_tick = take_over
+
+        def program() -> None:
+            results.append(
+                fly_mission(
+                    *(stage.link, stage.camera, Creeps(), (500.0, 0.0), stage.clock),
+                    *(stage.abandon, stage.abandon, lambda _: None),
+                    pilot_settings=PilotSettings(),
+                    watchdog_settings=WatchdogSettings(),
+                    limit_settings=LimitSettings(),
+                    guard=stage.clock,
+                    latency=FixedSampler(NATIVE_T2_US),
+                )
+            )
+
+        simulation = stage.run(setup, program)
+        until_us = simulation.time_us + 3 * US_PER_S
+        while simulation.time_us < until_us:
+            stage.firmware.step()
+        assert simulation.recorder is not None
+        accepted_us = simulation.recorder.setpoints.arrays()["accepted_us"]
+        assert simulation.autopilot.flight.phase is Phase.AIR
+    (result,) = results
+    assert result.reason == "taken over"
+    assert result.notes[-1].startswith("taken over: the mode is ")
+    assert [each for each, _ in modes[-2:]] == [Mode.OFFBOARD, mode]
+    assert accepted_us.max() <= modes[-1][1] + US_PER_S + US_PER_S // 2
+
+
+def test_a_picture_that_stays_is_not_flown_on() -> None:
+    record = flown(faults=("camera stuck at offboard+500ms",)).record
+    assert record.outcome is Outcome.ABORTED
+    assert "camera frozen" in record.reason
+    assert any("the image has not changed for" in note for note in record.notes)
+
+
+def test_telemetry_that_stays_is_not_flown_on() -> None:
+    record = flown(faults=("downlink cut at offboard+500ms",)).record
+    assert record.outcome is Outcome.ABORTED
+    assert "telemetry frozen" in record.reason
+    assert any("has not changed for 2." in note for note in record.notes)
