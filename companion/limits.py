@@ -277,7 +277,8 @@ class CameraLimits:
             self._first = frame
         if frame.intrinsics != self._first.intrinsics:
             return Ending(CAMERA_WRONG, f"{frame.intrinsics}; before: {self._first.intrinsics}")
-        return self._stamped(seen) or self._pictured(frame, state, now_us)
+        # A picture that stays is the camera's doing; late frames can be a busy host's.
+        return self._pictured(frame, state, now_us) or self._stamped(seen)
 
     def _stamped(self, seen: ReceivedFrame) -> Ending | None:
         """Return whether frames come late, or their stamps jump."""
