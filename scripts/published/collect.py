@@ -190,11 +190,17 @@ def _run(quality: Aggregate, info: RunInfo, t2_us: float | None) -> FlownRun:
         policy=info.setup.policy.name,
         arena=info.setup.arena.name,
         level=info.setup.level,
-        latency=asked["latency"] or workload,
+        latency=workload if asked["latency"] is None else _source(asked["latency"]),
         seed=asked["seed"],
         t2_ms=None if t2_us is None else round(t2_us / US_PER_MS, 3),
         **{measure: Figure.of(getattr(quality, measure)) for measure in MEASURES},
     )
+
+
+def _source(latency: str) -> str:
+    """Return a source of t2 as published: a run holds where a file of latencies lay."""
+    path = Path(latency)
+    return path.name if path.is_absolute() else latency
 
 
 def _gaps(comparison: Comparison, prefix: str) -> Iterator[tuple[str, Gap]]:
