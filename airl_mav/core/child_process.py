@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from airl_mav.core.standstill import Standstill
+from airl_mav.core.suspension import Suspension
 
 GRACE_S = 5.0
 """How long a child may take to end once its pipe is closed, and again once terminated [wall s]."""
@@ -97,7 +97,7 @@ class ChildProcess:
                 start_new_session=True,
                 pass_fds=inherited,
             )
-        self._standstill: Standstill | None = None
+        self._suspension: Suspension | None = None
         self.stdin = self._process.stdin
         """The pipe that it reads; None never."""
         self.stdout = self._process.stdout
@@ -125,23 +125,23 @@ class ChildProcess:
             return ""
         return "\n".join(written.decode(errors="replace").splitlines()[-TAIL_LINES:])
 
-    def stand_still(self) -> None:
-        """Stop it, as a computer that hangs, until `go_on`; it goes on when we are killed."""
-        if self._standstill is None and self._process.poll() is None:
-            self._standstill = Standstill(self._process.pid)
+    def suspend(self) -> None:
+        """Suspend it (SIGSTOP) until `resume`; it is also resumed when we are killed."""
+        if self._suspension is None and self._process.poll() is None:
+            self._suspension = Suspension(self._process.pid)
 
-    def go_on(self) -> None:
-        """Let it go on, if it stands still."""
-        standstill, self._standstill = self._standstill, None
-        if standstill is not None:
-            standstill.end()
+    def resume(self) -> None:
+        """Resume it, if it is suspended (SIGCONT)."""
+        suspension, self._suspension = self._suspension, None
+        if suspension is not None:
+            suspension.end()
 
     def stop(self) -> None:
         """Close its pipe, wait, then terminate, then kill; returns when it is gone.
 
         Harmless when called again.
         """
-        self.go_on()
+        self.resume()
         if self.stdin is not None:
             with suppress(BrokenPipeError):
                 self.stdin.close()
@@ -155,7 +155,7 @@ class ChildProcess:
     def kill(self) -> None:
         """End it at once; does not wait."""
         self._process.kill()
-        self.go_on()
+        self.resume()
 
 
 # --- the parent-death guard

@@ -201,10 +201,10 @@ _OTHER_KINDS: dict[tuple[Part, str], Kind] = {
         Amount("by how much", "s", 0.0, 60.0, _SECONDS),
         levels=ANY_LEVEL,
     ),
-    ("companion", "stopped"): Kind("it stands still (SIGSTOP), and goes on at the end (SIGCONT)"),
+    ("companion", "stopped"): Kind("it is suspended (SIGSTOP), and resumed at the end (SIGCONT)"),
     ("companion", "killed"): Kind("it ends at once (SIGKILL)", lasts=False),
     ("firmware", "stopped"): Kind(
-        "flight controller and plant stand still (SIGSTOP), and simulated time with them",
+        "flight controller and plant are suspended (SIGSTOP), and simulated time with them",
         levels=WITH_PROCESSES,
     ),
     ("firmware", "killed"): Kind("it ends at once (SIGKILL)", lasts=False, levels=WITH_PROCESSES),

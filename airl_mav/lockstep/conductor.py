@@ -51,8 +51,8 @@ class Conductor:
         self.clock = clock or SimClock()
         self.ended = False
         """Whether the companion has ended."""
-        self._standing = False
-        """Whether the companion stands still."""
+        self._suspended = False
+        """Whether the companion is suspended."""
         self._vehicle = vehicle
         self._partner = partner
         self._digest = digest or FlightDigest()
@@ -73,15 +73,15 @@ class Conductor:
             self._vehicle.take()  # What real firmware has sent while it booted is out of date.
         self._turn = Turn(at_us)
 
-    def stand_still(self) -> None:
-        """Let the companion stand still: it has no turns, and MAVSDK repeats nothing."""
-        self._standing = True
+    def suspend(self) -> None:
+        """Suspend the companion: it has no turns, and MAVSDK repeats nothing."""
+        self._suspended = True
 
-    def go_on(self) -> None:
-        """Let it go on: it has at once the turn that is overdue, and all telemetry since."""
-        if self._standing:
-            self._standing = False
-            self._inbound.go_on(self.clock.time_us())
+    def resume(self) -> None:
+        """Resume it: it has at once the turn that is overdue, and all telemetry since."""
+        if self._suspended:
+            self._suspended = False
+            self._inbound.resume(self.clock.time_us())
 
     @property
     def heard(self) -> bool:
@@ -109,7 +109,7 @@ class Conductor:
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))
-        if self._standing:
+        if self._suspended:
             self.clock.sleep_until(tick_us)
             return tick_us
         interrupt = self._turn.interrupt

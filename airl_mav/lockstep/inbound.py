@@ -121,7 +121,7 @@ class Inbound:
         self._counted = setpoints_sent
         return self.repeat(now_us) if again else None
 
-    def go_on(self, now_us: int) -> None:
+    def resume(self, now_us: int) -> None:
         """Nothing has been repeated for a while: once at simulated `now_us` [µs], not for all."""
         if self.next_repeat_us is not None:
             self.next_repeat_us = max(self.next_repeat_us, now_us)

@@ -154,7 +154,7 @@ class Stage:
             self.abandon.set()
             if stop is not None:
                 stop.set()
-            conductor.go_on()
+            conductor.resume()
             while not conductor.ended:
                 firmware.step()
         self._raise_what_broke()
@@ -174,7 +174,7 @@ class Stage:
         faults.on_change(changed)
 
     def _let_companion_fail(self, faults: FaultTimeline) -> None:
-        """Withhold the companion's turns while it stands still, and from when it is killed."""
+        """Withhold the companion's turns while it is suspended, and from when it is killed."""
 
         def changed() -> None:
             acting = [each.fault for each in faults.acting("companion")]
@@ -182,9 +182,9 @@ class Stage:
             if for_good is not None:
                 self.out = self.out or f"{for_good.part} {for_good.kind}"
             if acting:
-                self.conductor.stand_still()
+                self.conductor.suspend()
             elif not self.out:
-                self.conductor.go_on()
+                self.conductor.resume()
 
         changed()
         faults.on_change(changed)

@@ -50,7 +50,7 @@ class Episode:
     wall_us: int | None = None
     """Wall time from the reset to the verdict."""
     paused_us: int = 0
-    """How long the firmware stood still in it, as asked for [simulated µs]."""
+    """How long the firmware was suspended in it, as asked for [simulated µs]."""
     state: State | None = None
     verdict_state: State | None = None
     ended: Ended | None = None

@@ -20,7 +20,7 @@ class ProcessFaults:
         """Take the processes, and simulated seconds per wall second."""
         self._pair = pair
         self._speed = speed
-        self._stood_before_us = pair.stood_us(FIRMWARE)
+        self._suspended_before_us = pair.suspended_us(FIRMWARE)
         self._out: dict[str, str] = {}
 
     def out(self, name: str) -> str | None:
@@ -34,8 +34,8 @@ class ProcessFaults:
 
     @property
     def paused_us(self) -> int:
-        """How long the firmware has stood still, as asked for [simulated µs]."""
-        return round((self._pair.stood_us(FIRMWARE) - self._stood_before_us) * self._speed)
+        """How long the firmware was suspended, as asked for [simulated µs]."""
+        return round((self._pair.suspended_us(FIRMWARE) - self._suspended_before_us) * self._speed)
 
     def carry_out(self, due: Due) -> str | None:
         """Begin or end a fault.
@@ -48,10 +48,10 @@ class ProcessFaults:
         if name in self._out:
             return None
         if not due.begins:
-            # The firmware, which stands still itself, is timed by the wall clock.
+            # The firmware, which is suspended itself, is timed by the wall clock.
             if name == COMPANION:
-                self._pair.go_on(name)
-                return f"{name} goes on at {at_s:.2f} s"
+                self._pair.resume(name)
+                return f"{name} resumed at {at_s:.2f} s"
             return None
         if fault.for_good:
             self._out[name] = kind
@@ -59,10 +59,10 @@ class ProcessFaults:
             self._pair.kill(name)
         else:
             for_s = fault.for_s if name == FIRMWARE else None
-            self._pair.stand_still(name, None if for_s is None else for_s / self._speed)
+            self._pair.suspend(name, None if for_s is None else for_s / self._speed)
         return f"{name} {kind} at {at_s:.2f} s, as asked for"
 
     def undo(self) -> None:
         """Let those go on that still stand."""
         for name in (FIRMWARE, COMPANION):
-            self._pair.go_on(name)
+            self._pair.resume(name)

@@ -123,11 +123,10 @@ class ProcessPair:
         """Folder of the companion's temporary files. MAVSDK makes one for each system that it
         hears, and leaves it behind when its process is killed."""
         self._clock = WallClock()
-        self._still: dict[str, tuple[int, int | None]] = {}
-        """Since when each process stands still that does, and when it goes on [wall µs]; None: when
-        it is told to."""
-        self._stood_us: dict[str, int] = {}
-        """How long each has stood still before [wall µs]."""
+        self._suspended: dict[str, tuple[int, int | None]] = {}
+        """Since when each suspended process is, and when it is resumed [wall µs]; None: on request."""
+        self._suspended_us: dict[str, int] = {}
+        """How long each was suspended before [wall µs]."""
 
     def start(self, begin: Begin, logs: Path, keeps: Sequence[int]) -> None:
         """Start both processes and wait until they are ready.
@@ -182,37 +181,37 @@ class ProcessPair:
         """Return whether a process is there and meant to be."""
         return not self._children[name].ending
 
-    def stand_still(self, name: str, for_s: float | None = None) -> None:
-        """Stop a process, as a computer that hangs.
+    def suspend(self, name: str, for_s: float | None = None) -> None:
+        """Suspend a process, as a computer that hangs.
 
         Args:
             name: Which one.
-            for_s: It goes on after so long, while events are waited for [wall s]; None: when it is
-                told to.
+            for_s: It is resumed after so long, while events are waited for [wall s]; None: on
+                request.
         """
         now_us = self._clock.time_us()
         until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
-        self._children[name].stand_still()
-        self._still[name] = now_us, until_us
+        self._children[name].suspend()
+        self._suspended[name] = now_us, until_us
 
-    def go_on(self, name: str) -> None:
-        """Let a process go on, if it stands still."""
-        if name in self._still:
-            stood_us = self.stood_us(name)
-            del self._still[name]
-            self._stood_us[name] = stood_us
-            self._children[name].go_on()
+    def resume(self, name: str) -> None:
+        """Resume a process, if it is suspended."""
+        if name in self._suspended:
+            suspended_us = self.suspended_us(name)
+            del self._suspended[name]
+            self._suspended_us[name] = suspended_us
+            self._children[name].resume()
 
-    def stood_us(self, name: str) -> int:
-        """Return how long a process has stood still in all [wall µs]."""
-        before_us = self._stood_us.get(name, 0)
-        if name not in self._still:
+    def suspended_us(self, name: str) -> int:
+        """Return how long a process has been suspended in all [wall µs]."""
+        before_us = self._suspended_us.get(name, 0)
+        if name not in self._suspended:
             return before_us
-        return before_us + self._clock.time_us() - self._still[name][0]
+        return before_us + self._clock.time_us() - self._suspended[name][0]
 
     def kill(self, name: str) -> None:
         """End a process at once (SIGKILL), on purpose: its end is no loss."""
-        self._still.pop(name, None)
+        self._suspended.pop(name, None)
         self._children[name].kill()
 
     def send(self, name: str, request: BaseModel) -> None:
@@ -267,11 +266,11 @@ class ProcessPair:
     def _look_s(self) -> float:
         """Let those go on whose time is over; return how long there is nothing to do [wall s]."""
         now_us, look_us = self._clock.time_us(), round(LOOK_S * US_PER_S)
-        for name, (_, until_us) in list(self._still.items()):
+        for name, (_, until_us) in list(self._suspended.items()):
             if until_us is None:
                 continue
             if until_us <= now_us:
-                self.go_on(name)
+                self.resume(name)
             else:
                 look_us = min(look_us, until_us - now_us)
         return look_us / US_PER_S

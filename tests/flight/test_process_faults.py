@@ -73,7 +73,7 @@ def in_lockstep(fault: str, **more: float) -> FlownEpisode:
     return fly(resolved, resolved.fresh_policy(SEED), 0, SEED)
 
 
-def test_a_companion_that_stands_still_decides_nothing() -> None:
+def test_a_suspended_companion_decides_nothing() -> None:
     episode = in_lockstep("companion stopped at offboard+200ms for 700ms")
     record, (acted,) = episode.record, episode.record.faults
     assert acted.to_us - acted.from_us == 700_000

@@ -180,10 +180,10 @@ class FakeChild:
         stage = self.stage
         write_record(self.record, stage.slips, stage.strangers, stage.faults)
 
-    def stand_still(self) -> None:
+    def suspend(self) -> None:
         self.standing.append(True)
 
-    def go_on(self) -> None:
+    def resume(self) -> None:
         self.standing.append(False)
         self.stage.put(*self.stage.goes_on)
 

@@ -79,7 +79,7 @@ import os, signal, sys
 from pathlib import Path
 from airl_mav.core.child_process import ChildProcess
 child = ChildProcess([sys.executable, "-c", {SLEEPS!r}], Path(sys.argv[1]))
-child.stand_still()
+child.suspend()
 print(child.pid, flush=True)
 sys.stdin.readline()
 """
@@ -90,15 +90,15 @@ def state_of(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
-def test_a_child_stands_still_until_it_is_told_to_go_on(tmp_path: Path) -> None:
+def test_a_suspended_child_waits_until_it_is_resumed(tmp_path: Path) -> None:
     child = ChildProcess([sys.executable, "-c", SLEEPS], tmp_path / "log")
     try:
-        child.stand_still()
+        child.suspend()
         wait_until(lambda: state_of(child.pid) == "T", "stopped")
-        child.go_on()
+        child.resume()
         wait_until(lambda: state_of(child.pid) != "T", "going on")
-        child.go_on()  # harmless
-        child.stand_still()
+        child.resume()  # harmless
+        child.suspend()
         child.kill()
         assert child.wait().code == -signal.SIGKILL
     finally:
