@@ -124,7 +124,7 @@ class ProcessPair:
         hears, and leaves it behind when its process is killed."""
         self._clock = WallClock()
         self._suspended: dict[str, tuple[int, int | None]] = {}
-        """Since when each suspended process is, and when it is resumed [wall µs]; None: on request."""
+        """Since when each suspended process is, and until when [wall µs]; None: until asked for."""
         self._suspended_us: dict[str, int] = {}
         """How long each was suspended before [wall µs]."""
 
