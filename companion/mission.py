@@ -18,7 +18,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.camera import FrameSource
 from companion.guard import Guard
-from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, LinkError
+from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
@@ -125,17 +125,20 @@ def fly_mission(
     try:
         if reason in NOT_OURS:
             link.release()
-        elif abandon.is_set() or lost:
+        elif abandon.is_set() or lost or reason == TELEMETRY_FROZEN:
             # A lost link may be lost one way only: MAVSDK must not go on repeating the last
             # setpoint to a vehicle that still hears it.
             link.leave_offboard()
-        else:
+        if reason not in NOT_OURS and not (abandon.is_set() or lost):
             progress("landing")
-            if not watchdog.left_offboard:
+            if not watchdog.left_offboard and reason != TELEMETRY_FROZEN:
                 link.set_velocity_body(STOP)
             link.land(LAND_TIMEOUT_S)
     except LinkError as error:
         notes.append(str(error))
+        if reason == TELEMETRY_FROZEN:
+            # No answer either: all is silent, which MAVSDK takes 3 s to notice.
+            reason = LINK_LOST
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
 

@@ -112,6 +112,8 @@ class Pilot:
         """Return the limit that ends the flight, in words."""
         if self.limits is None:
             return None
+        if self.watchdog.left_offboard:
+            return "watchdog"  # The mode is another one by our own doing.
         ending = self.limits.broken(self.link.status(), state, seen, self.clock.time_us())
         return None if ending is None else ending.reason
 
@@ -135,7 +137,9 @@ class Pilot:
         sent_us = clock.time_us()
         if stop.is_set():
             return None
-        # Somebody may have taken over while this was decided.
+        # The watchdog may have left offboard, or somebody taken over, while this was decided.
+        if self.watchdog.left_offboard:
+            return "watchdog"
         limits = self.limits
         if limits is not None and (ending := limits.not_ours(self.link.status(), sent_us)):
             return ending.reason

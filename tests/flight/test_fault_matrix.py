@@ -152,7 +152,7 @@ def test_a_stopped_run_goes_on_where_it_was(
     [
         ({"phases": ["dinner"]}, "phases 'dinner': accepted: ground, climb"),
         ({"faults": ["gps off at 3s"]}, "without a time"),
-        ({"faults": ["link cut"]}, "nobody is at the link here"),
+        ({"faults": ["link cut"]}, "it flies alone here"),
     ],
 )
 def test_what_cannot_be_flown_gets_one_line(fields: dict[str, object], line: str) -> None:

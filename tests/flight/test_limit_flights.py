@@ -94,7 +94,10 @@ def test_a_picture_that_stays_is_not_flown_on() -> None:
 
 
 def test_telemetry_that_stays_is_not_flown_on() -> None:
+    """The vehicle still hears us: it is told to hold, and no answer comes."""
     record = flown(faults=("downlink cut at offboard+500ms",)).record
     assert record.outcome is Outcome.ABORTED
-    assert "telemetry frozen" in record.reason
-    assert any("has not changed for 2." in note for note in record.notes)
+    assert "link lost" in record.reason
+    notes = "; ".join(record.notes)
+    assert "telemetry frozen: position has not changed for 2." in notes
+    assert "leaving offboard failed" in notes
