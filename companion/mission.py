@@ -85,6 +85,7 @@ def fly_mission(
         mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
+    navigating = False
     limits = Limits(limit_settings, goal, pilot_settings, mount_pitch_up_rad)
     pilot = Pilot(
         *(link, frames, policy, watchdog, clock, pilot_settings),
@@ -102,6 +103,7 @@ def fly_mission(
         progress("navigating")
         watchdog.begin()
         guard.start(watchdog)
+        navigating = True
         reason = pilot.fly(goal, stop)
     except LinkError as error:
         reason = str(error)
@@ -119,17 +121,21 @@ def fly_mission(
         reason = LINK_LOST
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
+    if navigating and not (watchdog.left_offboard or abandon.is_set()):
+        # Whatever ended it, somebody may have taken over meanwhile.
+        limits.not_ours(link.status(), clock.time_us())
     notes = list(watchdog.notes)
     if limits.ending is not None:
         notes.append(str(limits.ending))
+    taken = limits.ending is not None and limits.ending.reason in NOT_OURS
     try:
-        if reason in NOT_OURS:
+        if taken:
             link.release()
         elif abandon.is_set() or lost or reason == TELEMETRY_FROZEN:
             # A lost link may be lost one way only: MAVSDK must not go on repeating the last
             # setpoint to a vehicle that still hears it.
             link.leave_offboard()
-        if reason not in NOT_OURS and not (abandon.is_set() or lost):
+        if not (taken or abandon.is_set() or lost):
             progress("landing")
             if not watchdog.left_offboard and reason != TELEMETRY_FROZEN:
                 link.set_velocity_body(STOP)

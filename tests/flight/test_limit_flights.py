@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from airl_mav.core.constants import US_PER_S
@@ -28,7 +30,12 @@ FAR_SEED = 3
 class Creeps:
     """Flies ahead slowly, and never arrives."""
 
+    def __init__(self, begins: Callable[[], None] = lambda: None) -> None:
+        """Take what is called with every decision."""
+        self._begins = begins
+
     def act(self, observation: Observation) -> Action:
+        self._begins()
         return Action(0.5, 0.0, 0.0)
 
 
@@ -37,8 +44,10 @@ def flown(**changes: object) -> FlownEpisode:
     return fly(scenario, scenario.fresh_policy(FAR_SEED), 0, FAR_SEED)
 
 
-@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.RETURN])
-def test_who_takes_over_has_the_vehicle(mode: Mode) -> None:
+@pytest.mark.parametrize(
+    ("mode", "breaks"), [(Mode.HOLD, False), (Mode.RETURN, False), (Mode.HOLD, True)]
+)
+def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
     """At most one heartbeat later nothing more is sent, and no mode is asked for."""
     scenario = demo_scenario(policy="greedy")
     setup = EpisodeSetup(scenario.vehicle, scenario.arena_of(FAR_SEED), FAR_SEED)
@@ -47,6 +56,13 @@ def test_who_takes_over_has_the_vehicle(mode: Mode) -> None:
     """What was flown, and since when [µs]."""
 
     with Stage(transport_us=TRANSPORT_US) as stage:
+
+        def break_after_a_long_thought() -> None:
+            now_us = stage.clock.time_us()
+            if breaks and modes[-1][0] is Mode.OFFBOARD and now_us - modes[-1][1] > 2 * US_PER_S:
+                stage.clock.sleep_until(now_us + 19 * US_PER_S // 10)
+                if modes[-1][0] is mode:
+                    raise ZeroDivisionError
 
         def take_over(simulation: Simulation) -> None:
             autopilot = simulation.autopilot
@@ -59,10 +75,12 @@ def test_who_takes_over_has_the_vehicle(mode: Mode) -> None:
 
         stage.firmware.on_tick = take_over
 
+        policy = Creeps(break_after_a_long_thought)
+
         def program() -> None:
             results.append(
                 fly_mission(
-                    *(stage.link, stage.camera, Creeps(), (500.0, 0.0), stage.clock),
+                    *(stage.link, stage.camera, policy, (500.0, 0.0), stage.clock),
                     *(stage.abandon, stage.abandon, lambda _: None),
                     pilot_settings=PilotSettings(),
                     watchdog_settings=WatchdogSettings(),
@@ -80,7 +98,7 @@ def test_who_takes_over_has_the_vehicle(mode: Mode) -> None:
         accepted_us = simulation.recorder.setpoints.arrays()["accepted_us"]
         assert simulation.autopilot.flight.phase is Phase.AIR
     (result,) = results
-    assert result.reason == "taken over"
+    assert result.reason == ("policy failed: ZeroDivisionError: " if breaks else "taken over")
     assert result.notes[-1].startswith("taken over: the mode is ")
     assert [each for each, _ in modes[-2:]] == [Mode.OFFBOARD, mode]
     assert accepted_us.max() <= modes[-1][1] + US_PER_S + US_PER_S // 2
