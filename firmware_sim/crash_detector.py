@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
-from firmware_sim.plant.world import FLOOR
 from firmware_sim.simulation import Simulation
 
 TOUCHDOWN_M_S = 2.0

@@ -19,6 +19,7 @@ from airl_mav.core.constants import TICK_S
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -28,11 +29,11 @@ TICKS = 400
 """Enough for the estimator to converge and the vehicle to arm and spin."""
 
 
-def warm_up(vehicle: VehicleProfile) -> None:
-    """Fly a moment in simulated time, through everything a real flight uses."""
+def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:
+    """Fly a moment in simulated time, through everything that a real flight on a plant uses."""
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
-    setup = EpisodeSetup(vehicle, arena, 0)
+    setup = EpisodeSetup(vehicle, arena, 0, Aircraft(plant=plant))
     autopilot = builtin_autopilot(setup)
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]

@@ -108,5 +108,17 @@ def kernel(function: F) -> F:
     constant, from a changed file would go on running the old code, also after an upgrade of the
     package. So each is kept in a folder of its file and of all that this imports.
     """
+    return _compiled(function, forceinline=True)
+
+
+def large_kernel(function: F) -> F:
+    """Compile a function with numba, called and not inlined.
+
+    For what is long and rarely needed: inlined, it would be compiled again with each caller.
+    """
+    return _compiled(function, forceinline=False)
+
+
+def _compiled(function: F, *, forceinline: bool) -> F:
     with _caching_in(cache_folder(function.__code__.co_filename)):
-        return cast(F, njit(cache=True, nogil=True, forceinline=True)(function))
+        return cast(F, njit(cache=True, nogil=True, forceinline=forceinline)(function))

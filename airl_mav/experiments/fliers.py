@@ -50,7 +50,7 @@ class LockstepFlier:
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
         """Load everything; see `Flier`."""
         scenario = self.scenario
-        warm_up(scenario.vehicle)
+        warm_up(scenario.vehicle, scenario.scenario.plant)
         log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
 
         def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:

@@ -53,7 +53,7 @@ def rehearse(
         LockstepError: The companion hangs, or broke.
     """
     observer.waiting("loading")
-    warm_up(scenario.vehicle)
+    warm_up(scenario.vehicle, scenario.scenario.plant)
     for index, seed in enumerate(scenario.seeds):
         if index in done:
             continue

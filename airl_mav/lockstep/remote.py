@@ -166,7 +166,7 @@ def fly_vehicle_in_lockstep(
         closing(CameraServer(f"tcp://{asked.bind}:{ports.camera_port or '*'}")) as camera,
     ):
         episode, goal = episode_of(asked, vehicle, computer_w)
-        warm_up(vehicle)
+        warm_up(vehicle, asked.plant)
         stage = RemoteStage(asked, endpoint, camera, broken_off=stop.is_set, say=listener.say)
         with closing(stage):
             stage.firmware.on_message = listener.text

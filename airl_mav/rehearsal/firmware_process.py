@@ -246,7 +246,7 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
         log=None if begin.log is None else Path(begin.log),
     )
     with closing(firmware):
-        warm_up(scenario.vehicle)
+        warm_up(scenario.vehicle, scenario.scenario.plant)
         channel.send(Ready())
         Service(firmware, channel, scenario).run(requests)
 

@@ -80,7 +80,7 @@ def fly_vehicle(
         firmware.on_message = listener.text
         firmware.on_log_lost = listener.say
         episode, goal = episode_of(asked, vehicle, computer_w)
-        warm_up(vehicle)
+        warm_up(vehicle, asked.plant)
         if (hint := how_to_start(asked, vehicle)) is not None:
             listener.waiting(hint)
         firmware.load(episode, asked.tlog, unix_us())

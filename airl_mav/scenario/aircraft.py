@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,7 +25,22 @@ GREATEST_INSTANCE = 9
 """PX4's instances above share one API port, 14549 (px4-rc.mavlink)."""
 
 EstimatorName = Literal["kernel", "filterpy"]
+PlantName = Literal["pybullet", "kernel"]
 FirmwareName = Literal["builtin", "px4", "ardupilot", "px4-hitl"]
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ImportError:
+        # Whoever keeps imports in check may refuse the very question.
+        return False
+
+
+HAS_PYBULLET = _is_installed("pybullet")
+"""Whether pybullet is installed here."""
+
+DEFAULT_PLANT: PlantName = "pybullet" if HAS_PYBULLET else "kernel"
 
 FREE = "decides no flight"
 """Marks a field that may differ when a run is resumed."""
@@ -132,6 +148,12 @@ class Aircraft(ProfileModel):
         default="kernel",
         description="filter of the state estimator: the compiled one, or filterpy's, its reference,"
         " some twenty times slower",
+    )
+    plant: PlantName = Field(
+        default=DEFAULT_PLANT,
+        description="what moves the vehicle's body, and finds what it touches: pybullet, or the"
+        " batch twin's compiled rigid body with contacts of its own, which needs no pybullet and"
+        " is the default where that is not installed; level gym has neither",
     )
     firmware: FirmwareName = Field(
         default="builtin",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
 from airl_mav.faults.twin import TWIN, check_twin
-from airl_mav.scenario.aircraft import GREATEST_PORT, NO_TWIN, Aircraft, Ports
+from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
 
 SITL_SPEEDS = 0.5, 10.0
@@ -57,6 +57,14 @@ def check_faults(asked: Aircraft, level: LevelName) -> None:
             raise FieldError(
                 "faults", str(fault), "with firmware builtin: real firmware has links of its own"
             )
+
+
+def check_plant(asked: Aircraft) -> None:
+    """Raise FieldError for a plant that is not installed here."""
+    if asked.plant == "pybullet" and not HAS_PYBULLET:
+        accepted = "kernel: pybullet is not installed (it has wheels for CPython 3.10 and 3.11 on"
+        accepted += " Linux x86-64)"
+        raise FieldError("plant", asked.plant, accepted)
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:

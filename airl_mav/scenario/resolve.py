@@ -13,7 +13,7 @@ from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.scenario.checks import check_firmware, check_level, check_ports
+from airl_mav.scenario.checks import check_firmware, check_level, check_plant, check_ports
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -27,6 +27,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
             arena can be made of the first seed. `FieldError`s name the field.
     """
     check_level(scenario)
+    if scenario.level != "gym":
+        check_plant(scenario)
     check_firmware(scenario, scenario.level, scenario.speed)
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: it cannot be "any free one" here.

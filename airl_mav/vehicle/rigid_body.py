@@ -24,6 +24,63 @@ def drag_force(velocity: Vec, wind: Vec, airframe: Airframe) -> Vec:
 
 
 @kernel
+def accelerate(
+    velocity: Vec, q: Quat, omega: Vec, force: Vec, torque: Vec, airframe: Airframe, dt: float
+) -> tuple[Vec, Vec]:
+    """Return the velocities of a free body after dt [s].
+
+    Args:
+        velocity: NED [m/s].
+        q: Attitude body -> world.
+        omega: Angular velocity FRD [rad/s].
+        force: All forces but gravity, NED [N].
+        torque: FRD [N m].
+        airframe: Mass and inertia.
+        dt: Step [s].
+
+    Returns:
+        Velocity [m/s] and angular velocity [rad/s], both NED.
+    """
+    m = airframe.mass
+    vx = velocity[0] + force[0] / m * dt
+    vy = velocity[1] + force[1] / m * dt
+    vz = velocity[2] + (force[2] / m + GRAVITY_M_S2) * dt
+    ix, iy, iz = airframe.inertia_xx, airframe.inertia_yy, airframe.inertia_zz
+    p, r_, s = omega
+    # Euler's equations: I dw/dt = torque - w x (I w)
+    wx = p + (torque[0] - (iz - iy) * r_ * s) / ix * dt
+    wy = r_ + (torque[1] - (ix - iz) * s * p) / iy * dt
+    wz = s + (torque[2] - (iy - ix) * p * r_) / iz * dt
+    # Bullet keeps the new angular velocity in world axes of the old attitude while it turns.
+    return (vx, vy, vz), rotate(q, (wx, wy, wz))
+
+
+@kernel
+def drift(position: Vec, velocity: Vec, q: Quat, spin: Vec, dt: float) -> tuple[Vec, Quat, Vec]:
+    """Move a body by dt [s] at constant velocities.
+
+    Args:
+        position: NED [m].
+        velocity: NED [m/s].
+        q: Attitude body -> world.
+        spin: Angular velocity NED [rad/s].
+        dt: Step [s].
+
+    Returns:
+        Position NED [m], attitude, angular velocity FRD [rad/s] after the step.
+    """
+    dq = exponential((spin[0] * dt, spin[1] * dt, spin[2] * dt))
+    q_new = normalize(multiply(dq, q))
+    body = rotate((q_new[0], -q_new[1], -q_new[2], -q_new[3]), spin)
+    here = (
+        position[0] + velocity[0] * dt,
+        position[1] + velocity[1] * dt,
+        position[2] + velocity[2] * dt,
+    )
+    return here, q_new, body
+
+
+@kernel
 def step(
     position: Vec,
     velocity: Vec,
@@ -49,24 +106,6 @@ def step(
     Returns:
         Position, velocity, attitude, angular velocity after the step.
     """
-    m = airframe.mass
-    vx = velocity[0] + force[0] / m * dt
-    vy = velocity[1] + force[1] / m * dt
-    vz = velocity[2] + (force[2] / m + GRAVITY_M_S2) * dt
-    ix, iy, iz = airframe.inertia_xx, airframe.inertia_yy, airframe.inertia_zz
-    p, r_, s = omega
-    # Euler's equations: I dw/dt = torque - w x (I w)
-    wx = p + (torque[0] - (iz - iy) * r_ * s) / ix * dt
-    wy = r_ + (torque[1] - (ix - iz) * s * p) / iy * dt
-    wz = s + (torque[2] - (iy - ix) * p * r_) / iz * dt
-    # Bullet keeps the new angular velocity in world axes of the old attitude while it turns.
-    world = rotate(q, (wx, wy, wz))
-    dq = exponential((world[0] * dt, world[1] * dt, world[2] * dt))
-    q_new = normalize(multiply(dq, q))
-    body = rotate((q_new[0], -q_new[1], -q_new[2], -q_new[3]), world)
-    return (
-        (position[0] + vx * dt, position[1] + vy * dt, position[2] + vz * dt),
-        (vx, vy, vz),
-        q_new,
-        body,
-    )
+    v, spin = accelerate(velocity, q, omega, force, torque, airframe, dt)
+    p, q_new, body = drift(position, v, q, spin, dt)
+    return p, v, q_new, body

@@ -1,4 +1,4 @@
-"""Forces, power and battery of the vehicle, computed around pybullet's step: compiled."""
+"""Forces, power and battery of the vehicle, computed around the body's step: compiled."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from airl_mav.vehicle.power import (
     standing_power_w,
 )
 from airl_mav.vehicle.rigid_body import drag_force
-from airl_mav.vehicle.rotation import Quat, Vec, rotate
+from airl_mav.vehicle.rotation import Vec, rotate
 from airl_mav.vehicle.rotor import settle, wrench
-from firmware_sim.plant.kinematics import from_bullet, quaternion, rates, velocity
+from firmware_sim.plant.kinematics import quaternion, rates, velocity
 
 Speeds = tuple[float, float, float, float]
 """Of the rotors, as fractions of the speed at full command."""
@@ -41,7 +41,7 @@ def pack_row(battery: Battery) -> tuple[float, ...]:
 def actuate(
     speeds: Speeds, motors: Speeds, row: Vector, wind: Vector, airframe: Vector, left: float
 ) -> tuple[Speeds, Vec, Vec, Vec]:
-    """Turn motor commands into the force and torque that pybullet applies for one tick.
+    """Turn motor commands into the force and torque that act on the body for one tick.
 
     Args:
         speeds: Of the rotors.
@@ -52,7 +52,7 @@ def actuate(
         left: Share of a speed error that a tick leaves (`rotor.lag`).
 
     Returns:
-        Rotor speeds after the tick; in ENU the centre of mass [m], the force without gravity [N]
+        Rotor speeds after the tick; in NED the centre of mass [m], the force without gravity [N]
         and the torque [N m].
     """
     a = airframe_of(airframe)
@@ -67,9 +67,9 @@ def actuate(
     lift = rotate(q, (0.0, 0.0, -thrust))
     drag = drag_force(velocity(row), (wind[0], wind[1], wind[2]), a)
     turn = rotate(q, (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2]))
-    here = (row[1], row[0], -row[2])
-    force = (lift[1] + drag[1], lift[0] + drag[0], -(lift[2] + drag[2]))
-    return s, here, force, (turn[1], turn[0], -turn[2])
+    here = (row[0], row[1], row[2])
+    force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
+    return s, here, force, turn
 
 
 @kernel
@@ -81,10 +81,6 @@ def supply(power: float, charge: float, pack: Vector) -> Supply:
 
 @kernel
 def absorb(
-    at: Vec,
-    orientation: Quat,
-    linear: Vec,
-    angular: Vec,
     before: Vector,
     row: Vector,
     wind: Vector,
@@ -98,15 +94,11 @@ def absorb(
     computer_w: float,
     tick_s: float,
 ) -> tuple[float, Vec, Supply, float]:
-    """Read pybullet's state after a tick: the motion, the power used, the charge left.
+    """Work out the power used in a tick and the charge that is left.
 
     Args:
-        at: Position ENU [m].
-        orientation: FLU -> ENU, xyzw.
-        linear: Velocity ENU [m/s].
-        angular: Angular velocity ENU [rad/s].
         before: (16,) the motion before the tick.
-        row: (16,) overwritten with the motion after it.
+        row: (16,) the motion after it.
         wind: (3,) NED [m/s].
         speeds: Of the rotors.
         standing: In touch with something.
@@ -122,12 +114,6 @@ def absorb(
         Power over the tick [W], without the computer's; the acceleration after it; the battery
         monitor's reading; the state of charge after it.
     """
-    accel = (
-        (linear[1] - before[3]) / tick_s,
-        (linear[0] - before[4]) / tick_s,
-        (-linear[2] - before[5]) / tick_s,
-    )
-    from_bullet(at, orientation, linear, angular, accel, row)
     m, a = power_model_of(power), airframe_of(airframe)
     thrust, _ = wrench(speeds[0], speeds[1], speeds[2], speeds[3], a)
     if standing:

@@ -52,8 +52,40 @@ def force(row: Vector) -> Vec:
 
 
 @kernel
+def write(p: Vec, v: Vec, q: Quat, omega: Vec, before: Vector, tick_s: float, row: Vector) -> None:
+    """Write a motion as a row.
+
+    Args:
+        p: Position NED [m].
+        v: Velocity NED [m/s].
+        q: Attitude body -> NED.
+        omega: Angular velocity FRD [rad/s].
+        before: (16,) the motion a tick before: the acceleration is the velocity's change.
+        tick_s: Length of the tick [s].
+        row: (16,) overwritten.
+    """
+    accel = (
+        (v[0] - before[3]) / tick_s,
+        (v[1] - before[4]) / tick_s,
+        (v[2] - before[5]) / tick_s,
+    )
+    felt = rotate(conjugate(q), (accel[0], accel[1], accel[2] - GRAVITY_M_S2))
+    row[0], row[1], row[2] = p
+    row[3], row[4], row[5] = v
+    row[6], row[7], row[8], row[9] = q
+    row[10], row[11], row[12] = omega
+    row[13], row[14], row[15] = felt
+
+
+@kernel
 def from_bullet(
-    at: Vec, orientation: Quat, linear: Vec, angular: Vec, accel: Vec, row: Vector
+    at: Vec,
+    orientation: Quat,
+    linear: Vec,
+    angular: Vec,
+    before: Vector,
+    tick_s: float,
+    row: Vector,
 ) -> None:
     """Write pybullet's state as a row: NED / FRD.
 
@@ -65,7 +97,8 @@ def from_bullet(
         orientation: FLU -> ENU, xyzw.
         linear: Velocity ENU [m/s].
         angular: Angular velocity ENU [rad/s].
-        accel: Acceleration NED, gravity removed [m/s²].
+        before: (16,) the motion a tick before.
+        tick_s: Length of the tick [s].
         row: (16,) overwritten.
     """
     x, y, z, w = orientation
@@ -75,9 +108,5 @@ def from_bullet(
         q = (-q[0], -q[1], -q[2], -q[3])
     body = conjugate(q)
     omega = rotate(body, (angular[1], angular[0], -angular[2]))
-    felt = rotate(body, (accel[0], accel[1], accel[2] - GRAVITY_M_S2))
-    row[0], row[1], row[2] = at[1], at[0], -at[2]
-    row[3], row[4], row[5] = linear[1], linear[0], -linear[2]
-    row[6], row[7], row[8], row[9] = q
-    row[10], row[11], row[12] = omega
-    row[13], row[14], row[15] = felt
+    p, v = (at[1], at[0], -at[2]), (linear[1], linear[0], -linear[2])
+    write(p, v, q, omega, before, tick_s, row)

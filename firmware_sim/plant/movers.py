@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from firmware_sim.plant.bullet import pybullet
+from firmware_sim.plant.tours import place_at, tour_arrays
 
 MARGIN_M = 0.5
 """Bodies are updated within this distance beyond contact. pybullet detects contacts before it moves
@@ -49,16 +49,7 @@ def _due(
     """
     count = 0
     for i in range(len(leg)):
-        t = (time_us / US_PER_S) % times_s[i, 0]
-        passed = times_s[i, 1:]
-        k = leg[i] if passed[leg[i]] <= t else 0
-        while passed[k + 1] <= t:
-            k += 1
-        leg[i] = k
-        # The order of numpy.interp, so that body and picture agree to the last bit.
-        a, b, step = points[i, k], points[i, k + 1], passed[k + 1] - passed[k]
-        north = (b[0] - a[0]) / step * (t - passed[k]) + a[0]
-        east = (b[1] - a[1]) / step * (t - passed[k]) + a[1]
+        north, east = place_at(time_us, times_s, points, leg, i)
         north_off, east_off = north - vehicle[0], east - vehicle[1]
         north_stands, east_stands = place[i, 0] - vehicle[0], place[i, 1] - vehicle[1]
         away = min(
@@ -90,15 +81,9 @@ class Movers:
             attitudes: Of the bodies, FLU -> ENU.
             radius_m: No part of the vehicle is further from its centre than this [m].
         """
-        obstacles, first = arena.obstacles, arena.n_static
-        n, k = len(bodies), max((len(tour.times_s) for tour in arena.tours), default=1)
+        obstacles, first, n = arena.obstacles, arena.n_static, len(bodies)
         self._bodies, self._attitudes = list(bodies), list(attitudes)
-        self._times_s = np.full((n, 1 + k), np.inf)
-        self._points = np.zeros((n, k, 2))
-        for i, tour in enumerate(arena.tours):
-            self._times_s[i, 0] = tour.times_s[-1]
-            self._times_s[i, 1 : 1 + len(tour.times_s)] = tour.times_s
-            self._points[i, : len(tour.points)] = tour.points
+        self._times_s, self._points = tour_arrays(arena)
         half = obstacles.half_size[first:]
         is_box = obstacles.shape[first:] == Shape.BOX
         bounding = np.where(is_box, np.hypot(half[:, 0], half[:, 1]), half[:, 0])

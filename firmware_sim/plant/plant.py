@@ -1,9 +1,9 @@
-"""The plant: a pybullet body with rotors, drag, battery and sensors, in an arena."""
+"""The plant: a body with rotors, drag, battery and sensors, in an arena."""
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,11 +15,12 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import PowerModel, standing_power_w
-from airl_mav.vehicle.rotation import Vec
+from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import lag
 from airl_mav.vehicle.wind import Wind
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
-from firmware_sim.plant.bullet import pybullet
+from firmware_sim.plant.bodies import new_body
+from firmware_sim.plant.body import FLOOR, Body, Touch
 from firmware_sim.plant.dynamics import (
     Speeds,
     absorb,
@@ -27,17 +28,13 @@ from firmware_sim.plant.dynamics import (
     pack_row,
     supply,
 )
-from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY, WIDTH, from_bullet
+from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.plant.world import FLOOR, World
 
 REST_SPEED_M_S = 0.1
 """Touching the floor slower than this is resting, no collision (AirSim's kRestingVelocityMax)."""
 
 STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
-
-_ANY_LINK = -2
-"""pybullet's filter of contacts that lets all links pass."""
 
 
 class Blowing(Protocol):
@@ -80,16 +77,13 @@ class Plant:
             rng: All randomness of sensors and wind.
             start_us: Simulated time of the first state [µs].
             aircraft: What was asked of it: wind as `wind_of_episode` returns it, sensors, charge of
-                the battery; None = the defaults.
+                the battery, which body; None = the defaults.
             airframe: This vehicle's own; None = that of the profile.
             rate_hz: Ticks a second.
             computer_w: What the onboard computer draws from the pack [W].
         """
         tick_s = 1.0 / rate_hz
         asked = aircraft or Aircraft()
-        body = profile.body
-        diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
-        self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self.collisions: list[Collision] = []
         """Latched collision events, oldest first."""
         airframe = airframe or Airframe.from_profile(profile)
@@ -116,9 +110,10 @@ class Plant:
         self.power_w = standing_power_w(0.0, airframe, model)
         """Electrical power over the newest tick, without the onboard computer's [W]."""
         self._felt: Vec = (0.0, 0.0, 0.0)
-        self._body = self._build_body(profile, airframe)
-        self._touching: set[int] = set()
-        self.motion = self._read()
+        self.body: Body = new_body(asked.plant, arena, profile.body, airframe, tick_s)
+        """What is moved among the bodies of the arena."""
+        self._touching: frozenset[int] = frozenset()
+        self.motion = self.body.rest()
         """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
         load_w = self.power_w + computer_w
         self._battery = BatterySample(*supply(load_w, self.battery_remaining, self._pack))
@@ -129,8 +124,8 @@ class Plant:
         self.collisions.clear()
 
     def close(self) -> None:
-        """Release the physics server."""
-        self.world.close()
+        """Release what the body holds."""
+        self.body.close()
 
     @property
     def position(self) -> tuple[float, float, float]:
@@ -140,31 +135,19 @@ class Plant:
 
     def step(self, controls: ActuatorControls) -> SensorSample:
         """Apply motor commands for one tick and return what the sensors then measure."""
-        world, body, before = self.world, self._body, self.motion
-        client, wind = world.number, self.wind.step()
+        body, before, wind = self.body, self.motion, self.wind.step()
         # An empty battery turns no motor.
         motors = controls.motors if self.battery_remaining > 0.0 else STOPPED
         speeds, here, force, torque = actuate(
             self._speeds, motors, before, wind, self._airframe, self._left
         )
-        pybullet.applyExternalForce(body, -1, force, here, pybullet.WORLD_FRAME, client)
-        pybullet.applyExternalTorque(body, -1, torque, pybullet.WORLD_FRAME, client)
         self._ticks += 1
         # Of the count: not every rate has a period of whole microseconds.
         self.time_us = self._start_us + self._ticks * US_PER_S // self._rate_hz
-        world.move_obstacles(self.time_us - self._moves_us, before)
-        pybullet.stepSimulation(client)
-        contacts = pybullet.getContactPoints(body, -1, _ANY_LINK, _ANY_LINK, client)
-        if contacts or self._touching:
-            self._watch(contacts, before)
-        at, orientation = pybullet.getBasePositionAndOrientation(body, client)
-        linear, angular = pybullet.getBaseVelocity(body, client)
-        self.motion = np.empty(WIDTH)
+        self.motion = body.move(here, force, torque, before, self.time_us - self._moves_us)
+        if body.touch.close or self._touching:
+            self._watch(body.touch, before)
         self.power_w, self._felt, reading, self.battery_remaining = absorb(
-            at,
-            orientation,
-            linear,
-            angular,
             before,
             self.motion,
             wind,
@@ -198,54 +181,33 @@ class Plant:
             self.battery_remaining,
         )
 
-    def _build_body(self, profile: VehicleProfile, airframe: Airframe) -> int:
-        client, body = self.world.client, profile.body
-        half = (0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m)
-        shape = client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
-        number = client.createMultiBody(
-            baseMass=airframe.mass,
-            baseCollisionShapeIndex=shape,
-            basePosition=(0.0, 0.0, half[2]),
-            # Facing north: forward = +y of ENU, a quarter turn about up.
-            baseOrientation=(0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)),
-        )
-        client.changeDynamics(
-            number,
-            -1,
-            localInertiaDiagonal=(
-                airframe.inertia_xx,
-                airframe.inertia_yy,
-                airframe.inertia_zz,
-            ),
-            linearDamping=0.0,
-            angularDamping=0.0,
-            restitution=0.0,
-            lateralFriction=0.8,
-            rollingFriction=0.0,
-            activationState=pybullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-        )
-        return int(number)
+    def put(
+        self,
+        position: Vec,
+        velocity: Vec = (0.0, 0.0, 0.0),
+        quaternion: Quat = (1.0, 0.0, 0.0, 0.0),
+        rates: Vec = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Put the vehicle somewhere; what it touched and hit so far is forgotten.
 
-    def _read(self) -> Vector:
-        """Return pybullet's state as a row, the vehicle taken to be at rest or in steady flight."""
-        client = self.world.number
-        at, orientation = pybullet.getBasePositionAndOrientation(self._body, client)
-        linear, angular = pybullet.getBaseVelocity(self._body, client)
-        row = np.empty(WIDTH)
-        from_bullet(at, orientation, linear, angular, (0.0, 0.0, 0.0), row)
-        return row
+        Args:
+            position: NED [m].
+            velocity: NED [m/s].
+            quaternion: Body -> NED.
+            rates: Angular velocity FRD [rad/s].
+        """
+        self.motion = self.body.put(position, velocity, quaternion, rates)
+        self._touching = frozenset()
+        self.collisions.clear()
 
-    def _watch(self, contacts: tuple[tuple[Any, ...], ...], before: Vector) -> None:
+    def _watch(self, touch: Touch, before: Vector) -> None:
         """Latch every new contact; a contact that lasts is one event."""
-        # Index 2 is body B, index 9 the normal force: 0 = close but not touching. Contacts flicker:
-        # one has ended when the bodies are no longer close.
-        close = {contact[2] for contact in contacts}
-        pressed = {contact[2] for contact in contacts if contact[9] > 0.0}
-        touching = pressed | (self._touching & close)
+        # Contacts flicker: one has ended when the bodies are no longer close.
+        touching = touch.pressed | (self._touching & touch.close)
         if touching - self._touching:
             speed = math.sqrt(sum(v * v for v in before[VELOCITY].tolist()))
             for other in sorted(touching - self._touching):
-                name = self.world.names[other]
+                name = self.body.names[other]
                 if name != FLOOR or speed > REST_SPEED_M_S:
                     self.collisions.append(Collision(self.time_us, name, speed))
         self._touching = touching

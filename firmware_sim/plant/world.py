@@ -15,13 +15,9 @@ from airl_mav.core.frames import (
     quat_ned_frd_to_enu_flu,
     quat_wxyz_to_xyzw,
 )
+from firmware_sim.plant.body import FLOOR, obstacle_name, walls_of
 from firmware_sim.plant.bullet import NO_CLIENT, connect, number_of, pybullet
 from firmware_sim.plant.movers import Movers, Xyzw
-
-WALL_THICKNESS_M = 0.2
-
-FLOOR = "floor"
-"""Name of the floor in a collision event."""
 
 
 def facing(yaw: float) -> Xyzw:
@@ -92,16 +88,9 @@ class World:
         return int(self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half))
 
     def _add_walls(self, arena: Arena) -> None:
-        b = arena.bounds
-        t, h = 0.5 * WALL_THICKNESS_M, 0.5 * b.height
-        north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
-        half_n, half_e = 0.5 * (b.north_max - b.north_min), 0.5 * (b.east_max - b.east_min)
-        # Inner faces stand on the bounds. A box's own axes are forward, left, up.
-        along_east, along_north = (t, half_e + 2 * t, h), (half_n + 2 * t, t, h)
-        self._add(self._box(along_east), np.array([b.north_max + t, east, -h]), LEVEL, "wall-north")
-        self._add(self._box(along_east), np.array([b.north_min - t, east, -h]), LEVEL, "wall-south")
-        self._add(self._box(along_north), np.array([north, b.east_max + t, -h]), LEVEL, "wall-east")
-        self._add(self._box(along_north), np.array([north, b.east_min - t, -h]), LEVEL, "wall-west")
+        # A box's own axes are forward, left, up.
+        for name, center, half in walls_of(arena):
+            self._add(self._box(half), np.array(center), LEVEL, name)
 
     def _add_obstacles(self, arena: Arena) -> tuple[list[int], list[Xyzw]]:
         """Return the obstacles' bodies and attitudes."""
@@ -117,8 +106,6 @@ class World:
                 )
             else:
                 shape = self.client.createCollisionShape(pybullet.GEOM_SPHERE, radius=x)
-            kind = Shape(int(o.shape[i])).name.lower()
-            name = f"{'moving' if i >= arena.n_static else 'static'}-{kind}-{i}"
             attitudes.append(facing(float(o.yaw[i])))
-            bodies.append(self._add(shape, o.center[i], attitudes[i], name))
+            bodies.append(self._add(shape, o.center[i], attitudes[i], obstacle_name(arena, i)))
         return bodies, attitudes

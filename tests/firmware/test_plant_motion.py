@@ -25,10 +25,7 @@ HOVER = quad().body.mass_kg * GRAVITY_M_S2 / (4 * quad().rotor.thrust_max_n)
 def plant() -> Iterator[Plant]:
     """Return a quad 50 m up, facing north, at rest."""
     plant = Plant(quad(), None, np.random.default_rng(0))
-    client, body = plant.world.client, plant._body
-    _, attitude = client.getBasePositionAndOrientation(body)
-    client.resetBasePositionAndOrientation(body, (0.0, 0.0, 50.0), attitude)
-    plant.motion = plant._read()
+    plant.put((0.0, 0.0, -50.0))
     yield plant
     plant.close()
 

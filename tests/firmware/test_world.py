@@ -16,6 +16,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import ned_to_enu
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.plant import REST_SPEED_M_S, Plant
 from firmware_sim.plant.world import World, facing
@@ -150,15 +151,12 @@ class PlainWorld:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_is_hit_and_when_is_as_in_plain_pybullet(seed: int) -> None:
     place = crowd(seed)
-    plant, plain = Plant(VEHICLE, place, np.random.default_rng(0)), PlainWorld(place)
+    bullet = Aircraft(plant="pybullet")
+    plant = Plant(VEHICLE, place, np.random.default_rng(0), aircraft=bullet)
+    plain = PlainWorld(place)
     names: set[str] = set()
     for position, velocity in throws(seed, place):
-        client, body = plant.world.client, plant._body
-        client.resetBasePositionAndOrientation(body, ned_to_enu(position), FACING_NORTH)
-        client.resetBaseVelocity(body, ned_to_enu(velocity), (0.0, 0.0, 0.0))
-        plant.motion = plant._read()
-        plant._touching.clear()
-        plant.collisions.clear()
+        plant.put(tuple(position), tuple(velocity))
         for _ in range(THROW_TICKS):
             plant.step(OFF)
         hits = [(hit.time_us, hit.what) for hit in plant.collisions]

@@ -7,8 +7,8 @@ import pytest
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
 from firmware_sim.crash_detector import is_crash
+from firmware_sim.plant.body import FLOOR
 from firmware_sim.plant.plant import Collision
-from firmware_sim.plant.world import FLOOR
 
 
 @pytest.mark.parametrize(

@@ -31,6 +31,7 @@ from airl_mav.vehicle.spread import draw_airframe
 from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.plant.bullet import pybullet
+from firmware_sim.plant.bullet_body import BulletBody
 from firmware_sim.plant.camera_server import DepthCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation
@@ -86,7 +87,8 @@ def test_a_simulation_draws_what_the_twin_draws() -> None:
         plant = Simulation(
             EpisodeSetup(QUAD, None, seed, asked), start_us=0, clock=SimClock()
         ).plant
-        body = pybullet.getDynamicsInfo(plant._body, -1, plant.world.number)
+        assert isinstance(plant.body, BulletBody)
+        body = pybullet.getDynamicsInfo(plant.body.number, -1, plant.body.world.number)
         row = twin.fleet.airframe[0]
         assert row.tolist() == list(plant._airframe)
         assert body[0] == row[0] != QUAD.body.mass_kg

@@ -73,10 +73,7 @@ class PlantPilot:
         )
         self.plant.battery_remaining = battery
         self.energy = 0.0
-        client, body = self.plant.world.client, self.plant._body
-        half = math.sqrt(0.5)
-        client.resetBasePositionAndOrientation(body, (0, 0, altitude_m), (0, 0, half, half))
-        self.plant.motion = self.plant._read()
+        self.plant.put((0.0, 0.0, -altitude_m))
         a = airframe
         self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
         self.memory = new_memory()

@@ -65,12 +65,9 @@ def in_the_plant(profile: VehicleProfile) -> Measured:
     # A hover is not stable by itself: each tick it is put back where it was.
     share = profile.body.mass_kg * G / (4 * profile.rotor.thrust_max_n)
     hovering = ActuatorControls(0, (share,) * 4, True)
-    client, body = plant.world.client, plant._body
-    half = math.sqrt(0.5)
 
     def still() -> None:
-        client.resetBasePositionAndOrientation(body, (0, 0, 50), (0, 0, half, half))
-        client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
+        plant.put((0.0, 0.0, -50.0))
         plant.step(hovering)
 
     for _ in range(75):
@@ -165,12 +162,9 @@ def test_a_mass_off_the_centre_turns_the_plant_by_its_weight() -> None:
         update={"drag": profile.drag.model_copy(update={"angular_n_m_s": 0.0})}
     )
     plant = Plant(profile, None, np.random.default_rng(0))
-    client, body = plant.world.client, plant._body
     share = profile.body.mass_kg * G / (4 * profile.rotor.thrust_max_n)
-    half = math.sqrt(0.5)
     for _ in range(100):
-        client.resetBasePositionAndOrientation(body, (0, 0, 50), (0, 0, half, half))
-        client.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0))
+        plant.put((0.0, 0.0, -50.0))
         plant.step(ActuatorControls(0, (share,) * 4, True))
     rates = plant.truth().angular_velocity
     inertia = profile.body.inertia_xx_kg_m2, profile.body.inertia_yy_kg_m2

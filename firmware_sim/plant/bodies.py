@@ -1,0 +1,31 @@
+"""The body that a scenario asks for, by its name."""
+
+from __future__ import annotations
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.profiles.vehicle import Body as BodyProfile
+from airl_mav.scenario.aircraft import PlantName
+from airl_mav.vehicle.airframe import Airframe
+from firmware_sim.plant.body import Body
+
+
+def new_body(
+    name: PlantName, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
+) -> Body:
+    """Return a vehicle's body at rest on the floor at the start, facing north.
+
+    Args:
+        name: Which of them.
+        arena: Where; None = an endless floor.
+        body: Its collision box.
+        airframe: Its mass and inertia.
+        tick_s: Length of a tick [s].
+    """
+    # Imported here: pybullet is not everywhere, and numba compiles what is imported.
+    if name == "kernel":
+        from firmware_sim.plant.kernel_body import KernelBody
+
+        return KernelBody(arena, body, airframe, tick_s)
+    from firmware_sim.plant.bullet_body import BulletBody
+
+    return BulletBody(arena, body, airframe, tick_s)

@@ -1,0 +1,233 @@
+"""Contacts of the vehicle's box with walls and obstacles: closed forms and separating axes.
+
+Everything is done in the obstacle's own axes, where it is a box, an upright cylinder or a sphere
+around the origin. The axis along which two bodies are furthest apart, or least into each other,
+gives the contact's normal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from airl_mav.arena.geometry import Shape
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, rotate
+from firmware_sim.plant.contacts.box import corner_of, note, reach_along
+
+_BOX = int(Shape.BOX)
+_CYLINDER = int(Shape.CYLINDER)
+_SPHERE = int(Shape.SPHERE)
+
+_LEVEL_M = 0.01
+"""Corners of the vehicle this much further out than the deepest one touch with it [m]."""
+
+_BESIDE_M = 1e-3
+"""A corner touches what lies under it, and this far around [m]."""
+
+_STEPS = 30
+"""Projections to and fro that find where two bodies touch that do so with no corner."""
+
+_PARALLEL = 1e-6
+"""Edges whose product is shorter have no axis of their own."""
+
+_MOST_AXES = 23
+"""Axes that may separate the vehicle from a box (15), or from a cylinder (7, and 16 of corners)."""
+
+
+@kernel
+def _clamped(x: float, most: float) -> float:
+    return min(max(x, -most), most)
+
+
+@kernel
+def nearest_point(kind: int, size: Vec, x: Vec) -> Vec:
+    """Return the point of an obstacle around the origin that is nearest to x; x itself if inside.
+
+    Args:
+        kind: Shape.
+        size: Its half extents, as `Obstacles.half_size` [m].
+        x: In the obstacle's axes [m].
+    """
+    if kind == _BOX:
+        return _clamped(x[0], size[0]), _clamped(x[1], size[1]), _clamped(x[2], size[2])
+    if kind == _CYLINDER:
+        away = math.hypot(x[0], x[1])
+        k = 1.0 if away <= size[0] else size[0] / away
+        return k * x[0], k * x[1], _clamped(x[2], size[2])
+    away = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    k = 1.0 if away <= size[0] else size[0] / away
+    return k * x[0], k * x[1], k * x[2]
+
+
+@kernel
+def _support(kind: int, size: Vec, n: Vec) -> float:
+    """Return how far a box or cylinder reaches from its centre along a unit vector [m]."""
+    if kind == _BOX:
+        return abs(n[0]) * size[0] + abs(n[1]) * size[1] + abs(n[2]) * size[2]
+    return math.hypot(n[0], n[1]) * size[0] + abs(n[2]) * size[2]
+
+
+@kernel
+def separation(kind: int, size: Vec, d: Vec, q: Quat, half: Vector) -> tuple[float, Vec]:
+    """Return how far the vehicle is from a box or cylinder [m], and the unit axis to it.
+
+    Below zero: how far into it. Above zero a lower bound, exact where faces or the side of a
+    cylinder are nearest.
+
+    Args:
+        kind: Shape.
+        size: Half extents of the obstacle [m].
+        d: The vehicle's centre, in the obstacle's axes [m].
+        q: Attitude of the vehicle in the obstacle's axes.
+        half: (3,) half extents of the vehicle [m].
+    """
+    axes = np.zeros((_MOST_AXES, 3))
+    axes[0, 2] = axes[1, 0] = axes[2, 1] = 1.0
+    count = 3 if kind == _BOX else 1
+    edges = (
+        rotate(q, (1.0, 0.0, 0.0)),
+        rotate(q, (0.0, 1.0, 0.0)),
+        rotate(q, (0.0, 0.0, 1.0)),
+    )
+    for i in range(3):
+        e = edges[i]
+        axes[count, 0], axes[count, 1], axes[count, 2] = e
+        axes[count + 1, 0], axes[count + 1, 1] = -e[1], e[0]
+        count += 2
+        if kind == _BOX:
+            axes[count, 1], axes[count, 2] = -e[2], e[1]
+            axes[count + 1, 0], axes[count + 1, 2] = e[2], -e[0]
+            count += 2
+    if kind == _CYLINDER:
+        for i in range(8):
+            c = rotate(q, corner_of(i, half))
+            x = (d[0] + c[0], d[1] + c[1], d[2] + c[2])
+            o = nearest_point(kind, size, x)
+            axes[count, 0], axes[count, 1] = x[0], x[1]
+            axes[count + 1, 0], axes[count + 1, 1] = x[0] - o[0], x[1] - o[1]
+            axes[count + 1, 2] = x[2] - o[2]
+            count += 2
+    best, n = -math.inf, (0.0, 0.0, -1.0)
+    for j in range(count):
+        x, y, z = axes[j, 0], axes[j, 1], axes[j, 2]
+        length = math.sqrt(x * x + y * y + z * z)
+        if length < _PARALLEL:
+            continue
+        along = (x * d[0] + y * d[1] + z * d[2]) / length
+        k = 1.0 / length if along >= 0.0 else -1.0 / length
+        a = (k * x, k * y, k * z)
+        apart = abs(along) - _support(kind, size, a) - reach_along(q, half, a)
+        if apart > best:
+            best, n = apart, a
+    return best, n
+
+
+@kernel
+def _meeting_point(
+    kind: int, size: Vec, d: Vec, q: Quat, half: Vector, apart: float, n: Vec
+) -> Vec:
+    """Return where the vehicle touches an obstacle, as an arm from its centre [m].
+
+    The vehicle is taken to be moved along the normal until the two just touch.
+    """
+    at = (d[0] - apart * n[0], d[1] - apart * n[1], d[2] - apart * n[2])
+    back = conjugate(q)
+    arm = (0.0, 0.0, 0.0)
+    for _ in range(_STEPS):
+        o = nearest_point(kind, size, (at[0] + arm[0], at[1] + arm[1], at[2] + arm[2]))
+        b = rotate(back, (o[0] - at[0], o[1] - at[1], o[2] - at[2]))
+        arm = rotate(q, (_clamped(b[0], half[0]), _clamped(b[1], half[1]), _clamped(b[2], half[2])))
+    return arm
+
+
+@kernel
+def _touch_sphere(radius: float, d: Vec, q: Quat, half: Vector) -> tuple[float, Vec, Vec]:
+    """Return the distance to a sphere [m], the unit axis to the vehicle, and the arm [m]."""
+    b = rotate(conjugate(q), (-d[0], -d[1], -d[2]))
+    c = (_clamped(b[0], half[0]), _clamped(b[1], half[1]), _clamped(b[2], half[2]))
+    off = (c[0] - b[0], c[1] - b[1], c[2] - b[2])
+    away = math.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+    if away > 0.0:
+        n = rotate(q, (off[0] / away, off[1] / away, off[2] / away))
+        return away - radius, n, rotate(q, c)
+    # The centre is inside the vehicle: out through the face that is nearest.
+    room = (half[0] - abs(b[0]), half[1] - abs(b[1]), half[2] - abs(b[2]))
+    axis = 0
+    for i in range(1, 3):
+        if room[i] < room[axis]:
+            axis = i
+    sign = -1.0 if b[axis] > 0.0 else 1.0
+    out = (
+        sign if axis == 0 else 0.0,
+        sign if axis == 1 else 0.0,
+        sign if axis == 2 else 0.0,
+    )
+    face = (b[0] - out[0] * room[0], b[1] - out[1] * room[1], b[2] - out[2] * room[2])
+    return -room[axis] - radius, rotate(q, out), rotate(q, face)
+
+
+@large_kernel
+def touch_obstacle(
+    kind: int,
+    size: Vec,
+    center: Vec,
+    yaw: float,
+    p: Vec,
+    q: Quat,
+    half: Vector,
+    close: float,
+    rows: Vector,
+    count: int,
+    owner: int,
+) -> int:
+    """Find the contacts with a wall or an obstacle.
+
+    As in Bullet, boxes touch where they overlap, and cylinders and spheres are close already
+    before.
+
+    Args:
+        kind: Shape.
+        size: Half extents [m].
+        center: NED [m].
+        yaw: Heading of a box's first axis [rad].
+        p: Of the vehicle's centre, NED [m].
+        q: Attitude of the vehicle, body -> NED.
+        half: (3,) half extents of its box [m].
+        close: Cylinders and spheres further off are no contact [m].
+        rows: (MOST, ROW) contacts; written from `count` on.
+        count: How many there are already.
+        owner: Whose contacts these are.
+
+    Returns:
+        How many there are now.
+    """
+    turn = (math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw))
+    d = rotate(conjugate(turn), (p[0] - center[0], p[1] - center[1], p[2] - center[2]))
+    q = multiply(conjugate(turn), q)
+    if kind == _SPHERE:
+        apart, n, arm = _touch_sphere(size[0], d, q, half)
+        if apart < close:
+            count = note(rows, count, rotate(turn, arm), rotate(turn, n), apart, owner)
+        return count
+    apart, n = separation(kind, size, d, q, half)
+    if apart >= (0.0 if kind == _BOX else close):
+        return count
+    normal, face, before = rotate(turn, n), _support(kind, size, n), count
+    for k in range(8):
+        arm = rotate(q, corner_of(k, half))
+        x = (d[0] + arm[0], d[1] + arm[1], d[2] + arm[2])
+        off = n[0] * x[0] + n[1] * x[1] + n[2] * x[2] - face
+        if off > apart + _LEVEL_M or off > close:
+            continue
+        under = (x[0] - off * n[0], x[1] - off * n[1], x[2] - off * n[2])
+        o = nearest_point(kind, size, under)
+        beside = (under[0] - o[0]) ** 2 + (under[1] - o[1]) ** 2 + (under[2] - o[2]) ** 2
+        if beside < _BESIDE_M * _BESIDE_M:
+            count = note(rows, count, rotate(turn, arm), normal, off, owner)
+    if count == before:
+        arm = _meeting_point(kind, size, d, q, half, apart, n)
+        count = note(rows, count, rotate(turn, arm), normal, apart, owner)
+    return count
