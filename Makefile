@@ -13,8 +13,8 @@ SPREAD := --dist loadgroup --no-loadscope-reorder
 
 comma := ,
 
-# pybullet has wheels for CPython 3.10 and 3.11 only. PYTHON=python3.10, given to make or in the
-# environment, says which of them.
+# PYTHON=python3.12, given to make or in the environment, says which one. pybullet has wheels for
+# CPython 3.10 and 3.11 only; with a newer one the kernel plant flies.
 INTERPRETER := $(shell PYTHON='$(PYTHON)' scripts/find-python)
 
 # Containers often set it: every process would then compile every module that it imports, of the

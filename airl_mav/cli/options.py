@@ -344,7 +344,7 @@ def _fail(message: str) -> None:
 
 EXTRAS = {
     "profile": ("onnx",),
-    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pybullet", "pymavlink", "scipy"),
+    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
 }
 """What the extras install, by their names in pyproject.toml."""
