@@ -55,6 +55,8 @@ class ZmqFrameSource:
         """
         self.malformed = 0
         """Messages that were no frames, or frames of another size than the first one's."""
+        self.failure: str | None = None
+        """Why no more frames come: never known here, as a publisher may start at any time."""
         self._clock = clock
         self._newest: ReceivedFrame | None = None
         self._owns_context = context is None

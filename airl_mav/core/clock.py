@@ -124,3 +124,11 @@ class Patience:
 def utc_now() -> datetime:
     """Return the calendar time, for names and log headers; never for timing."""
     return datetime.now(timezone.utc)
+
+
+def utc_us() -> int:
+    """Return the calendar time since 1970 [µs], for stamps that a driver took from it.
+
+    It may jump, so nothing waits by it.
+    """
+    return time.time_ns() // NS_PER_US

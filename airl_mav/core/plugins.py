@@ -47,9 +47,10 @@ NETWORKS = Door("network.kind", "airl_mav.networks", "a class of SB3's BaseFeatu
 LAYOUTS = Door("layout", "airl_mav.layouts", "a class with methods boxes and encode")
 ACTION_SETS = Door("actions", "airl_mav.action_sets", "a class with a method commands")
 GENERATORS = Door("generator", "airl_mav.generators", "a function that makes an Arena")
+CAMERAS = Door("camera", "airl_mav.cameras", "a class with a lens and a method read")
 MODELS = Door("model", "airl_mav.models", "a torch.nn.Module, or what makes one without arguments")
 
-DOORS = (POLICIES, REWARDS, NETWORKS, LAYOUTS, ACTION_SETS, GENERATORS, MODELS)
+DOORS = (POLICIES, REWARDS, NETWORKS, LAYOUTS, ACTION_SETS, GENERATORS, CAMERAS, MODELS)
 
 
 def names_code(name: str) -> bool:

@@ -22,11 +22,10 @@ from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.camera import open_camera
 from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.program import prepare
+from companion.program import mission_camera, prepare
 from companion.timesync import TimesyncLink
 
 GOAL = 9_000.0, 0.0
@@ -134,7 +133,7 @@ def _fly(
     limited = DecisionLimit(mission.policy, decisions, stop, bar)
     clock, abandon = WallClock(), threading.Event()
     with (
-        closing(open_camera(asked.camera, clock)) as frames,
+        closing(mission_camera(asked, mission, clock)) as frames,
         closing(TimesyncLink(asked.connect, clock, abandon)) as link,
     ):
         link.connect(asked.connect_timeout, stop)

@@ -1,0 +1,77 @@
+"""The camera that `--camera` names: an address, a RealSense, or a driver of the user's."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.clock import Clock
+from airl_mav.core.errors import FieldError
+from airl_mav.core.plugins import CAMERAS, load_part, reference
+from companion.camera import FrameSource, open_camera
+from companion.cameras.driver import CameraThread, DepthCamera
+from companion.cameras.fitting import Fitting, check_coverage
+
+REALSENSE = "realsense"
+
+
+class OpenCamera(FrameSource, Protocol):
+    """A frame source that is let go of in the end, and that says why it fell silent."""
+
+    @property
+    def failure(self) -> str | None:
+        """Return why no more frames come; None: they do, or it is not known."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        ...
+
+
+def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -> OpenCamera:
+    """Open a camera by its name.
+
+    Args:
+        name: tcp://HOST:PORT or ipc://PATH; "realsense", "realsense:SERIAL" or
+            "realsense:FILE.bag"; FILE.py:NAME, MODULE:NAME or the entry point of a driver.
+        clock: The companion's, for the stamps.
+        wanted: What images of a driver are made into; an address sends what it sends.
+        whose: Whose camera `wanted` is: "vehicle quad".
+
+    Raises:
+        FieldError: There is no such camera, or it sees too little of what is wanted.
+    """
+    if "://" in name:
+        return open_camera(name, clock)
+    camera = _driver(name)
+    fitting = Fitting(camera.lens, wanted)
+    try:
+        check_coverage(name, camera.lens, fitting, whose)
+    except FieldError:
+        camera.close()
+        raise
+    return CameraThread(name, camera, clock, fitting)
+
+
+def _driver(name: str) -> DepthCamera:
+    brand, _, which = name.partition(":")
+    if brand == REALSENSE:
+        try:
+            # Imported when it is asked for: few companions have one.
+            from companion.cameras.realsense import open_realsense
+        except ImportError as error:
+            raise FieldError(
+                "camera", name, problem=f"needs librealsense (pip install pyrealsense2): {error}"
+            ) from None
+        return open_realsense(which)
+    if reference(CAMERAS, name) is None:
+        accepted = "tcp://HOST:PORT, ipc://PATH, realsense, FILE.py:NAME or MODULE:NAME"
+        raise FieldError("camera", name, accepted)
+    made = load_part(CAMERAS, name, lambda part: callable(getattr(part, "read", None)))
+    try:
+        camera: DepthCamera = made()
+    except Exception as error:
+        # What a driver raises when its camera is not there.
+        told = " ".join(f"{type(error).__name__}: {error}".split())
+        raise FieldError("camera", name, problem=told) from error
+    return camera

@@ -1,0 +1,117 @@
+"""What a camera driver is, and the thread that keeps its newest image as a frame.
+
+A driver is a class made without arguments. It has a `lens`, and `read` waits for the next image.
+Everything else (the thread, the time stamps, the size that the policy was trained with) is done
+here, once for every camera.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import traceback
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import Frame
+from airl_mav.core.clock import Clock
+from companion.camera import ReceivedFrame
+from companion.cameras.fitting import Fitting, Lens
+
+READ_S = 0.1
+"""A driver is asked for its next image for this long at a time [s], so that it can be closed."""
+
+
+class DepthImage(NamedTuple):
+    """One image of a camera, as its driver returns it."""
+
+    depth_mm: NDArray[np.uint16]  # (height, width) along the optical axis [mm]; 0 = no return
+    age_us: int
+    """Time since the exposure, by the driver's stamps [µs]; 0 where it has none."""
+
+
+class DepthCamera(Protocol):
+    """A camera of the companion computer's."""
+
+    @property
+    def lens(self) -> Lens:
+        """Return the lens; it stays the same."""
+        ...
+
+    def read(self, timeout_s: float) -> DepthImage | None:
+        """Wait for the next image; None when the time is over [s]. Called from one thread.
+
+        May raise anything: the camera then counts as failed.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        ...
+
+
+class CameraThread:
+    """The newest image of a driver, as a frame of the wanted size. Implements `FrameSource`."""
+
+    def __init__(self, name: str, camera: DepthCamera, clock: Clock, fitting: Fitting) -> None:
+        """Start to read.
+
+        Args:
+            name: What the camera is called in messages.
+            camera: The driver; closed by `close`.
+            clock: The companion's, for the stamps.
+            fitting: What makes its images those that the policy was trained with.
+        """
+        self.failure: str | None = None
+        """Why no more images come, once the driver has raised."""
+        self._name, self._camera, self._clock, self._fitting = name, camera, clock, fitting
+        self._newest: ReceivedFrame | None = None
+        self._changed = threading.Condition()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._read_on, name="camera", daemon=True)
+        self._thread.start()
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the newest frame so far, without waiting; None before the first."""
+        return self._newest
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen; see `FrameSource`."""
+        with self._changed:
+            arrived = self._changed.wait_for(
+                lambda: (
+                    self._newest is not None and self._newest.frame.sequence != newer_than_sequence
+                ),
+                timeout_s,
+            )
+            return self._newest if arrived else None
+
+    def close(self) -> None:
+        """End the thread and let go of the camera."""
+        self._ended.set()
+        self._thread.join(10.0 * READ_S)
+        self._camera.close()
+
+    def _read_on(self) -> None:
+        sequence = 0
+        try:
+            while not self._ended.is_set():
+                image = self._camera.read(READ_S)
+                if image is None:
+                    continue
+                taken_us = self._clock.time_us() - image.age_us
+                # Fitted before the stamp of arrival: it is part of how long a frame takes.
+                depth_mm = self._fitting.fit(image.depth_mm)
+                frame = Frame(sequence, taken_us, depth_mm, self._fitting.wanted)
+                received = ReceivedFrame(frame, self._clock.time_us())
+                with self._changed:
+                    self._newest = received
+                    self._changed.notify_all()
+                sequence += 1
+        except Exception as error:
+            # A driver may raise anything. The watchdog stops the vehicle: no frame comes.
+            told = " ".join(f"{type(error).__name__}: {error}".split())
+            self.failure = f"camera {self._name} failed: {told}"
+            traceback.print_exc(file=sys.stderr)

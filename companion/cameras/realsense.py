@@ -1,0 +1,144 @@
+"""Intel RealSense depth cameras, through librealsense (the extra `realsense`), and its recordings.
+
+The sensor is opened by itself, without a pipeline: a queue of one frame keeps the newest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyrealsense2 as rs
+
+from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.core.clock import utc_us
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import FieldError
+from companion.cameras.driver import DepthImage
+from companion.cameras.fitting import Lens
+
+RATE_HZ = 30
+WIDTH_PX = 848
+"""The stereo modules of the D400 family match best at 848 x 480 (Intel, "Tuning depth cameras for
+best performance")."""
+
+RECORDINGS = ".bag", ".db3"
+"""Files of librealsense's recorder, by its version."""
+
+FAILED_S = 5.0
+"""A camera that delivers nothing for so long has failed [s of waiting]."""
+
+
+class RealSense:
+    """The depth stream of one device. Implements `driver.DepthCamera`."""
+
+    def __init__(self, device: Any, utc_now_us: Callable[[], int] = utc_us) -> None:
+        """Start the depth stream of a device of librealsense's.
+
+        Args:
+            device: `pyrealsense2.device`: a camera, a recording that is played, or a software one.
+            utc_now_us: The host's calendar time [µs], by which librealsense stamps images.
+
+        Raises:
+            FieldError: It has no depth stream.
+        """
+        self._device, self._utc_now_us = device, utc_now_us
+        self._sensor, profile = _depth_stream(device)
+        k = profile.as_video_stream_profile().intrinsics
+        self._lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
+        self._queue = rs.frame_queue(1)
+        self._silent_s = 0.0
+        self._sensor.open(profile)
+        self._sensor.start(self._queue)
+
+    @property
+    def lens(self) -> Lens:
+        """Return the lens of the depth stream, which librealsense delivers rectified."""
+        return self._lens
+
+    def read(self, timeout_s: float) -> DepthImage | None:
+        """Wait for the next image; see `driver.DepthCamera`.
+
+        Raises RuntimeError when none has come for 5 s: the camera was unplugged, or a recording is
+        over.
+        """
+        arrived, frame = self._queue.try_wait_for_frame(int(timeout_s * US_PER_S / US_PER_MS))
+        if not arrived:
+            self._silent_s += timeout_s
+            if self._silent_s >= FAILED_S:
+                raise RuntimeError(f"no image for {FAILED_S:g} s")
+            return None
+        self._silent_s = 0.0
+        depth = frame.as_depth_frame()
+        # Copied: librealsense reuses the memory once the frame is gone.
+        image = np.array(depth.get_data(), np.uint16)
+        unit_mm = depth.get_units() * MM_PER_M
+        if abs(unit_mm - 1.0) > 1e-6:
+            image = np.clip(np.rint(image * unit_mm), 0, MAX_MM).astype(np.uint16)
+        return DepthImage(image, self._age_us(depth))
+
+    def close(self) -> None:
+        """Stop the stream."""
+        self._sensor.stop()
+        self._sensor.close()
+
+    def _age_us(self, frame: Any) -> int:
+        """Return how old an image is [µs]; 0 where it is stamped by the camera's own clock."""
+        if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
+            return 0
+        age_us = self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS)
+        # The calendar may have been set since, and a recording is of another day.
+        return age_us if 0 <= age_us <= US_PER_S else 0
+
+
+def open_realsense(which: str) -> RealSense:
+    """Open a camera, or a recording.
+
+    Args:
+        which: "" for the first camera; a serial number; or a path that ends in .bag or .db3.
+
+    Raises:
+        FieldError: There is no such camera or file, or it has no depth stream.
+    """
+    context = rs.context()
+    if which.endswith(RECORDINGS):
+        if not Path(which).is_file():
+            raise FieldError("camera", f"realsense:{which}", problem="no such file")
+        try:
+            return RealSense(context.load_device(which))
+        except RuntimeError as error:
+            raise FieldError("camera", f"realsense:{which}", problem=str(error)) from None
+    found = {each.get_info(rs.camera_info.serial_number): each for each in context.query_devices()}
+    if not found:
+        raise FieldError("camera", _name(which), problem="librealsense finds no camera")
+    if which and which not in found:
+        raise FieldError("camera", _name(which), f"realsense:{' or realsense:'.join(found)}")
+    try:
+        return RealSense(found[which] if which else next(iter(found.values())))
+    except RuntimeError as error:
+        # Another program has it, or the bus is too slow.
+        raise FieldError("camera", _name(which), problem=str(error)) from None
+
+
+def _name(which: str) -> str:
+    return f"realsense:{which}" if which else "realsense"
+
+
+def _depth_stream(device: Any) -> tuple[Any, Any]:
+    """Return the sensor and the profile that fit best: 848 pixels wide, 30 images a second."""
+    offered = [
+        (sensor, profile)
+        for sensor in device.query_sensors()
+        for profile in sensor.get_stream_profiles()
+        if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16
+    ]
+    if not offered:
+        raise FieldError("camera", "realsense", problem="the device has no depth stream")
+
+    def fit(offer: tuple[Any, Any]) -> tuple[int, int]:
+        profile = offer[1].as_video_stream_profile()
+        return abs(profile.width() - WIDTH_PX), abs(profile.fps() - RATE_HZ)
+
+    return min(offered, key=fit)
