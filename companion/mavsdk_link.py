@@ -41,6 +41,13 @@ OFFBOARD_SETTLE_S = 0.1
 """Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know: a
 setpoint that comes within some 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
 
+OFFBOARD_REPEAT_S = 0.05
+"""Time between two zero setpoints while a switch to offboard is waited for [s]: MAVSDK's 20 Hz; PX4
+wants them at more than 2 Hz."""
+
+TEXT_CHARACTERS = 50
+"""Length of a STATUSTEXT."""
+
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
@@ -224,8 +231,13 @@ class MavsdkLink:
     @property
     def healthy(self) -> bool:
         """Whether the flight controller reports good sensors and that it may be armed."""
+        return not self.missing_health()
+
+    def missing_health(self) -> list[str]:
+        """Return what the flight controller does not report as good, in words."""
         health = self._telemetry.health()
-        return all(getattr(health, flag) for flag in self.dialect.health)
+        flags = [flag for flag in self.dialect.health if not getattr(health, flag)]
+        return [flag.removeprefix("is_").removesuffix("_ok").replace("_", " ") for flag in flags]
 
     @property
     def armed(self) -> bool:
@@ -294,6 +306,30 @@ class MavsdkLink:
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
+    def await_offboard(self, stop: threading.Event) -> None:
+        """Send zero velocity until somebody else has switched a flying vehicle to offboard.
+
+        PX4 takes no switch to offboard without setpoints, and MAVSDK stops repeating them with
+        every heartbeat of another mode. `stop`, set from outside, ends the wait.
+        """
+        while not self._flies_offboard():
+            self._check(None, stop=stop)
+            self.set_velocity_body(STOP)
+            self._pause(OFFBOARD_REPEAT_S)
+
+    def _flies_offboard(self) -> bool:
+        status = self.status()
+        return status.armed and status.offboard and bool(self._telemetry.in_air())
+
+    def tell(self, text: str) -> None:
+        """Send a text for the pilot and the ground station, cut to 50 characters.
+
+        Lost where the flight controller does not forward it.
+        """
+        if self._texts is None:
+            self._texts = ServerUtility(self._system)
+        self._texts.send_status_text(StatusTextType.INFO, text[:TEXT_CHARACTERS])
+
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
         self.setpoints_sent += 1
@@ -333,14 +369,16 @@ class MavsdkLink:
     def _deadline(self, timeout_s: float) -> int:
         return self._clock.time_us() + int(timeout_s * US_PER_S)
 
-    def _check(self, deadline_us: int, message: str, stop: threading.Event | None = None) -> None:
+    def _check(
+        self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
+    ) -> None:
         if not self.connected:
             raise LinkError("the flight controller is no longer heard")
         if self._abandon.is_set():
             raise LinkError("abandoned")
         if stop is not None and stop.is_set():
             raise LinkError("stopped")
-        if self._clock.time_us() >= deadline_us:
+        if deadline_us is not None and self._clock.time_us() >= deadline_us:
             raise LinkError(message)
 
     def _pause(self, seconds: float = POLL_S) -> None:

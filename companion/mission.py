@@ -1,4 +1,4 @@
-"""One mission: connect, arm, take off, fly the policy to the goal, land."""
+"""One mission: arm, take off, fly the policy to the goal, land; or from a pilot and back to him."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
+from airl_mav.scenario.stand_alone import Start
 from companion.camera import FrameSource
 from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
@@ -63,6 +64,7 @@ def fly_mission(
     latency: LatencySampler | None = None,
     compensator: Compensator | None = None,
     mount_pitch_up_rad: float = 0.0,
+    start: Start = "arm",
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
 
@@ -83,6 +85,8 @@ def fly_mission(
         latency: Where to draw t2 from, to fly as a slower computer.
         compensator: Carries forward what is seen; None: the policy sees what is.
         mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
+        start: Whether this program arms, takes off and lands, or a pilot who hands the vehicle over
+            in flight and gets it back in Hold.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
@@ -94,12 +98,7 @@ def fly_mission(
         limits=limits,
     )
     try:
-        progress("arming")
-        link.prepare(PREPARE_TIMEOUT_S, stop)
-        link.arm(link.dialect.arm_timeout_s, stop)
-        progress("taking off")
-        link.takeoff(pilot_settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
-        link.enter_offboard()
+        _begin(link, start, pilot_settings.altitude_m, stop, progress)
         progress("navigating")
         watchdog.begin()
         guard.start(watchdog)
@@ -129,17 +128,21 @@ def fly_mission(
         notes.append(str(limits.ending))
     taken = limits.ending is not None and limits.ending.reason in NOT_OURS
     try:
-        if taken:
+        if taken or (start == "offboard" and not navigating):
+            # Nothing may be repeated into a later switch to offboard, either.
             link.release()
         elif abandon.is_set() or lost or reason == TELEMETRY_FROZEN:
             # A lost link may be lost one way only: MAVSDK must not go on repeating the last
             # setpoint to a vehicle that still hears it.
             link.leave_offboard()
         if not (taken or abandon.is_set() or lost):
-            progress("landing")
-            if not watchdog.left_offboard and reason != TELEMETRY_FROZEN:
+            left = watchdog.left_offboard or reason == TELEMETRY_FROZEN
+            if start == "arm":
+                _land(link, left, progress)
+            elif navigating and not left:
+                progress("handing back")
                 link.set_velocity_body(STOP)
-            link.land(LAND_TIMEOUT_S)
+                link.leave_offboard()
     except LinkError as error:
         notes.append(str(error))
         if reason == TELEMETRY_FROZEN:
@@ -147,6 +150,32 @@ def fly_mission(
             reason = LINK_LOST
     progress("done")
     return MissionResult(reason, tuple(notes), pilot.log)
+
+
+def _begin(
+    link: MavsdkLink,
+    start: Start,
+    altitude_m: float,
+    stop: threading.Event,
+    progress: Callable[[str], None],
+) -> None:
+    """Return once the vehicle flies our setpoints. Raises LinkError."""
+    progress("arming" if start == "arm" else "waiting for offboard")
+    link.prepare(PREPARE_TIMEOUT_S, stop)
+    if start == "offboard":
+        link.await_offboard(stop)
+        return
+    link.arm(link.dialect.arm_timeout_s, stop)
+    progress("taking off")
+    link.takeoff(altitude_m, TAKEOFF_TIMEOUT_S, stop)
+    link.enter_offboard()
+
+
+def _land(link: MavsdkLink, left_offboard: bool, progress: Callable[[str], None]) -> None:
+    progress("landing")
+    if not left_offboard:
+        link.set_velocity_body(STOP)
+    link.land(LAND_TIMEOUT_S)
 
 
 def check_camera(

@@ -6,16 +6,16 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.clock import WallClock
+from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
     check_quota,
@@ -24,7 +24,7 @@ from airl_mav.scenario.piloting import (
     select_latency,
 )
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
-from companion.camera import open_camera
+from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
@@ -48,8 +48,13 @@ class Mission:
     """Where t2 is drawn from; None injects nothing."""
     compensator: Compensator | None
     """Carries forward what is seen; None: the policy sees what is."""
-    mount_pitch_up_rad: float
-    """How far the camera looks up, as it is mounted [rad]."""
+    vehicle: VehicleProfile
+    """The aircraft: what its camera is, and how it is mounted."""
+
+    @property
+    def mount_pitch_up_rad(self) -> float:
+        """How far the camera looks up, as it is mounted [rad]."""
+        return math.radians(self.vehicle.camera.pitch_up_deg)
 
 
 def prepare(asked: StandAloneCompanion) -> Mission:
@@ -80,8 +85,14 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         limits,
         sampler,
         compensator,
-        math.radians(vehicle.camera.pitch_up_deg),
+        vehicle,
     )
+
+
+def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -> OpenCamera:
+    """Open the camera that is asked for. Raises FieldError when it cannot be used."""
+    wanted = Intrinsics.of(mission.vehicle.camera)
+    return open_named_camera(asked.camera, clock, wanted, f"vehicle {asked.vehicle}")
 
 
 def fly_alone(
@@ -107,16 +118,22 @@ def fly_alone(
         LinkError: No flight controller is heard, or it was lost.
     """
     clock = WallClock(asked.speed)
+
+    def begin(phase: str) -> None:
+        progress(phase, clock.time_us())
+        if phase != "done":
+            link.tell(f"airl: {phase}")
+
     with (
         held_to(asked.cpu_quota),
-        closing(open_camera(asked.camera, clock)) as frames,
+        closing(mission_camera(asked, mission, clock)) as frames,
         signed(asked.connect, asked.signing_key) as url,
         closing(MavsdkLink(url, clock, abandon)) as link,
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)
         check_camera(mission.policy, frames, stop, mission.compensator)
-        return fly_mission(
+        result = fly_mission(
             link,
             frames,
             mission.policy,
@@ -124,7 +141,7 @@ def fly_alone(
             clock,
             stop,
             abandon,
-            lambda phase: progress(phase, clock.time_us()),
+            begin,
             pilot_settings=mission.pilot,
             watchdog_settings=mission.watchdog,
             limit_settings=mission.limits,
@@ -132,4 +149,9 @@ def fly_alone(
             latency=mission.latency,
             compensator=mission.compensator,
             mount_pitch_up_rad=mission.mount_pitch_up_rad,
+            start=asked.start,
         )
+        link.tell(f"airl: {result.reason}")
+        if frames.failure is not None:
+            return replace(result, notes=(*result.notes, frames.failure))
+        return result

@@ -12,8 +12,9 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.files import save_arrays
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.conducted import Abandoned
+from companion.ground_check import check_on_ground
 from companion.interfaces import LinkError
-from companion.program import fly_alone, prepare
+from companion.program import Mission, fly_alone, prepare
 
 
 class CompanionOptions(StandAloneCompanion):
@@ -22,6 +23,7 @@ class CompanionOptions(StandAloneCompanion):
     Examples:
         airl-companion --goal 20 5
         airl-companion --connect serial:///dev/ttyAMA0:921600 --camera tcp://192.168.1.10:5600
+        airl-companion --check --camera realsense --policy policies/mine
         airl-companion --lockstep --goal 20 5     (with airl-firmware --lockstep)
     """
 
@@ -44,6 +46,8 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)
+    if options.check:
+        return show_check(options, mission, stop, console)
     what = "simulator" if options.lockstep else "flight controller"
 
     def waiting() -> None:
@@ -74,6 +78,19 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
     if result.reason == "goal reached":
         return 0
     return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
+
+
+def show_check(
+    options: CompanionOptions, mission: Mission, stop: threading.Event, console: Console
+) -> int:
+    """Say what is found on the ground, line by line; exit status 0 all is good, 1 it is not."""
+    console.print(f"looking at {options.camera} and {options.connect}", markup=False)
+    good = True
+    for finding in check_on_ground(options, mission, stop):
+        good &= finding.good
+        mark, colour = ("ok", "green") if finding.good else ("WRONG", "red")
+        console.print(f"{finding.what:<18} {mark:<6} {finding.told}", style=colour, markup=False)
+    return 0 if good and not stop.is_set() else EXIT_BROKEN
 
 
 if __name__ == "__main__":

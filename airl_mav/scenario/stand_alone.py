@@ -14,7 +14,7 @@ from airl_mav.core.ports import LOOPBACK
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.checks import check_faults, check_firmware, check_ports
+from airl_mav.scenario.checks import check_faults, check_firmware, check_plant, check_ports
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
@@ -138,6 +138,10 @@ class StandAloneVehicle(Aircraft):
         return self.speed if isinstance(self.speed, float) else None
 
 
+Start = Literal["arm", "offboard"]
+"""Who begins a flight: the companion, or a pilot."""
+
+
 class CompanionAddresses(ProfileModel):
     """Where a companion by itself finds the flight controller and the camera."""
 
@@ -147,7 +151,10 @@ class CompanionAddresses(ProfileModel):
         " serial://DEVICE:BAUD",
     )
     camera: str = Field(
-        default="tcp://127.0.0.1:5600", description="ZeroMQ address of the depth camera"
+        default="tcp://127.0.0.1:5600",
+        description="depth camera: the ZeroMQ address of its publisher (tcp://HOST:PORT, ipc://PATH);"
+        " realsense, realsense:SERIAL or realsense:FILE.bag; a driver of your own, FILE.py:NAME or"
+        " MODULE:NAME",
     )
 
 
@@ -163,10 +170,21 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     goal: tuple[float, float] = Field(
         default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
     )
+    start: Start = Field(
+        default="arm",
+        description="arm: arms, takes off, flies to the goal and lands; offboard: a pilot"
+        " takes off and hands over in flight by switching to Offboard (ArduPilot: GUIDED); the"
+        " companion gives the vehicle back in Hold and never arms or lands it",
+    )
     vehicle: str = Field(
         default="quad",
         description="vehicle profile: its response to setpoints and its camera's mount are what"
         " compensation reckons with",
+    )
+    check: bool = Field(
+        default=False,
+        description="look at camera, flight controller and policy on the ground, say what is wrong,"
+        " and end: nothing is armed, no setpoint is sent",
     )
     lockstep: bool = Field(
         default=False,
@@ -206,6 +224,7 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
     level: LevelName = "lockstep" if asked.lockstep else "sitl"
     if asked.signing_key is not None and (asked.lockstep or asked.firmware != "builtin"):
         raise FieldError("signing_key", asked.signing_key, "without lockstep, firmware builtin")
+    check_plant(asked)
     check_firmware(asked, "sitl", speed)
     if asked.lockstep and asked.firmware != "builtin":
         raise FieldError(
@@ -245,6 +264,13 @@ def check_companion(asked: StandAloneCompanion) -> None:
     for metres in asked.goal:
         if not abs(metres) <= FARTHEST_M:
             raise FieldError("goal", metres, f"{-FARTHEST_M:g} <= value <= {FARTHEST_M:g} m")
+    if asked.lockstep and "://" not in asked.camera:
+        accepted = "in lockstep the address of the simulator's camera: tcp://HOST:PORT, ipc://PATH"
+        raise FieldError("camera", asked.camera, accepted)
+    if asked.lockstep and asked.check:
+        raise FieldError("check", asked.check, "without lockstep")
+    if asked.lockstep and asked.start != "arm":
+        raise FieldError("start", asked.start, "arm in lockstep, where nobody else flies")
     if asked.lockstep and asked.signing_key is not None:
         raise FieldError("signing_key", asked.signing_key, "without lockstep")
     _check_folder("log", asked.log)

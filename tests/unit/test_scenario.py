@@ -371,3 +371,21 @@ def test_the_facts_of_a_report_name_the_conditions_that_are_not_the_defaults() -
     )
     told = resolve(windy).setup.conditions
     assert told == "payload.mass_g 50, wind.east_m_s 4, battery_charge 0.5"
+
+
+# --- the arena
+
+
+def test_movers_are_at_the_same_places_when_navigation_begins_at_every_level() -> None:
+    twin, lockstep = (
+        resolve(Scenario(level=level, arena="dynamic-obstacles", policy="greedy", altitude_m=4.0))
+        for level in ("gym", "lockstep")
+    )
+    assert twin.takeoff_s == 0.0
+    assert lockstep.takeoff_s == pytest.approx(9.2 + 4.0 / 1.5)
+    begins, after_takeoff = twin.arena_of(3), lockstep.arena_of(3)
+    assert begins.tours
+    takeoff_us = round(lockstep.takeoff_s * 1e6)
+    for time_us in (0, 1_000_000, 70_000_000):
+        there, here = after_takeoff.centers_at(takeoff_us + time_us), begins.centers_at(time_us)
+        assert abs(there - here).max() < 3e-6  # of a microsecond's rounding, at 2.5 m/s

@@ -1,0 +1,172 @@
+"""What can be wrong before take-off, looked at on the ground: `airl-companion --check`.
+
+Camera, flight controller and policy are looked at as a flight would use them, for a few seconds.
+Nothing is armed, and no setpoint is sent.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from typing import NamedTuple
+
+import numpy as np
+
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.errors import UsageError
+from airl_mav.latency.percentiles import percentile
+from airl_mav.policy.observation import InFlight, Kinematics, observe
+from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.camera import FrameSource, ReceivedFrame
+from companion.dialects import RATE_HZ
+from companion.interfaces import LinkError
+from companion.mavsdk_link import MavsdkLink
+from companion.mission import FRAME_TIMEOUT_S, check_camera
+from companion.pilot import age_of
+from companion.program import Mission, mission_camera
+from companion.signing_proxy import signed
+
+LOOK_S = 3.0
+"""How long the camera, and then the telemetry, is looked at [s of wall time]."""
+
+POLL_S = 0.002
+"""Time between two looks at the telemetry [s]."""
+
+DECISIONS = 30
+"""Decisions that are timed; the first one is left out."""
+
+LEAST_SHARE = 0.5
+"""Telemetry that comes at less than this share of the rate that was asked for is too rare."""
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at."""
+
+    what: str
+    good: bool
+    told: str
+    """What was seen, or what is wrong."""
+
+
+def check_on_ground(
+    asked: StandAloneCompanion, mission: Mission, stop: threading.Event
+) -> Iterator[Finding]:
+    """Look at everything that a flight needs, one thing after the other.
+
+    What needs a part that is not there is left out. `stop`, set from outside, ends it early.
+    """
+    clock = WallClock(asked.speed)
+    yield Finding("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
+    with held_to(asked.cpu_quota):
+        try:
+            camera = mission_camera(asked, mission, clock)
+        except UsageError as error:
+            yield Finding("camera", False, str(error))
+            return
+        with closing(camera):
+            yield from look_at_camera(mission, camera, clock, stop)
+            seen = camera.latest()
+            try:
+                with (
+                    signed(asked.connect, asked.signing_key) as url,
+                    closing(MavsdkLink(url, clock, stop)) as link,
+                ):
+                    link.connect(asked.connect_timeout, stop)
+                    yield from look_at_vehicle(link, stop)
+                    if seen is not None and not stop.is_set():
+                        yield time_decisions(mission, seen, link.kinematics())
+            except (LinkError, UsageError) as error:
+                yield Finding("flight controller", False, str(error))
+
+
+def look_at_camera(
+    mission: Mission, camera: FrameSource, clock: Clock, stop: threading.Event
+) -> Iterator[Finding]:
+    """Take frames for a while: how many, how old, and whether they change and suit the policy."""
+    first = camera.wait(-1, FRAME_TIMEOUT_S)
+    if first is None:
+        yield Finding("camera", False, f"no frame for {FRAME_TIMEOUT_S:g} s")
+        return
+    try:
+        check_camera(mission.policy, camera, stop, mission.compensator)
+    except UsageError as error:
+        yield Finding("camera", False, str(error))
+        return
+    watch, frames, ages_us = WallClock(), [first], []
+    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
+        newer = camera.wait(frames[-1].frame.sequence, 0.5)
+        if newer is not None:
+            frames.append(newer)
+            ages_us.append(age_of(newer, clock.time_us()))
+    lens, rate_hz = first.frame.intrinsics, (len(frames) - 1) / LOOK_S
+    if not ages_us:
+        yield Finding("camera", False, f"one frame in {LOOK_S:g} s")
+        return
+    told = f"{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
+    frozen = all(np.array_equal(first.frame.depth_mm, each.frame.depth_mm) for each in frames)
+    if frozen:
+        # A simulator's image of a vehicle at rest has no noise, so this is no fault by itself.
+        told += "; every image is the same (a real camera has noise)"
+    age_us = percentile(ages_us, 50)
+    assert age_us is not None  # noqa: S101 (one age is enough for a median)
+    yield Finding("camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on")
+
+
+def look_at_vehicle(link: MavsdkLink, stop: threading.Event) -> Iterator[Finding]:
+    """Look at the telemetry for a while, then at what it says."""
+    watch, changes, last = WallClock(), 0, link.kinematics()
+    while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
+        watch.sleep_until(watch.time_us() + int(POLL_S * US_PER_S))
+        now = link.kinematics()
+        changes += not np.array_equal(now.position, last.position)
+        last = now
+    rate_hz = changes / LOOK_S
+    status = link.status()
+    yield Finding(
+        "flight controller",
+        link.connected,
+        f"{link.dialect.name}, {'armed' if status.armed else 'disarmed'}, mode {status.mode}",
+    )
+    asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
+    yield Finding("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
+    missing = link.missing_health()
+    yield Finding(
+        "health",
+        not missing,
+        f"not yet: {', '.join(missing)}"
+        if missing
+        else "calibrated, knows where it is, may be armed",
+    )
+
+
+def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> Finding:
+    """Let the policy decide on what is seen, and say how long that takes (t2)."""
+    frame, watch, took_us = seen.frame, WallClock(), []
+    told = InFlight.of_first_decisions(1)
+    observation = observe(
+        *(frame.depth_mm, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
+        InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+    )
+    try:
+        for _ in range(DECISIONS + 1):
+            begun_us = watch.time_us()
+            mission.policy.act(observation)
+            took_us.append(watch.time_us() - begun_us)
+    except Exception as error:
+        # A policy may raise anything.
+        what = " ".join(f"{type(error).__name__}: {error}".split())
+        return Finding("decision", False, f"the policy failed: {what}")
+    del took_us[0]
+    median_us = percentile(took_us, 50)
+    assert median_us is not None  # noqa: S101 (one is enough for a median)
+    longest_s = max(took_us) / US_PER_S
+    bound_s = mission.watchdog.decision_timeout_s
+    return Finding(
+        "decision",
+        longest_s < bound_s,
+        f"t2 {median_us / US_PER_MS:.2f} ms, the median of {DECISIONS}; longest"
+        f" {1e3 * longest_s:.2f} ms, the watchdog's bound is {bound_s:g} s",
+    )
