@@ -11,6 +11,7 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes import MODES
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
 from firmware_sim.autopilot.requests import Request
@@ -53,20 +54,30 @@ class Guidance:
         self.context.home, self.context.home_yaw = here(state)
         self._spool_since_us = None
 
-    def take_off_to(self, altitude_m: float | None, state: Vector, *, flying: bool) -> None:
-        """Set the height above home that the next take-off climbs to [m].
+    def take_off_to(
+        self,
+        altitude_m: float | None,
+        place: tuple[float, float] | None,
+        state: Vector,
+        *,
+        flying: bool,
+    ) -> None:
+        """Set the height above home [m] and the place (north, east [m]) of the next take-off.
 
-        None = MIS_TAKEOFF_ALT; in flight, PX4 climbs that much from where the vehicle is.
+        No height = MIS_TAKEOFF_ALT; in flight, PX4 climbs that much from where the vehicle is. No
+        place = straight up.
         """
         context = self.context
+        context.takeoff_place = place
         height = context.height(state) if flying else 0.0
         if altitude_m is None:
             default = context.value("MIS_TAKEOFF_ALT")
             text = f"Using default takeoff altitude: {default:.1f} m"
-            context.say(Message(Severity.INFO, text))
+            context.say(Message(Severity.INFO, text, events.TAKEOFF_DEFAULT.event(default)))
             altitude_m = default + height
         if altitude_m < height:
-            context.say(Message(Severity.CRITICAL, "Already higher than takeoff altitude"))
+            higher = events.TAKEOFF_ALREADY_HIGHER.event()
+            context.say(Message(Severity.CRITICAL, "Already higher than takeoff altitude", higher))
             altitude_m = height
         context.takeoff_altitude_m = altitude_m
 

@@ -53,6 +53,15 @@ class OrbitRequest(Request):
     """ORBIT_YAW_BEHAVIOUR; None = as it is."""
 
 
+class LandingTarget(NamedTuple):
+    """What a precision landing lands on."""
+
+    position: Vec
+    """Local NED [m]."""
+    time_us: int
+    """When it was heard, in simulated time."""
+
+
 class FollowedTarget(NamedTuple):
     """What Follow follows."""
 

@@ -22,6 +22,7 @@ PHASE_OF_MODE: Mapping[Mode, str] = {
     Mode.MISSION: "mission",
     Mode.RETURN: "return",
     Mode.LAND: "landing",
+    Mode.PRECISION_LAND: "landing",
 }
 """Phase of a flight in the air, by the mode that is flown."""
 

@@ -27,6 +27,7 @@ NAVIGATION_STATES: dict[Mode, int] = {
     Mode.TAKEOFF: 17,
     Mode.LAND: 18,
     Mode.FOLLOW: 19,
+    Mode.PRECISION_LAND: 20,
     Mode.ORBIT: 21,
 }
 """VehicleStatus.nav_state (NAVIGATION_STATE_*) of each mode."""

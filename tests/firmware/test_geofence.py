@@ -250,7 +250,6 @@ LAND = at(0, 90, 0, N.LAND)
         (0, (49.5, 0), (0, 0)),  # not nearer by 2 m
         (1, (30, 0), (100, 0)),
         (1, (0, 80), (0, 90)),
-        (2, (90, 0), (0, 90)),
         (3, (0, 80), (0, 90)),
         (3, (0, 10), (0, 0)),
         (0, (0, 80), (0, 0)),  # the mission's landing is not asked for
@@ -265,11 +264,17 @@ def test_return_goes_to_the_nearest_place(
     plans.store(Kind.RALLY, rally, 1)
     found = destination(plans, ORIGIN, place(*here, 20.0), kind)
     wanted = place(*expected)
-    assert found[:2] == pytest.approx(wanted[:2], abs=1e-9)
+    assert found.place[:2] == pytest.approx(wanted[:2], abs=1e-9)
+    assert found.by_landing is (expected == (0, 90))
     ground = ORIGIN.altitude_m + (3.0 if expected == (100, 0) else 0.0)
-    assert found.altitude_m == pytest.approx(ground)
+    assert found.place.altitude_m == pytest.approx(ground)
 
 
 def test_return_goes_home_where_there_is_nothing_else() -> None:
-    for kind in (0, 1, 2, 3, 9):
-        assert destination(Plans(), ORIGIN, Geodetic(47.0, 8.0, 500.0), kind) == ORIGIN
+    for kind in (0, 1, 3, 9):
+        found = destination(Plans(), ORIGIN, Geodetic(47.0, 8.0, 500.0), kind)
+        assert found == (ORIGIN, False)
+    plans = Plans()
+    plans.store(Kind.MISSION, (LAND,), 1)
+    invalid = destination(plans, ORIGIN, place(0, 80), 1, valid=False)
+    assert invalid == (ORIGIN, False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -191,6 +192,14 @@ def test_a_place_must_be_numbers(rig: Rig, x: str, y: str, result: int) -> None:
     )
     answers = rig.exchange(item)
     assert [m.type for m in answers if m.get_type() == "MISSION_ACK"] == [result]
+
+
+@pytest.mark.parametrize("command", [80, 201])
+@pytest.mark.parametrize(("region", "result"), [(0.0, 0), (3.0, 0), (1.0, 6), (math.nan, 6)])
+def test_a_region_of_interest_must_be_named(
+    rig: Rig, command: int, region: float, result: int
+) -> None:
+    assert upload(rig, [item_int(0, command=command, param1=region)]) == result
 
 
 @pytest.mark.parametrize(

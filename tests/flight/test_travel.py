@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.frames import quat_yaw
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.autopilot_state import Mode, Result
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.requests import Place, Reposition
 from tests.support.flight_rig import NAN, Rig, flight
@@ -81,3 +81,37 @@ def test_a_take_off_below_the_ground_stays_there() -> None:
         rig.run(3.0)
         assert rig.ap.flight.phase is Phase.GROUND
         assert rig.height < 0.01
+
+
+def test_a_take_off_to_a_place_climbs_on_the_way() -> None:
+    with flight(0) as rig:
+        rig.arm()
+        assert rig.ap.takeoff(8.0, (20.0, -10.0)) is Result.ACCEPTED
+        rig.until(lambda: rig.height > 4.0, 20.0)
+        north, east, _ = rig.truth.position
+        assert math.atan2(east, north) == pytest.approx(math.atan2(-10.0, 20.0), abs=0.2)
+        assert rig.mode is Mode.TAKEOFF and 1.0 < math.hypot(north, east) < 15.0
+        rig.until(lambda: rig.mode is Mode.HOLD, 20.0)
+        assert rig.height > 7.0
+        assert rig.ap.state().destination == pytest.approx((20.0, -10.0, -8.0), abs=0.3)
+        rig.run(15.0)
+        assert rig.truth.position[:2] == pytest.approx([20.0, -10.0], abs=0.7)
+        assert rig.height == pytest.approx(8.0, abs=0.5)
+        # In flight the same command leads on, and another one without a place stays there.
+        assert rig.ap.takeoff(10.0, (0.0, 0.0)) is Result.ACCEPTED
+        rig.run(15.0)
+        assert rig.truth.position[:2] == pytest.approx([0.0, 0.0], abs=0.7)
+        assert rig.height == pytest.approx(10.0, abs=0.5)
+
+
+def test_a_take_off_that_was_asked_for_before_arming_leads_to_its_place() -> None:
+    with flight(0) as rig:
+        rig.boot()
+        rig.ap.takeoff(3.0, (6.0, 0.0))
+        rig.ap.arm(force=False)
+        rig.run(15.0)
+        assert rig.truth.position[:2] == pytest.approx([6.0, 0.0], abs=0.7)
+        rig.ap.takeoff(5.0)
+        rig.run(6.0)
+        assert rig.truth.position[:2] == pytest.approx([6.0, 0.0], abs=0.7)
+        assert rig.height == pytest.approx(5.0, abs=0.5)

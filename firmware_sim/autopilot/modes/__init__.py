@@ -17,6 +17,7 @@ from firmware_sim.autopilot.modes.mission import Mission
 from firmware_sim.autopilot.modes.offboard import Offboard
 from firmware_sim.autopilot.modes.orbit import Orbit
 from firmware_sim.autopilot.modes.position import Position
+from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.modes.return_to_launch import ReturnToLaunch
 from firmware_sim.autopilot.modes.stabilized import Stabilized
 from firmware_sim.autopilot.modes.takeoff import Takeoff
@@ -37,6 +38,7 @@ MODES: Mapping[Mode, Callable[[FlightContext], FlightMode]] = MappingProxyType(
         Mode.ORBIT: Orbit,
         Mode.FOLLOW: Follow,
         Mode.DESCEND: Descend,
+        Mode.PRECISION_LAND: PrecisionLand,
     }
 )
 """What flies each mode."""

@@ -16,7 +16,7 @@ from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
-from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Place, Request
 from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
@@ -34,6 +34,8 @@ class FlightContext:
     """Local NED [m]."""
     takeoff_altitude_m: float = 0.0
     """Height above home that a take-off climbs to [m]."""
+    takeoff_place: tuple[float, float] | None = None
+    """Where it leads, north and east [m]; None = straight up."""
     climb: Climb = field(default_factory=Climb)
     """The vertical trajectory of a take-off, which hold goes on with."""
     say: Callable[[Message], None] = lambda _message: None
@@ -46,10 +48,10 @@ class FlightContext:
     """How the automatic modes move."""
     setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
     """The newest offboard setpoint."""
-    return_place: Callable[[], Place] | None = None
-    """Chooses where Return goes; None = home."""
+    return_place: Callable[[], Place | None] | None = None
+    """Chooses where Return goes; returns None where it flies items of the mission. None = home."""
     triplet: Triplet = STANDING
-    """What Mission mode flies."""
+    """What Mission mode flies, and Return where it flies items of the mission."""
     mission_over: bool = False
     """Whether the mission has come to its end."""
     standing: bool = True
@@ -58,6 +60,8 @@ class FlightContext:
     """The pilot's sticks; None = there are none, or they are lost."""
     target: FollowedTarget | None = None
     """What Follow follows."""
+    landing_target: LandingTarget | None = None
+    """What a precision landing lands on, as it was reported last."""
     orbit: OrbitStatus | None = None
     """The circle that was flown last."""
 

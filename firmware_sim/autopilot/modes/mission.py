@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.control.demand import AnyDemand, Demand
-from airl_mav.core.frames import Vector, quat_yaw
+from airl_mav.control.demand import AnyDemand
+from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
 from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.modes.precision_land import PrecisionLand
+from firmware_sim.autopilot.modes.takeoff import gentle, leave_ground
 from firmware_sim.autopilot.navigation.triplet import Triplet, TripletKind
 from firmware_sim.autopilot.requests import Request
 from firmware_sim.autopilot.trajectory import Leg, PathLimits
 
 _TAKEOFF, _LAND, _IDLE = TripletKind.TAKEOFF, TripletKind.LAND, TripletKind.IDLE
+
+_REQUIRED = 2
+"""PRECISION_LAND_MODE: the target is searched for."""
 
 _MOVES_M_S = 0.5
 """Along its way a vehicle turns from this speed on [m/s] (MPC_YAW_MODE = 3)."""
@@ -26,6 +31,8 @@ class Mission(FlightMode):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._triplet: Triplet | None = None
+        self._precision = PrecisionLand(context)
+        self._lands_precisely = False
 
     @property
     def lifts(self) -> bool:
@@ -39,7 +46,7 @@ class Mission(FlightMode):
 
     def enter(self, _state: Vector, _request: Request | None, /) -> None:
         """Begin; the executor says with what."""
-        self._triplet = None
+        self._triplet, self._lands_precisely = None, False
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Fly on."""
@@ -47,14 +54,14 @@ class Mission(FlightMode):
         triplet, position, travel = context.triplet, triple(state, P), context.travel
         if context.standing:
             # The trajectory begins where the vehicle is once it has left the ground.
-            travel.launch(state, time_us, context.climb.speed_m_s)
-            north, east, _ = position
-            yaw = quat_yaw(state[Q:RATES])
-            return Demand((north, east, math.nan), (math.nan,) * 3, yaw, math.nan)
+            return leave_ground(context, state, time_us)
         if triplet is not self._triplet:
             if self._triplet is None or triplet.cruise_m_s != self._triplet.cruise_m_s:
                 travel.speed_m_s = triplet.cruise_m_s
             self._triplet = triplet
+        if triplet.precision:
+            return self._land_precisely(triplet, state, time_us)
+        self._lands_precisely = False
         yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
         leg, limits = _leg(triplet, position), self._limits(state)
         if triplet.kind is _LAND:
@@ -63,18 +70,23 @@ class Mission(FlightMode):
             leg = Leg((north, east, math.nan), vertical_m_s=speed)
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)
 
+    def _land_precisely(self, triplet: Triplet, state: Vector, time_us: int) -> AnyDemand:
+        """Land on a target near the place of the item."""
+        if not self._lands_precisely:
+            self._lands_precisely = True
+            north, east, _ = triplet.target
+            height = triple(state, P)[2]
+            self._precision.begin((north, east, height), required=triplet.precision == _REQUIRED)
+        return self._precision.demand(state, time_us)
+
     def is_done(self, _state: Vector, /) -> bool:
         """Return whether the mission is over."""
         return self._context.mission_over
 
     def _limits(self, state: Vector) -> PathLimits:
-        value, triplet = self._context.value, self._context.triplet
+        triplet = self._context.triplet
         limits = self._context.travel.limits()._replace(acceptance_m=triplet.acceptance_m)
-        if triplet.kind is _TAKEOFF and self._context.height(state) < value("MPC_LAND_ALT1"):
-            speed = value("MPC_TKO_SPEED")
-            gentle = min(limits.up_m_s2, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
-            limits = limits._replace(up_m_s=speed, up_m_s2=gentle)
-        return limits
+        return gentle(limits, self._context, state) if triplet.kind is _TAKEOFF else limits
 
     def _heading(self, state: Vector) -> float:
         """Return the heading by MPC_YAW_MODE; NaN = towards the waypoint, or as it is near it."""

@@ -1,6 +1,6 @@
-"""Return: climb, fly home or to a rally point, wait if asked to, land.
+"""Return: climb, fly home or to a rally point, wait if asked to, land; or fly along the mission.
 
-Source: PX4 1.16, RtlDirect.
+Source: PX4 1.16, RtlDirect. The way along the mission is the navigator's.
 """
 
 from __future__ import annotations
@@ -14,11 +14,18 @@ from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.error_state import P
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
 from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.modes.mission import Mission
+from firmware_sim.autopilot.modes.precision_land import PrecisionLand
 from firmware_sim.autopilot.navigation.return_path import return_height
 from firmware_sim.autopilot.requests import Place, Request
 from firmware_sim.autopilot.trajectory import Leg
+
+_REQUIRED = 2
+"""RTL_PLD_MD: 1 lands on a landing target that is seen at once, 2 searches for it."""
 
 
 class _Stage(Enum):
@@ -41,10 +48,16 @@ class ReturnToLaunch(FlightMode):
         self._down = 0.0
         """Of the way home, NED [m]."""
         self._home = Place((0.0, 0.0, 0.0), 0.0)
+        self._mission = Mission(context)
+        self._precision = PrecisionLand(context)
+        self._precise = False
+        self._by_mission = False
 
     @property
     def destination(self) -> Vec | None:
         """The end of the present stage."""
+        if self._by_mission:
+            return self._mission.destination
         north, east, ground = self._home.position
         if self._stage is _Stage.CLIMB:
             return *self._start.position[:2], self._down
@@ -55,9 +68,13 @@ class ReturnToLaunch(FlightMode):
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin with the climb, if it takes one."""
         context = self._context
-        self._home = Place(context.home, context.home_yaw)
-        if context.return_place is not None:
-            self._home = context.return_place()
+        home = Place(context.home, context.home_yaw)
+        chosen = home if context.return_place is None else context.return_place()
+        self._by_mission = chosen is None
+        if chosen is None:
+            self._mission.enter(state, None)
+            return
+        self._home = chosen
         self._start = here(state)
         self._waiting_since_us = None
         height = self._height(state)
@@ -67,10 +84,13 @@ class ReturnToLaunch(FlightMode):
         ground = context.home_amsl_m + context.home[2] - self._home.position[2]
         above_sea = math.ceil(ground + at)
         text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
-        context.say(Message(Severity.INFO, text))
+        event = events.RTL_RETURN_AT.event(above_sea, math.ceil(at))
+        context.say(Message(Severity.INFO, text, event))
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Fly the present stage, and on to the next when it is over."""
+        if self._by_mission:
+            return self._mission.demand(state, time_us)
         self._go_on(state, time_us)
         (north, east, _), travel = self._home.position, self._context.travel
         if self._stage is _Stage.CLIMB:
@@ -81,6 +101,8 @@ class ReturnToLaunch(FlightMode):
             near = self._away(state) < self._context.value("RTL_MIN_DIST")
             yaw = self._home.yaw if near else math.nan
             return travel.fly(state, time_us, Leg((north, east, self._down)), yaw=yaw)
+        if self._stage is _Stage.LAND and self._precise:
+            return self._precision.demand(state, time_us)
         if self._stage is _Stage.LAND:
             speed = landing_speed(self._context.value, self._height(state))
             leg = Leg((north, east, math.nan), vertical_m_s=speed)
@@ -105,19 +127,25 @@ class ReturnToLaunch(FlightMode):
             if delay:
                 self._stage = _Stage.DESCEND
             else:
-                self._land()
+                self._land(down)
         elif self._stage is _Stage.DESCEND and abs(down - self._waiting_down) < radius:
             self._stage, self._waiting_since_us = _Stage.WAIT, time_us
             if delay < 0.0:
-                self._context.say(Message(Severity.INFO, "RTL: completed, loitering"))
+                self._context.say(_told(events.RTL_LOITERING))
         elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
             waited_s = (time_us - self._waiting_since_us) / US_PER_S
             if 0.0 <= delay <= waited_s:
-                self._land()
+                self._land(down)
 
-    def _land(self) -> None:
+    def _land(self, down: float) -> None:
+        """Land from a height NED [m], onto a landing target where RTL_PLD_MD asks for it."""
         self._stage = _Stage.LAND
-        self._context.say(Message(Severity.INFO, "RTL: land at destination"))
+        asked = round(self._context.value("RTL_PLD_MD"))
+        self._precise = asked > 0
+        if self._precise:
+            north, east, _ = self._home.position
+            self._precision.begin((north, east, down), required=asked == _REQUIRED)
+        self._context.say(_told(events.RTL_LAND))
 
     def _height(self, state: Vector) -> float:
         """Return the height above where it will land [m]."""
@@ -127,3 +155,7 @@ class ReturnToLaunch(FlightMode):
         """Return the horizontal distance from home [m]."""
         (north, east, _), home = triple(state, P), self._home.position
         return math.hypot(north - home[0], east - home[1])
+
+
+def _told(definition: Definition) -> Message:
+    return Message(Severity.INFO, definition.message, definition.event())

@@ -1,14 +1,22 @@
-"""Take-off: climb above the place where it began."""
+"""Take-off: climb above the place where it began, or to another one."""
 
 from __future__ import annotations
 
-from airl_mav.control.demand import Demand
+from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.climb import ClimbLimits
 from firmware_sim.autopilot.error_state import V
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, over
-from firmware_sim.autopilot.requests import ClimbOn, Place, Request
+from firmware_sim.autopilot.modes.interface import (
+    FREE,
+    NAN,
+    FlightContext,
+    FlightMode,
+    here,
+    over,
+)
+from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
+from firmware_sim.autopilot.trajectory import Leg, PathLimits
 
 LEAST_CLIMB_M = 0.1
 """A take-off that asks for less than this above where the vehicle stands leaves it there [m]."""
@@ -20,6 +28,8 @@ class Takeoff(FlightMode):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
+        self._gently = True
+        """Whether it began on the ground."""
 
     @property
     def lifts(self) -> bool:
@@ -28,21 +38,24 @@ class Takeoff(FlightMode):
 
     @property
     def destination(self) -> Vec | None:
-        """The altitude above the place where it began."""
+        """The altitude above the place where it began, or above the one asked for."""
         return self._end
 
     @property
     def _end(self) -> Vec:
-        north, east, _ = self._place.position
+        north, east = self._context.takeoff_place or self._place.position[:2]
         return north, east, self._context.home[2] - self._context.takeoff_altitude_m
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin the climb at the present place."""
         self._context.climb.restart(max(0.0, -state.item(V + 2)))
         self._place = here(state)
+        self._gently = self._context.standing
 
-    def demand(self, state: Vector, time_us: int, /) -> Demand:
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Climb on."""
+        if self._context.takeoff_place is not None:
+            return self._fly(state, time_us)
         # The trajectory stays where the vehicle is: it must not wait below the ground while the
         # thrust ramps up, nor be chased after it.
         climb = self._context.climb
@@ -50,10 +63,22 @@ class Takeoff(FlightMode):
         climb_on(self._context, time_us, near_ground=True)
         return over(self._place, -climb.speed_m_s)
 
+    def _fly(self, state: Vector, time_us: int) -> AnyDemand:
+        """Fly to the place asked for, climbing on the way as PX4 does."""
+        context, travel = self._context, self._context.travel
+        if context.standing:
+            return leave_ground(context, state, time_us)
+        limits = travel.limits()
+        if self._gently:
+            limits = gentle(limits, context, state)
+        return travel.fly(state, time_us, Leg(self._end), limits=limits)
+
     def remainder(self, state: Vector, /) -> Request | None:
-        """Return the altitude above the place where it began, once it is near: hold goes on."""
+        """Return where it leads, once it is near that altitude: hold goes on."""
         if not self.is_done(state):
             return None
+        if self._context.takeoff_place is not None:
+            return Reposition(Place(self._end, NAN))
         return ClimbOn(Place(self._end, self._place.yaw))
 
     def is_done(self, state: Vector, /) -> bool:
@@ -64,6 +89,24 @@ class Takeoff(FlightMode):
         altitude, radius = self._context.takeoff_altitude_m, self._context.value("NAV_MC_ALT_RAD")
         near = altitude / 2.0 if altitude < radius else radius
         return self._context.height(state) > altitude - near
+
+
+def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
+    """Return the demand of a vehicle on the ground whose trajectory begins once it has left it."""
+    context.travel.launch(state, time_us, context.climb.speed_m_s)
+    place = here(state)
+    north, east, _ = place.position
+    return Demand((north, east, NAN), FREE, place.yaw, NAN)
+
+
+def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLimits:
+    """Return the limits of a take-off: near the ground it climbs as slowly as MPC_TKO_SPEED."""
+    value = context.value
+    if context.height(state) >= value("MPC_LAND_ALT1"):
+        return limits
+    speed = value("MPC_TKO_SPEED")
+    acceleration = min(limits.up_m_s2, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
+    return limits._replace(up_m_s=speed, up_m_s2=acceleration)
 
 
 def climb_on(context: FlightContext, time_us: int, *, near_ground: bool) -> None:

@@ -14,6 +14,8 @@ from typing import Protocol
 from airl_mav.core.frames import Geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.navigation import jumps
 from firmware_sim.autopilot.navigation.feasibility import Verdict
 from firmware_sim.autopilot.navigation.flown_item import (
@@ -70,8 +72,13 @@ class MissionExecutor:
         value: Callable[[str], float],
         crew: Crew,
         check: Callable[[Situation], Verdict],
+        *,
+        climbs_first: bool = True,
     ) -> None:
-        """Take the plans, a lookup of parameters, the crew, and the check of feasibility."""
+        """Take the plans, a lookup of parameters, the crew, and the check of feasibility.
+
+        `climbs_first`: whether it climbs to the first item's altitude before it sets out.
+        """
         self._plans, self._value, self._crew, self._check = plans, value, crew, check
         self.triplet = STANDING
         """What to fly."""
@@ -87,6 +94,7 @@ class MissionExecutor:
         self._work = _Work.ITEM
         self._flown = FlownItem(_N.WAYPOINT, (0.0, 0.0, 0.0))
         self._arrival = Arrival(value)
+        self._climbs_first = climbs_first
         self._climb_down = NAN
         """Height NED to climb to before the mission begins; NaN = none."""
         self._began_before = False
@@ -184,11 +192,11 @@ class MissionExecutor:
         self.finished = False
         if not self.valid:
             self._running = False
-            what = "refusing takeoff" if landed else "loitering"
-            self._say(Severity.CRITICAL, f"No valid mission available, {what}")
+            refused = events.MISSION_REFUSED if landed else events.MISSION_LOITER
+            self._say(Severity.CRITICAL, refused.message, refused.event())
             return
         if not self._running:
-            self._say(Severity.INFO, "Executing Mission")
+            self._say(Severity.INFO, "Executing Mission", events.MISSION_EXECUTE.event())
         self._running = True
         self._work = _Work.ITEM
         self._plans.reached = -1
@@ -197,7 +205,7 @@ class MissionExecutor:
         """Find out whether the vehicle must climb before it sets out."""
         self._climb_down = NAN
         following = jumps.next_places(self._plans, self._plans.current, 1)
-        if self._running and following:
+        if self._running and following and self._climbs_first:
             down = self._place(following[0], situation)[2]
             if situation.position[2] - down > self._value("NAV_MC_ALT_RAD"):
                 self._climb_down = down
@@ -216,8 +224,9 @@ class MissionExecutor:
         if self._work is _Work.ITEM:
             following = jumps.go_to(self._plans, self._plans.current + 1)
             if following is None:
-                how = "landed" if situation.landed else "loitering"
-                self._say(Severity.INFO, f"Mission finished, {how}")
+                landed = situation.landed
+                end = events.MISSION_FINISHED if landed else events.MISSION_FINISHED_LOITER
+                self._say(Severity.INFO, end.message, end.event())
                 if self._plans.current + 1 == len(self._plans.mission):
                     self._plans.jumps_done.clear()
                 self._end(situation)
@@ -281,7 +290,8 @@ class MissionExecutor:
             flown.yaw = NAN
         if not math.isnan(self._climb_down) and self._work is _Work.ITEM:
             above_m = -(self._climb_down - situation.local(situation.home)[2])
-            self._say(Severity.INFO, f"Climb to {above_m:.1f} meters above home")
+            text = f"Climb to {above_m:.1f} meters above home"
+            self._say(Severity.INFO, text, events.MISSION_CLIMB.event(above_m))
             then = flown.place
             flown.command = _N.TAKEOFF if situation.landed else _N.LOITER_TO_ALT
             flown.place = north, east, self._climb_down
@@ -319,6 +329,7 @@ class MissionExecutor:
             next=places[0] if goes_on else None,
             yaw=flown.yaw,
             acceptance_m=self._arrival.acceptance_m(flown),
+            precision=flown.precision if kind is TripletKind.LAND else 0,
             cruise_m_s=self.cruise_m_s,
         )
 
@@ -375,8 +386,8 @@ class MissionExecutor:
             self._flown.yaw = yaw
             self.triplet = self.triplet._replace(yaw=yaw)
 
-    def _say(self, severity: Severity, text: str) -> None:
-        self._crew.say(Message(severity, text))
+    def _say(self, severity: Severity, text: str, event: Event) -> None:
+        self._crew.say(Message(severity, text, event))
 
 
 def _raised(place: Vec, rise_m: float) -> Vec:

@@ -51,6 +51,9 @@ AT_ONCE = frozenset(
 WITH_TIMEOUT = (_N.DO_WINCH, _N.DO_GRIPPER, _N.DO_GIMBAL_MANAGER_PITCHYAW)
 """Commands that are given MIS_COMMAND_TOUT to be carried out."""
 
+_PRECISE = (1.0, 2.0)
+"""PRECISION_LAND_MODE in parameter 2 of a landing: opportunistic, required."""
+
 _STAYS = (_N.WAYPOINT, _N.LOITER_TIME, _N.DELAY)
 """Commands whose parameter 1 is a time to stay [s]."""
 
@@ -89,6 +92,8 @@ class FlownItem:
     acceptance_m: float = 0.0
     """0 = NAV_ACC_RAD."""
     autocontinue: bool = True
+    precision: int = 0
+    """As of `Triplet`."""
 
 
 def as_flown(item: PlanItem, place: Vec) -> FlownItem:
@@ -102,6 +107,7 @@ def as_flown(item: PlanItem, place: Vec) -> FlownItem:
         max(first, 0.0) if item.command in _STAYS and math.isfinite(first) else 0.0,
         radius if item.command == _N.WAYPOINT and math.isfinite(radius) else 0.0,
         item.autocontinue,
+        int(radius) if item.command == _N.LAND and radius in _PRECISE else 0,
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
@@ -17,10 +18,17 @@ from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionE
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
 from firmware_sim.autopilot.navigation.fence_monitor import FenceMonitor
 from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.navigation.rally import destination
-from firmware_sim.autopilot.navigation.return_path import return_time_s
+from firmware_sim.autopilot.navigation.geography import distance_m
+from firmware_sim.autopilot.navigation.plan import Kind, PlanItem, Plans
+from firmware_sim.autopilot.navigation.rally import Destination, ReturnType, destination
+from firmware_sim.autopilot.navigation.return_path import return_height, return_time_s
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
+from firmware_sim.autopilot.navigation.way_home import (
+    along_mission,
+    climb,
+    landing_start,
+    onwards,
+)
 from firmware_sim.autopilot.requests import Place
 
 
@@ -32,16 +40,28 @@ class Navigator:
         self._plans, self._value = plans, value
         self.mission = MissionExecutor(plans, value, crew, self._check)
         """Holds the region of interest and the speed, too."""
+        self._way_home = Plans()
+        """What Return flies of the mission."""
+        self._returning = MissionExecutor(
+            self._way_home, value, crew, self._check_way_home, climbs_first=False
+        )
+        self._home_by_mission = False
+        """Whether Return flies along the mission now."""
         self.fence = FenceMonitor(plans, value, crew.say)
         """What of the geofence is breached."""
         self.due_us = 0
         """When to step next [µs]; 0 = at once."""
+        self._crew = crew
+        self._returned = False
+        """Whether the way of the present return has been chosen."""
         self._flying = False
         self._position: Vec | None = None
 
     @property
     def triplet(self) -> Triplet:
-        """What Mission mode flies."""
+        """What is flown of a mission, in Mission or Return mode."""
+        if self._home_by_mission:
+            return self._returning.triplet
         return self.mission.triplet if self._flying else STANDING
 
     @property
@@ -55,11 +75,58 @@ class Navigator:
             self.mission.review(situation)
         return self.mission.valid
 
-    def return_place(self, situation: Situation, home: Place) -> Place:
-        """Return where Return goes: home, or what RTL_TYPE prefers; its height is the ground's."""
+    def return_place(self, situation: Situation, home: Place) -> Place | None:
+        """Return where Return goes: home, or what RTL_TYPE prefers; its height is the ground's.
+
+        None where it flies items of the mission, which lead it there.
+        """
+        if self._return_type is ReturnType.MISSION:
+            return None
+        goal = self._destination(situation)
+        if goal.by_landing:
+            return None
+        same = goal.place == situation.home
+        return home if same else Place(situation.local(goal.place), home.yaw)
+
+    @property
+    def _return_type(self) -> ReturnType:
+        asked = round(self._value("RTL_TYPE"))
+        return ReturnType(asked) if asked in set(ReturnType) else ReturnType.HOME_OR_RALLY
+
+    def _destination(self, situation: Situation) -> Destination:
         here = local_to_geodetic(np.array(situation.position), situation.origin)
-        goal = destination(self._plans, situation.home, here, round(self._value("RTL_TYPE")))
-        return home if goal == situation.home else Place(situation.local(goal), home.yaw)
+        kind, valid = self._return_type, self.mission.valid
+        return destination(self._plans, situation.home, here, kind, valid=valid)
+
+    def _plan_way_home(self, situation: Situation, *, flying: bool) -> None:
+        """Find the items that Return flies; `flying`: whether a mission was flown until now."""
+        plans, home = self._plans, situation.home
+        here = local_to_geodetic(np.array(situation.position), situation.origin)
+        if self._return_type is ReturnType.MISSION:
+            way = along_mission(plans, home, here, flying=flying) if self.mission.valid else ()
+        else:
+            way = self._way_to_landing(situation, here)
+        self._way_home.store(Kind.MISSION, way, 0, 0)
+
+    def _way_to_landing(self, situation: Situation, here: Geodetic) -> tuple[PlanItem, ...]:
+        """Return the climb, and the mission's landing from its beginning."""
+        begin = landing_start(self._plans.mission)
+        if begin is None:
+            return ()
+        ground = self._destination(situation).place
+        away = distance_m(ground[:2], here[:2])
+        above = return_height(self._value, here.altitude_m - ground.altitude_m, away)
+        landing = onwards(self._plans, begin)
+        altitude = ground.altitude_m + above
+        if altitude <= here.altitude_m:
+            return landing
+        text = f"RTL Mission land: climb to {math.ceil(altitude)} m"
+        event = events.RTL_MISSION_LAND.event(math.ceil(altitude))
+        self._crew.say(Message(Severity.INFO, text, event))
+        return (climb(here, altitude), *landing)
+
+    def _check_way_home(self, _situation: Situation) -> Verdict:
+        return Verdict(bool(self._way_home.mission), ())
 
     def tell(self, context: FlightContext, reports: Reports) -> None:
         """Tell the modes what to fly, and the failsafes what is wrong."""
@@ -72,7 +139,10 @@ class Navigator:
 
     def _return_time_s(self, context: FlightContext, position: Vec) -> float:
         """Return how long a return from a place, local NED [m], takes [s]."""
-        goal = context.home if context.return_place is None else context.return_place().position
+        place = None if context.return_place is None else context.return_place()
+        if place is None:
+            return 0.0  # along a mission nobody knows
+        goal = place.position
         away, height = math.dist(position[:2], goal[:2]), goal[2] - position[2]
         return return_time_s(self._value, height, away)
 
@@ -84,6 +154,7 @@ class Navigator:
         self._position = situation.position
         self.fence.step(situation, mode, place)
         flying = armed and mode is Mode.MISSION
+        self._step_home(situation, returning=armed and mode is Mode.RETURN)
         if flying and not self._flying:
             self.mission.activate(situation)
         elif self._flying and not flying:
@@ -93,6 +164,23 @@ class Navigator:
         else:
             self.mission.idle(situation, armed=armed)
         self._flying = flying
+
+    def _step_home(self, situation: Situation, *, returning: bool) -> None:
+        """Advance along the mission where Return flies it."""
+        if not returning:
+            if self._home_by_mission:
+                self._returning.deactivate()
+            self._home_by_mission = self._returned = False
+        elif self._home_by_mission:
+            self._returning.update(situation)
+        elif not self._returned:
+            # The way is chosen once, when the mode begins.
+            self._returned = True
+            anywhere = Place((0.0, 0.0, 0.0), 0.0)
+            if self.return_place(situation, anywhere) is None:
+                self._plan_way_home(situation, flying=self._flying)
+                self._home_by_mission = True
+                self._returning.activate(situation)
 
     def _check(self, situation: Situation) -> Verdict:
         return check(

@@ -1,13 +1,14 @@
 """Where Return goes: home, a rally point, or the mission's landing (RTL_TYPE).
 
-Source: PX4 1.16, RTL::findRtlDestination, for a multicopter. With RTL_TYPE = 2 PX4 follows the
-mission's own path; here the vehicle flies straight to the mission's landing, or home.
+Source: PX4 1.16, RTL::findRtlDestination, for a multicopter. RTL_TYPE = 2 has no destination, but a
+way along the mission: `way_home`.
 """
 
 from __future__ import annotations
 
 import math
 from enum import IntEnum
+from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.navigation.geography import distance_m
@@ -27,12 +28,23 @@ class ReturnType(IntEnum):
     NOT_HOME = 1
     """The mission's landing or a rally point; home only where there is neither."""
     MISSION = 2
-    """The mission's landing; home where it has none."""
+    """Along the mission to its landing; where it has none, back along it and home."""
     NEAREST = 3
     """Home, the mission's landing or a rally point."""
 
 
-def destination(plans: Plans, home: Geodetic, here: Geodetic, kind: int) -> Geodetic:
+class Destination(NamedTuple):
+    """Where to return to."""
+
+    place: Geodetic
+    """Its altitude is the ground's."""
+    by_landing: bool = False
+    """Whether it is the mission's landing, which is flown from its beginning."""
+
+
+def destination(
+    plans: Plans, home: Geodetic, here: Geodetic, kind: int, *, valid: bool = True
+) -> Destination:
     """Return where to return to.
 
     Args:
@@ -40,25 +52,26 @@ def destination(plans: Plans, home: Geodetic, here: Geodetic, kind: int) -> Geod
         home: Its altitude is the ground's, as is that of what is returned.
         here: Where the vehicle is.
         kind: RTL_TYPE; a number that it does not have counts as 0.
+        valid: Whether the mission can be flown; else its landing does not count.
     """
 
     def away(place: Geodetic) -> float:
         return distance_m(place[:2], here[:2])
 
-    not_home = kind in (ReturnType.NOT_HOME, ReturnType.MISSION)
-    best, nearest = home, math.inf if not_home else away(home)
-    candidates: list[Geodetic] = []
-    if kind in (ReturnType.NOT_HOME, ReturnType.MISSION, ReturnType.NEAREST):
-        landings = (item for item in plans.mission if item.command == NavCommand.LAND)
-        candidates += [item.place(home.altitude_m) for item in list(landings)[:1]]
-    if kind != ReturnType.MISSION:
-        rally = [
-            item.place(home.altitude_m)
-            for item in plans.stored(Kind.RALLY).items
-            if item.command == NavCommand.RALLY_POINT
-        ]
-        candidates += [place for place in rally if distance_m(place[:2], home[:2]) > OF_HOME_M]
-    for place in candidates:
-        if away(place) + NEARER_M < nearest:
-            best, nearest = place, away(place)
+    best = Destination(home)
+    nearest = math.inf if kind == ReturnType.NOT_HOME else away(home)
+    candidates: list[Destination] = []
+    if kind in (ReturnType.NOT_HOME, ReturnType.NEAREST) and valid:
+        landings = [item for item in plans.mission if item.command == NavCommand.LAND]
+        places = [item.place(home.altitude_m) for item in landings[:1]]
+        candidates += [Destination(place, by_landing=True) for place in places]
+    rally = [
+        item.place(home.altitude_m)
+        for item in plans.stored(Kind.RALLY).items
+        if item.command == NavCommand.RALLY_POINT
+    ]
+    far = [place for place in rally if distance_m(place[:2], home[:2]) > OF_HOME_M]
+    for candidate in [*candidates, *map(Destination, far)]:
+        if away(candidate.place) + NEARER_M < nearest:
+            best, nearest = candidate, away(candidate.place)
     return best

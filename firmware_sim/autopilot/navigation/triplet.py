@@ -36,6 +36,8 @@ class Triplet(NamedTuple):
     yaw: float = math.nan
     """Heading [rad]; NaN = by MPC_YAW_MODE."""
     acceptance_m: float = 0.0
+    precision: int = 0
+    """Of a landing: 1 onto a landing target that is seen at once, 2 also onto one that is not."""
     cruise_m_s: float = math.nan
     """NaN = MPC_XY_CRUISE."""
 

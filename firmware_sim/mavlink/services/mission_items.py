@@ -46,6 +46,11 @@ def _whole(value: float) -> float:
     return float(int(value)) if math.isfinite(value) else 0.0
 
 
+def _region(value: float) -> float | None:
+    """Return which MAV_ROI is meant; NaN means none of them to PX4's SITL."""
+    return _whole(value) if math.isfinite(value) else None
+
+
 def _rounded(value: float) -> float:
     return float(int(value + 0.5)) if math.isfinite(value) else 0.0
 
@@ -142,7 +147,7 @@ def parse(message: WireMessage) -> PlanItem | int:
     if frame in _GLOBAL_FRAMES or (integer and frame in _INT_FRAMES):
         if command not in _PLACES:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
-        if roi and _whole(message.param1) not in (_ROI_NONE, _ROI_LOCATION):
+        if roi and _region(message.param1) not in (_ROI_NONE, _ROI_LOCATION):
             return int(dialect.MAV_MISSION_INVALID_PARAM1)
         if not (math.isfinite(x) and math.isfinite(y)):
             # PX4 stores such a place, and does not know what to fly.
@@ -153,7 +158,7 @@ def parse(message: WireMessage) -> PlanItem | int:
     elif frame == Frame.MISSION:
         if command not in _WITHOUT_PLACE:
             return int(dialect.MAV_MISSION_UNSUPPORTED)
-        if roi and _whole(message.param1) not in (_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX):
+        if roi and _region(message.param1) not in (_ROI_NONE, _ROI_WPNEXT, _ROI_WPINDEX):
             return int(dialect.MAV_MISSION_INVALID_PARAM1)
     else:
         return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)

@@ -30,7 +30,7 @@ def _reposition(command: Command, context: Context) -> Result:
         return Result.UNSUPPORTED
     speed, yaw = command.params[0], command.params[3]
     speed = speed if math.isfinite(speed) and speed > 0.0 else NAN
-    place = Place(_local(command, context), yaw if math.isfinite(yaw) else NAN)
+    place = Place(local_place(command, context), yaw if math.isfinite(yaw) else NAN)
     if all(map(math.isnan, (*place.position, place.yaw))):
         return context.port.set_mode(Mode.HOLD)
     return context.port.set_mode(Mode.HOLD, Reposition(place, speed))
@@ -40,7 +40,7 @@ def _change_altitude(command: Command, context: Context) -> Result:
     """Parameter 1: altitude [m] above mean sea level."""
     nowhere = (NAN, NAN, NAN, NAN, NAN, NAN)
     above = replace(command, params=(*nowhere, command.params[0]))
-    place = Place(_local(above, context), NAN)
+    place = Place(local_place(above, context), NAN)
     return context.port.set_mode(Mode.HOLD, Reposition(place))
 
 
@@ -55,14 +55,14 @@ def _change_speed(command: Command, context: Context) -> Result:
 def _orbit(command: Command, context: Context) -> Result:
     """Parameter 1: radius [m], 2: speed [m/s], 3: ORBIT_YAW_BEHAVIOUR, 5..7: centre."""
     radius, speed = (p if math.isfinite(p) else NAN for p in command.params[:2])
-    request = OrbitRequest(_local(command, context), radius, speed, command.integer(3))
+    request = OrbitRequest(local_place(command, context), radius, speed, command.integer(3))
     result = context.port.set_mode(Mode.ORBIT, request)
     if result is not Result.ACCEPTED:
         context.announce(Message(Severity.CRITICAL, "Orbit command rejected"))
     return result
 
 
-def _local(command: Command, context: Context) -> Vec:
+def local_place(command: Command, context: Context) -> Vec:
     """Return parameters 5..7 in local NED [m]; NaN where nothing is given or known."""
     latitude, longitude, altitude = command.params[4:]
     state = context.port.state()

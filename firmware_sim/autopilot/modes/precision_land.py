@@ -1,0 +1,229 @@
+"""Precision land: over a landing target that somebody reports (LANDING_TARGET), down onto it.
+
+Source: PX4 1.16, navigator/precland.cpp: its states, their conditions and PLD_*.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import Enum, auto
+
+from airl_mav.control.demand import AnyDemand
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.error_state import P
+from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, triple
+from firmware_sim.autopilot.modes.land import landing_speed
+from firmware_sim.autopilot.requests import LandingTarget, Request
+from firmware_sim.autopilot.trajectory import Leg
+
+PERIOD_US = 50_000
+"""Time between two looks for the target [µs]: PX4's navigator runs at 20 Hz."""
+
+_SETTLE_US = 2 * US_PER_S
+"""The vehicle waits so long at the start for the target, and above it before it descends [µs]."""
+
+_SEEN_US = US_PER_S
+"""A target that the search has found is looked at for so long before it is approached [µs]."""
+
+_LOST_NEAR_GROUND_US = US_PER_S // 2
+"""Near the ground a target that was silent for so long is lost [µs]."""
+
+_STOP_CLIMBING_M = 1.0
+"""The search climbs on by so much once it has found the target [m]."""
+
+
+class _State(Enum):
+    START = auto()
+    """At a place, on the look-out."""
+    APPROACH = auto()
+    """To the target, at the present height."""
+    DESCEND = auto()
+    """Above the target, downwards."""
+    FINAL = auto()
+    """Down to the ground without looking any more."""
+    SEARCH = auto()
+    """Up to PLD_SRCH_ALT, on the look-out."""
+    FALLBACK = auto()
+    """Down where it is: an ordinary landing."""
+
+
+_DOWNWARDS = (_State.DESCEND, _State.FINAL, _State.FALLBACK)
+
+
+class PrecisionLand(FlightMode):
+    """Finds the landing target, and lands on it; without one, where the vehicle is."""
+
+    def __init__(self, context: FlightContext, /) -> None:
+        self._context = context
+        self._state = _State.START
+        self._goal: Vec = (0.0, 0.0, 0.0)
+        """Where it flies, local NED [m]; on the way down the height has no meaning."""
+        self._required = True
+        self._searches = 0
+        self._next_us = 0
+        self._entered_us = 0
+        """When the present state began."""
+        self._reached_us: int | None = None
+        self._found_us: int | None = None
+        self._known_us = 0
+        """Time of the newest report that was looked at."""
+        self._is_new = False
+
+    @property
+    def destination(self) -> Vec | None:
+        """Where it flies; on the way down, the ground."""
+        north, east, down = self._goal
+        return north, east, self._context.home[2] if self._state in _DOWNWARDS else down
+
+    def enter(self, state: Vector, _request: Request | None, /) -> None:
+        """Begin at the present place; a target that is not seen is searched for."""
+        self.begin(triple(state, P), required=True)
+
+    def begin(self, place: Vec, *, required: bool) -> None:
+        """Begin over a place, local NED [m].
+
+        `required`: a target that is not seen is searched for; else the vehicle just lands.
+        """
+        self._goal, self._required = place, required
+        self._searches, self._next_us = 1, 0
+        self._known_us, self._is_new = -1, False
+        self._reached_us = self._found_us = None
+        self._state = _State.START
+
+    def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
+        """Look for the target now and then; fly on."""
+        if time_us >= self._next_us:
+            self._next_us = time_us + PERIOD_US
+            self._look(triple(state, P), time_us)
+        north, east, _ = self._goal
+        travel = self._context.travel
+        if self._state in _DOWNWARDS:
+            speed = landing_speed(self._context.value, self._context.height(state))
+            return travel.fly(state, time_us, Leg((north, east, math.nan), vertical_m_s=speed))
+        return travel.fly(state, time_us, Leg(self._goal))
+
+    # --- states
+
+    def _look(self, position: Vec, now_us: int) -> None:
+        target = self._context.landing_target
+        self._is_new = target is not None and target.time_us != self._known_us
+        if target is not None:
+            self._known_us = target.time_us
+        if self._state is _State.START:
+            self._start(position, now_us)
+        elif self._state is _State.APPROACH:
+            self._approach(position, now_us)
+        elif self._state is _State.DESCEND:
+            self._descend(position, now_us)
+        elif self._state is _State.SEARCH:
+            self._search(position, now_us)
+
+    def _start(self, position: Vec, now_us: int) -> None:
+        if self._begin_approach(position, now_us):
+            return
+        if not self._required:
+            self._fall_back(position)
+            return
+        if math.dist(position[:2], self._goal[:2]) >= self._context.value("NAV_ACC_RAD"):
+            return
+        if self._reached_us is None:
+            self._reached_us = now_us
+        if self._context.value("PLD_SRCH_TOUT") <= 0.0:
+            self._fall_back(position)
+        elif now_us - self._reached_us > _SETTLE_US:
+            north, east, _ = self._goal
+            # Above the origin of local NED, where PX4 has its reference altitude.
+            self._goal = north, east, -self._context.value("PLD_SRCH_ALT")
+            self._become(_State.SEARCH, now_us)
+
+    def _approach(self, position: Vec, now_us: int) -> None:
+        target = self._target
+        if target is None or (self._is_over(target, position) and not self._is_seen(now_us)):
+            self._lose(position, now_us)
+            return
+        if self._is_new and self._is_over(target, position):
+            if self._reached_us is None:
+                self._reached_us = now_us
+            if now_us - self._reached_us > _SETTLE_US:
+                self._become(_State.DESCEND, now_us)
+        self._goal = *target.position[:2], self._goal[2]
+
+    def _descend(self, position: Vec, now_us: int) -> None:
+        target = self._target
+        if target is None:
+            self._lose(position, now_us)
+            return
+        near = self._is_near_ground(target, position, now_us)
+        seen = self._is_seen(now_us)
+        if near:
+            seen = now_us - target.time_us < _LOST_NEAR_GROUND_US
+        if seen:
+            self._goal = *target.position[:2], self._goal[2]
+        elif near:
+            self._become(_State.FINAL, now_us)
+        else:
+            self._lose(position, now_us)
+
+    def _search(self, position: Vec, now_us: int) -> None:
+        if self._is_new and self._is_seen(now_us) and self._found_us is None:
+            self._found_us = now_us
+            north, east, down = self._goal
+            self._goal = north, east, max(down, position[2] - _STOP_CLIMBING_M)
+        settled = self._found_us is not None and now_us - self._found_us > _SEEN_US
+        if settled and self._begin_approach(position, now_us):
+            return
+        if now_us - self._entered_us > self._context.value("PLD_SRCH_TOUT") * US_PER_S:
+            self._fall_back(position)
+
+    # --- from state to state
+
+    def _become(self, state: _State, now_us: int) -> None:
+        self._state, self._entered_us = state, now_us
+        self._reached_us = self._found_us = None
+
+    def _begin_approach(self, position: Vec, now_us: int) -> bool:
+        """Approach the target where it is seen now; return whether it is."""
+        if not (self._is_new and self._is_seen(now_us)):
+            return False
+        north, east, _ = self._goal
+        self._goal = north, east, position[2]
+        self._become(_State.APPROACH, now_us)
+        return True
+
+    def _lose(self, position: Vec, now_us: int) -> None:
+        """Look for the target where the vehicle is, unless that was done too often."""
+        self._goal = position
+        if self._searches <= self._context.value("PLD_MAX_SRCH"):
+            self._searches += 1
+            self._become(_State.START, now_us)
+        else:
+            self._fall_back(position)
+
+    def _fall_back(self, position: Vec) -> None:
+        self._goal, self._state = position, _State.FALLBACK
+
+    # --- the target
+
+    @property
+    def _target(self) -> LandingTarget | None:
+        return self._context.landing_target
+
+    def _is_seen(self, now_us: int) -> bool:
+        """Return whether the target was reported within PLD_BTOUT."""
+        target = self._target
+        if target is None:
+            return False
+        return now_us - target.time_us <= self._context.value("PLD_BTOUT") * US_PER_S
+
+    def _is_over(self, target: LandingTarget, position: Vec) -> bool:
+        """Return whether the vehicle is above the target, within PLD_HACC_RAD on either axis."""
+        radius = self._context.value("PLD_HACC_RAD")
+        offsets = (a - b for a, b in zip(target.position[:2], position[:2], strict=True))
+        return all(abs(offset) < radius for offset in offsets)
+
+    def _is_near_ground(self, target: LandingTarget, position: Vec, now_us: int) -> bool:
+        """Return whether the vehicle is within PLD_FAPPR_ALT above a target that is seen."""
+        above = target.position[2] - position[2]
+        return self._is_seen(now_us) and above < self._context.value("PLD_FAPPR_ALT")
