@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
+from firmware_sim.autopilot.mode_numbers import MAIN_OFFBOARD
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
-from firmware_sim.mavlink.px4_custom_mode import MAIN_OFFBOARD
 
 REPEAT_US = US_PER_S // 20
 """MAVSDK repeats the newest setpoint so often [µs] (its offboard plugin: 20 Hz)."""

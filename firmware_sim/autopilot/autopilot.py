@@ -28,6 +28,8 @@ from firmware_sim.autopilot.commander import (
     Phase,
 )
 from firmware_sim.autopilot.estimator import Estimator, NewFilter
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Event as Told
 from firmware_sim.autopilot.failsafes.framework import Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
@@ -43,7 +45,7 @@ from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import FollowedTarget, Place, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Place, Request
 from firmware_sim.autopilot.snapshot import Parts, snapshot
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 
@@ -72,7 +74,8 @@ class BuiltinAutopilot:
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._manual_control = ManualControl(value)
-        self.supervisor = Supervisor(value, self.estimator)
+        self._events: list[Told] = []
+        self.supervisor = Supervisor(value, self.estimator, self._events.append)
         """Failsafes and pre-arm checks."""
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value)
@@ -158,7 +161,7 @@ class BuiltinAutopilot:
             self._navigator.step(situation, flight.mode, place, armed=armed)
             self._navigator.tell(self._guidance.context, self.supervisor.watch.reports)
 
-    def _return_place(self) -> Place:
+    def _return_place(self) -> Place | None:
         """Return where Return goes: home, or what RTL_TYPE prefers."""
         context, now = self._guidance.context, self._situation()
         home = Place(context.home, context.home_yaw)
@@ -191,6 +194,8 @@ class BuiltinAutopilot:
 
     def _say(self, message: Message) -> None:
         self._messages.append(message)
+        if message.event is not None:
+            self._events.append(message.event)
         if self.on_message is not None:
             self.on_message(message)
 
@@ -244,6 +249,16 @@ class BuiltinAutopilot:
         taken, self._messages = self._messages, []
         return taken
 
+    def take_events(self) -> list[Told]:
+        """Return events since the last call."""
+        taken = list(self._events)
+        self._events.clear()
+        return taken
+
+    def tell_checks(self) -> None:
+        """Tell all failing pre-arm checks anew (MAV_CMD_RUN_PREARM_CHECKS)."""
+        self.supervisor.tell_checks()
+
     def arm(self, *, force: bool) -> Result:
         """Ask to arm. PX4 runs its checks although a client asks by force, and so do we."""
         del force
@@ -262,10 +277,10 @@ class BuiltinAutopilot:
         """Ask to disarm; force = kill, also in the air."""
         return self._commander.handle(Event.KILL if force else Event.DISARM)
 
-    def takeoff(self, altitude_m: float | None) -> Result:
-        """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
+    def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
+        """Ask to climb to a height above home [m], and to a place; None = as it is by default."""
         flying = self.flight.phase is _AIR
-        self._guidance.take_off_to(altitude_m, self._state, flying=flying)
+        self._guidance.take_off_to(altitude_m, place, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
 
     def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
@@ -292,7 +307,8 @@ class BuiltinAutopilot:
     def start_mission(self, index: int) -> Result:
         """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
         if not self._navigator.mission_is_valid(self._situation()):
-            self.say(Message(Severity.CRITICAL, "Mission start denied! No valid mission"))
+            denied = events.MISSION_DENIED
+            self.say(Message(Severity.CRITICAL, denied.message, denied.event()))
             return Result.DENIED
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
@@ -338,7 +354,7 @@ class BuiltinAutopilot:
 
     def return_to_launch(self) -> None:
         """End the mission and return."""
-        self.say(Message(Severity.INFO, "Returning to launch"))
+        self.say(Message(Severity.INFO, "Returning to launch", events.RETURNING.event()))
         self.set_mode(Mode.RETURN)
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
@@ -369,11 +385,16 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
-            self._say(Message(Severity.INFO, "Pilot took over using sticks"))
+            took_over = events.PILOT_TOOK_OVER
+            self._say(Message(Severity.INFO, took_over.message, took_over.event()))
 
     def follow(self, target: FollowedTarget) -> None:
         """Hand over where the target is that Follow follows."""
         self._guidance.context.target = target
+
+    def landing_target(self, target: LandingTarget) -> None:
+        """Hand over where the target of a precision landing is."""
+        self._guidance.context.landing_target = target
 
     def gcs_heartbeat(self, time_us: int) -> None:
         """A ground station was heard."""

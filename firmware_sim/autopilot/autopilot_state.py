@@ -6,7 +6,7 @@ Whatever is created for every snapshot is a named tuple, which is faster than a 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.frames import Geodetic
+from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.interfaces import BatterySample, GpsFix
 
 Vector = NDArray[np.float64]
@@ -51,6 +52,8 @@ class Mode(IntEnum):
     """Comes down level without knowing where; failsafes alone choose it."""
     TERMINATION = 14
     """The motors stand still for good."""
+    PRECISION_LAND = 15
+    """Onto a landing target that is reported."""
 
 
 MODE_NAMES = {
@@ -69,6 +72,7 @@ MODE_NAMES = {
     Mode.FOLLOW: "Follow Target",
     Mode.DESCEND: "Descend",
     Mode.TERMINATION: "Termination",
+    Mode.PRECISION_LAND: "Precision Landing",
 }
 """As PX4's texts name them."""
 
@@ -105,6 +109,8 @@ class Message:
 
     severity: Severity
     text: str
+    event: Event | None = field(default=None, compare=False)
+    """The same as an event, for ground stations that know it; None = there is none."""
 
 
 class Result(IntEnum):

@@ -21,6 +21,10 @@ from firmware_sim.autopilot.autopilot_state import (
     Result,
     Severity,
 )
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Event as Told
+from firmware_sim.autopilot.events.enumerations import ArmingReason, words
+from firmware_sim.autopilot.mode_numbers import custom_mode, named
 
 
 class Phase(IntEnum):
@@ -111,22 +115,24 @@ class Row:
     text: Message | None = None
 
 
-def _info(text: str) -> Message:
-    return Message(Severity.INFO, text)
+def _info(text: str, event: Told) -> Message:
+    return Message(Severity.INFO, text, event)
 
 
-def _critical(text: str) -> Message:
-    return Message(Severity.CRITICAL, text)
+def _critical(text: str, event: Told) -> Message:
+    return Message(Severity.CRITICAL, text, event)
 
 
+_ARM_DENIED, _NOT_LANDED_YET = events.ARM_DENIED, events.DISARM_DENIED
+_BY_COMMAND = events.ARMED_BY.event(ArmingReason.COMMAND_EXTERNAL)
 _IGNORE = Row()
 _TEMP = Result.TEMPORARILY_REJECTED
-_NO_ARM = Row(result=_TEMP, text=_critical("Arming denied: Resolve system health failures first"))
-_NOT_LANDED = Row(result=_TEMP, text=_critical("Disarming denied: not landed"))
+_NO_ARM = Row(result=_TEMP, text=_critical(_ARM_DENIED.message, _ARM_DENIED.event()))
+_NOT_LANDED = Row(result=_TEMP, text=_critical(_NOT_LANDED_YET.message, _NOT_LANDED_YET.event()))
 _B, _S, _G, _A = Phase
-_ARMED = Row(phase=_G, text=_info("Armed by external command"))
-_LIFTED = Row(phase=_A, text=_info("Takeoff detected"))
-_LANDED = Row(phase=_G, text=_info("Landing detected"))
+_ARMED = Row(phase=_G, text=_info("Armed by external command", _BY_COMMAND))
+_LIFTED = Row(phase=_A, text=_info("Takeoff detected", events.TAKEOFF_DETECTED.event()))
+_LANDED = Row(phase=_G, text=_info("Landing detected", events.LANDING_DETECTED.event()))
 
 
 def _ask(mode: Mode, text: Message | None = None) -> Row:
@@ -135,7 +141,8 @@ def _ask(mode: Mode, text: Message | None = None) -> Row:
 
 def _unavailable(mode: Mode) -> Row:
     text = f"Switching to {MODE_NAMES[mode]} is currently not available"
-    return Row(result=_TEMP, text=_critical(text))
+    event = events.MODE_NOT_AVAILABLE.event(custom_mode(mode), named(mode))
+    return Row(result=_TEMP, text=_critical(text, event))
 
 
 def _asked(mode: Mode) -> tuple[Row, Row, Row, Row]:
@@ -149,16 +156,20 @@ def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
     return (_ask(mode), _ask(mode), _unavailable(mode), _unavailable(mode))
 
 
-def _disarm(text: str) -> Row:
-    return Row(phase=_S, choice=Choice.RESTORE, text=_info(text))
+def _disarm(reason: ArmingReason) -> Row:
+    text = _info(f"Disarmed by {words(reason)}", events.DISARMED_BY.event(reason))
+    return Row(phase=_S, choice=Choice.RESTORE, text=text)
 
 
-_FLYING_TEXT = {Mode.LAND: _info("Landing at current position")}
+_FLYING_TEXT = {
+    Mode.LAND: _info("Landing at current position", events.LANDING_HERE.event()),
+    Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
+}
 """What an armed vehicle says when it is asked for a mode."""
 
-_DISARMED = _disarm("Disarmed by external command")
-_UNUSED = _disarm("Disarmed by auto preflight disarming")
-_LOCKED, _CUT = _disarm("Disarmed by lockdown"), _disarm("Disarmed by failsafe")
+_DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
+_UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)
+_LOCKED, _CUT = _disarm(ArmingReason.LOCKDOWN), _disarm(ArmingReason.FAILSAFE)
 _DENIED = Row(result=Result.DENIED)
 
 TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
@@ -173,7 +184,7 @@ TABLE: dict[Ask | Event, tuple[Row, Row, Row, Row]] = {
     Event.LANDED: (_IGNORE, _IGNORE, _IGNORE, _LANDED),
     Event.MODE_DONE: (_IGNORE, _IGNORE, _IGNORE, _ask(Mode.HOLD)),
     Event.DISARM_TIMEOUT: (_IGNORE, _IGNORE, _UNUSED, _IGNORE),
-    Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm("Disarmed by landing"), _IGNORE),
+    Event.LANDED_TIMEOUT: (_IGNORE, _IGNORE, _disarm(ArmingReason.AUTO_DISARM_LAND), _IGNORE),
     Event.LOCKDOWN_TIMEOUT: (_IGNORE, _IGNORE, _LOCKED, _LOCKED),
     Event.FAILSAFE_DISARM: (_IGNORE, _IGNORE, _CUT, _CUT),
     **{Ask(mode): _asked(mode) for mode in Mode},
@@ -195,7 +206,10 @@ READINESS = tuple(
 """[phase][whether the estimator is healthy]: the event to handle, None where the table ignores it.
 Looked up at every tick."""
 
-_PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN, Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND}
+_PASSING = {
+    *(Mode.TAKEOFF, Mode.LAND, Mode.PRECISION_LAND, Mode.RETURN),
+    *(Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND),
+}
 
 
 @dataclass(frozen=True, slots=True)

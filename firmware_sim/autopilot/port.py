@@ -11,9 +11,10 @@ from airl_mav.core.frames import Geodetic
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.requests import FollowedTarget, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
 from firmware_sim.interfaces import SensorSample
 
 
@@ -164,6 +165,14 @@ class AutopilotPort(Protocol):
         """Return texts for the operator since the last call."""
         ...
 
+    def take_events(self) -> list[Event]:
+        """Return events since the last call: texts that are events, too, and reports."""
+        ...
+
+    def tell_checks(self) -> None:
+        """Tell all failing pre-arm checks anew."""
+        ...
+
     def arm(self, *, force: bool) -> Result:
         """Ask to arm."""
         ...
@@ -176,8 +185,11 @@ class AutopilotPort(Protocol):
         """Ask to stop the motors for good; DENIED while disarmed."""
         ...
 
-    def takeoff(self, altitude_m: float | None) -> Result:
-        """Ask to climb to a height above home [m]; None = MIS_TAKEOFF_ALT."""
+    def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
+        """Ask to climb to a height above home [m], and to a place, local NED north and east [m].
+
+        No height = MIS_TAKEOFF_ALT; no place = straight up.
+        """
         ...
 
     def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
@@ -222,6 +234,10 @@ class AutopilotPort(Protocol):
 
     def follow(self, target: FollowedTarget) -> None:
         """Hand over where the target is that Follow follows."""
+        ...
+
+    def landing_target(self, target: LandingTarget) -> None:
+        """Hand over where the target of a precision landing is."""
         ...
 
     def gcs_heartbeat(self, time_us: int) -> None:

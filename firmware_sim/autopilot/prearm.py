@@ -7,83 +7,14 @@ commander/HealthAndArmingChecks; a check of what this vehicle does not have is l
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntFlag, auto
 from typing import NamedTuple
 
-from firmware_sim.autopilot.autopilot_state import Mode, Severity
-from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Conditions, Need
-
-SUPPLY_CHECK_OFF = 894281
-"""CBRK_SUPPLY_CHK at this value switches the checks of the battery off."""
-
-
-class Part(IntFlag):
-    """Parts of the vehicle that a check is about."""
-
-    GYRO = auto()
-    ACCEL = auto()
-    MAG = auto()
-    BARO = auto()
-    GPS = auto()
-    BATTERY = auto()
-    ESTIMATOR = auto()
-    MANUAL_CONTROL = auto()
-    LINK = auto()
-    SYSTEM = auto()
-
-
-class ArmingSettings(NamedTuple):
-    """Each field is the parameter of that name in capitals; the numbers are PX4's defaults."""
-
-    com_arm_bat_min: float = -1.0
-    com_arm_mag_str: int = 2
-    com_arm_mis_req: int = 0
-    com_arm_wo_gps: int = 1
-    com_rc_in_mode: int = 3
-    cbrk_supply_chk: int = 0
-    gf_action: int = 2
-    nav_dll_act: int = 0
-    sys_has_baro: int = 1
-    sys_has_gps: int = 1
-    sys_has_mag: int = 1
-
-    @classmethod
-    def read(cls, value: Callable[[str], float]) -> ArmingSettings:
-        """Read them by a lookup of PX4 parameter names."""
-        defaults = cls._field_defaults.values()
-        return cls(
-            *(
-                type(default)(value(name.upper()))
-                for name, default in zip(cls._fields, defaults, strict=True)
-            )
-        )
-
-
-class Readiness(NamedTuple):
-    """What the checks look at. No measured number: it is the same until something has changed."""
-
-    mode: Mode
-    conditions: Conditions
-    settings: ArmingSettings
-    converged: bool = True
-    """The estimator knows well enough where the vehicle is and how it points."""
-    compass_agrees: bool = True
-    """The estimator has not given up the compass."""
-    field_disturbed: bool = False
-    """The compass measures something else than the earth's field."""
-    gyro: bool = True
-    """Whether its data are valid, as of all sensors here."""
-    accel: bool = True
-    mag: bool = True
-    baro: bool = True
-    gps: bool = True
-    rolled: bool = False
-    """Roll is beyond FD_FAIL_R."""
-    pitched: bool = False
-    charge_short: bool = False
-    """The battery's charge is below COM_ARM_BAT_MIN."""
-    terminated: bool = False
-    armed: bool = False
+from firmware_sim.autopilot.autopilot_state import Severity
+from firmware_sim.autopilot.events import check_events as events
+from firmware_sim.autopilot.events.check_events import CheckEvent
+from firmware_sim.autopilot.events.definition import Level
+from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Need
+from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Part, Readiness
 
 
 class Check(NamedTuple):
@@ -93,32 +24,46 @@ class Check(NamedTuple):
     fails: Callable[[Readiness], bool]
     text: str
     """What the operator is told."""
+    event: CheckEvent
+    """What ground stations are told of it."""
     said: bool = True
     """Whether PX4 says it by itself when it begins to fail; else only when arming is refused."""
     blocks: Callable[[Readiness], bool] | None = None
     """Whether it keeps the vehicle from arming; None = always."""
     severity: Severity = Severity.CRITICAL
+    level: Callable[[Readiness], Level] | None = None
+    """Level of the event; None = its definition's."""
+    shown: Callable[[Readiness], Need] | None = None
+    """Ground stations show it in modes that need one of these, too; None: where it blocks alone,
+    in all modes if it blocks nowhere."""
+
+
+def never(_readiness: Readiness) -> bool:
+    """Return that a check keeps no vehicle from arming."""
+    return False
 
 
 def _lacks(need: Need) -> Callable[[Readiness], bool]:
     return lambda r: bool(NEEDS[r.mode] & need)
 
 
-def _sensor(part: Part, name: str, fails: Callable[[Readiness], bool]) -> Check:
-    return Check(part, fails, f"Preflight Fail: No valid data from {name}")
+def _sensor(part: Part, name: str, event: CheckEvent, fails: Callable[[Readiness], bool]) -> Check:
+    return Check(part, fails, f"Preflight Fail: No valid data from {name}", event)
 
 
 def _field_fails(r: Readiness, as_asked: int) -> bool:
     return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
 
 
-def _battery(level: BatteryWarning, text: str) -> Check:
+def _battery(level: BatteryWarning, text: str, event: CheckEvent) -> Check:
     return Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and _battery_level(r) is level,
         text,
+        event,
         blocks=_battery_blocks,
         severity=Severity.EMERGENCY,
+        level=_battery_urgency,
     )
 
 
@@ -145,21 +90,47 @@ def _battery_blocks(r: Readiness) -> bool:
     return r.conditions.battery_warning >= BatteryWarning.CRITICAL
 
 
+def _battery_urgency(r: Readiness) -> Level:
+    critical = r.conditions.battery_warning >= BatteryWarning.CRITICAL or r.charge_short
+    return Level.CRITICAL if critical else Level.WARNING
+
+
 _FIELD_REQUIRED, _FIELD_WARNED = 1, 2
 """COM_ARM_MAG_STR: 1 refuses to arm in a disturbed magnetic field, 2 warns, 0 says nothing."""
 _GLOBAL_REQUIRED = 0
 """COM_ARM_WO_GPS: 0 refuses to arm without a global position, 1 warns, 2 says nothing."""
 _FENCE_RETURN = 3
+_STICKS_DISABLED = 4
+"""COM_RC_IN_MODE: 4 listens to no sticks at all."""
+_POSITION = Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED | Need.GLOBAL_POSITION
+_ANYTHING = Need.ANGULAR_VELOCITY | Need.MANUAL_CONTROL | Need.NOT_ARMING
+"""Every mode needs one of these."""
+
+
+def _no_sticks_wanted(r: Readiness) -> bool:
+    return r.settings.com_rc_in_mode == _STICKS_DISABLED
+
 
 CHECKS: tuple[Check, ...] = (
-    _sensor(Part.ACCEL, "Accel 0", lambda r: not r.accel),
-    _sensor(Part.GYRO, "Gyro 0", lambda r: not r.gyro),
-    _sensor(Part.BARO, "Baro 0", lambda r: bool(r.settings.sys_has_baro) and not r.baro),
-    _sensor(Part.MAG, "Compass 0", lambda r: bool(r.settings.sys_has_mag) and not r.mag),
+    _sensor(Part.ACCEL, "Accel 0", events.ACCEL_NO_DATA, lambda r: not r.accel),
+    _sensor(Part.GYRO, "Gyro 0", events.GYRO_NO_DATA, lambda r: not r.gyro),
+    _sensor(
+        Part.BARO,
+        "Baro 0",
+        events.BARO_NO_DATA,
+        lambda r: bool(r.settings.sys_has_baro) and not r.baro,
+    ),
+    _sensor(
+        Part.MAG,
+        "Compass 0",
+        events.MAG_NO_DATA,
+        lambda r: bool(r.settings.sys_has_mag) and not r.mag,
+    ),
     Check(
         Part.GPS,
         lambda r: bool(r.settings.sys_has_gps) and not r.gps and r.settings.com_arm_wo_gps == 0,
         "Preflight Fail: GPS fix too low",
+        events.GPS_FIX_TOO_LOW,
     ),
     Check(
         Part.GPS,
@@ -170,33 +141,40 @@ CHECKS: tuple[Check, ...] = (
             and r.settings.com_arm_wo_gps == 1
         ),
         "Preflight: GPS fix too low",
-        blocks=lambda _: False,
+        events.GPS_FIX_TOO_LOW,
+        blocks=never,
         severity=Severity.WARNING,
+        level=lambda _: Level.WARNING,
+        shown=lambda _: _POSITION,
     ),
-    _battery(BatteryWarning.LOW, "Low battery"),
-    _battery(BatteryWarning.CRITICAL, "Critical battery"),
-    _battery(BatteryWarning.EMERGENCY, "Emergency battery level"),
+    _battery(BatteryWarning.LOW, "Low battery", events.BATTERY_LOW),
+    _battery(BatteryWarning.CRITICAL, "Critical battery", events.BATTERY_CRITICAL),
+    _battery(BatteryWarning.EMERGENCY, "Emergency battery level", events.BATTERY_EMERGENCY),
     Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
         "Preflight Fail: Battery unhealthy",
+        events.BATTERY_UNHEALTHY,
     ),
     Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_low_remaining_time,
         "Remaining flight time low",
+        events.BATTERY_TIME_LOW,
         said=False,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: not r.converged and not r.armed,
         "Preflight Fail: ekf2 missing data",
+        events.ESTIMATOR_MISSING,
         said=False,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: not r.compass_agrees and not r.armed,
         "Preflight Fail: heading estimate not stable",
+        events.HEADING_UNSTABLE,
     ),
     Check(
         Part.ESTIMATOR,
@@ -204,11 +182,13 @@ CHECKS: tuple[Check, ...] = (
             r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == _FIELD_REQUIRED
         ),
         "Preflight Fail: Strong magnetic interference",
+        events.MAG_INTERFERENCE,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: _field_fails(r, _FIELD_WARNED),
         "Preflight: Strong magnetic interference",
+        events.MAG_INTERFERENCE,
         # Before the estimator has a heading, that field is what it waits for the end of.
         blocks=lambda r: not r.converged,
         severity=Severity.WARNING,
@@ -217,26 +197,31 @@ CHECKS: tuple[Check, ...] = (
         Part.SYSTEM,
         lambda r: r.rolled,
         "Preflight Fail: Attitude failure (roll)",
+        events.ROLLED,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.pitched and not r.rolled,
         "Preflight Fail: Attitude failure (pitch)",
+        events.PITCHED,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.geofence.distance and r.settings.gf_action != 0,
         "Geofence violation: exceeding maximum distance to Home",
+        events.FENCE_DISTANCE,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.geofence.altitude and r.settings.gf_action != 0,
         "Geofence violation: exceeding maximum altitude above Home",
+        events.FENCE_ALTITUDE,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.geofence.custom and r.settings.gf_action != 0,
         "Geofence violation: approaching or outside geofence",
+        events.FENCE_CUSTOM,
     ),
     Check(
         Part.SYSTEM,
@@ -246,27 +231,41 @@ CHECKS: tuple[Check, ...] = (
             and r.converged
         ),
         "Preflight Fail: Geofence RTL requires valid home",
+        events.FENCE_NO_HOME,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.mission_failure,
         "Mission cannot be completed",
+        events.MISSION_FAILURE,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.flight_time_limit_exceeded,
         "Maximum flight time reached",
+        events.FLIGHT_TIME,
     ),
     Check(
         Part.LINK,
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act > 0,
         "Preflight Fail: No connection to the ground control station",
+        events.NO_GCS,
         severity=Severity.WARNING,
+    ),
+    Check(
+        Part.LINK,
+        lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act <= 0,
+        "No connection to the ground control station",
+        events.NO_GCS,
+        said=False,
+        blocks=never,
+        level=lambda _: Level.INFO,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.terminated,
         "Preflight Fail: Flight termination active",
+        events.TERMINATED,
     ),
     Check(
         Part.SYSTEM,
@@ -277,6 +276,7 @@ CHECKS: tuple[Check, ...] = (
             and r.conditions.global_position_invalid
         ),
         "Preflight Fail: Global position estimate required",
+        events.NO_GLOBAL_POSITION,
     ),
     Check(
         Part.SYSTEM,
@@ -287,18 +287,21 @@ CHECKS: tuple[Check, ...] = (
             and r.conditions.home_position_invalid
         ),
         "Preflight Fail: Home position required",
+        events.NO_HOME,
     ),
     # What a mode needs. PX4 tells it by events alone, and so do we until arming is refused.
     Check(
         Part.SYSTEM,
         lambda r: bool(NEEDS[r.mode] & Need.NOT_ARMING) and not r.terminated and not r.armed,
         "Preflight Fail: Mode not suitable for arming",
+        events.MODE_CANNOT_ARM,
         said=False,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: r.conditions.attitude_invalid,
         "Preflight Fail: No valid attitude estimate",
+        events.MODE_ATTITUDE,
         said=False,
         blocks=_lacks(Need.ATTITUDE),
     ),
@@ -306,6 +309,7 @@ CHECKS: tuple[Check, ...] = (
         Part.ESTIMATOR,
         lambda r: r.conditions.local_position_invalid,
         "Preflight Fail: No valid position estimate",
+        events.MODE_LOCAL_POSITION,
         said=False,
         blocks=_lacks(Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED),
     ),
@@ -313,6 +317,7 @@ CHECKS: tuple[Check, ...] = (
         Part.ESTIMATOR,
         lambda r: r.conditions.global_position_invalid and not r.conditions.local_position_invalid,
         "Preflight Fail: No valid global position estimate",
+        events.MODE_GLOBAL_POSITION,
         said=False,
         blocks=_lacks(Need.GLOBAL_POSITION),
     ),
@@ -320,6 +325,7 @@ CHECKS: tuple[Check, ...] = (
         Part.ESTIMATOR,
         lambda r: r.conditions.local_altitude_invalid,
         "Preflight Fail: No valid altitude estimate",
+        events.MODE_ALTITUDE,
         said=False,
         blocks=_lacks(Need.ALTITUDE),
     ),
@@ -330,6 +336,7 @@ CHECKS: tuple[Check, ...] = (
             and (bool(r.settings.com_arm_mis_req) or bool(NEEDS[r.mode] & Need.MISSION))
         ),
         "Preflight Fail: No valid mission available",
+        events.MODE_MISSION,
         said=False,
     ),
     Check(
@@ -338,12 +345,14 @@ CHECKS: tuple[Check, ...] = (
             r.conditions.offboard_control_signal_lost and bool(NEEDS[r.mode] & Need.OFFBOARD_SIGNAL)
         ),
         "Preflight Fail: No offboard signal",
+        events.MODE_OFFBOARD,
         said=False,
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.home_position_invalid and bool(NEEDS[r.mode] & Need.HOME),
         "Preflight Fail: Home position not set",
+        events.MODE_HOME,
         said=False,
     ),
     Check(
@@ -352,7 +361,10 @@ CHECKS: tuple[Check, ...] = (
             r.conditions.manual_control_signal_lost and bool(NEEDS[r.mode] & Need.MANUAL_CONTROL)
         ),
         "Preflight Fail: No manual control input",
+        events.MODE_MANUAL,
         said=False,
+        level=lambda r: Level.ERROR if _no_sticks_wanted(r) else Level.WARNING,
+        shown=lambda r: Need.MANUAL_CONTROL if _no_sticks_wanted(r) else _ANYTHING,
     ),
 )
 """In the order in which they are told."""

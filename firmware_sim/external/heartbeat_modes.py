@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Flight, Phase
-from firmware_sim.mavlink import px4_custom_mode as px4_modes
+from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.mavlink.codec import dialect
 
 # PX4 reports Descend as Land.
-_PX4_MODES = {px4_modes.custom_mode(mode): mode for mode in Mode if mode is not Mode.DESCEND}
+_PX4_MODES = {custom_mode(mode): mode for mode in Mode if mode is not Mode.DESCEND}
 
 # ArduCopter's mode numbers: ArduCopter/mode.h, enum class Number.
 GUIDED = 4

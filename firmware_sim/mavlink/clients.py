@@ -19,6 +19,7 @@ from airl_mav.core.signing import Signing
 from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
+from firmware_sim.mavlink.event_buffer import EventSender
 from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.texts import TextEncoder
@@ -52,6 +53,8 @@ class Client:
     link: Link
     texts: TextEncoder
     reply_texts: TextEncoder
+    events: EventSender | None = None
+    """As `context`."""
     context: Context | None = None
     """None while there is no autopilot."""
     announced_origin: Geodetic | None = None

@@ -7,28 +7,13 @@ src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
 from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import WITH_STICKS, Arming, CommanderStatus, Mode
+from firmware_sim.autopilot.mode_numbers import (
+    MAIN_AUTO,
+    MAIN_POSCTL,
+    MAIN_SUB,
+    MAIN_TERMINATION,
+)
 from firmware_sim.mavlink.codec import dialect
-
-MAIN_AUTO, MAIN_OFFBOARD, MAIN_POSCTL = 4, 6, 3
-_MAIN_ACRO, _MAIN_TERMINATION = 5, 10
-
-_MAIN_SUB: dict[Mode, tuple[int, int]] = {
-    Mode.HOLD: (MAIN_AUTO, 3),
-    Mode.TAKEOFF: (MAIN_AUTO, 2),
-    Mode.LAND: (MAIN_AUTO, 6),
-    Mode.RETURN: (MAIN_AUTO, 5),
-    Mode.OFFBOARD: (MAIN_OFFBOARD, 0),
-    Mode.POSITION: (MAIN_POSCTL, 0),
-    Mode.MISSION: (MAIN_AUTO, 4),
-    Mode.ORBIT: (MAIN_POSCTL, 1),
-    Mode.FOLLOW: (MAIN_AUTO, 8),
-    Mode.MANUAL: (1, 0),
-    Mode.ALTITUDE: (2, 0),
-    Mode.ACRO: (_MAIN_ACRO, 0),
-    Mode.STABILIZED: (7, 0),
-    Mode.DESCEND: (MAIN_AUTO, 6),  # PX4 reports it as Land
-    Mode.TERMINATION: (_MAIN_TERMINATION, 0),
-}
 
 
 def _unavailable(name: str) -> str:
@@ -39,29 +24,22 @@ def _unavailable(name: str) -> str:
 # PX4 that are known by name and never available.
 _MAIN_MODES: dict[int, Mode | str] = {
     main: mode
-    for mode, (main, sub) in _MAIN_SUB.items()
-    if main not in (MAIN_AUTO, _MAIN_TERMINATION) and sub == 0
+    for mode, (main, sub) in MAIN_SUB.items()
+    if main not in (MAIN_AUTO, MAIN_TERMINATION) and sub == 0
 }
 _POSITION_MODES: dict[int, Mode | str] = {
-    **{sub: mode for mode, (main, sub) in _MAIN_SUB.items() if main == MAIN_POSCTL},
+    **{sub: mode for mode, (main, sub) in MAIN_SUB.items() if main == MAIN_POSCTL},
     2: _unavailable("Position Slow"),
 }
 _AUTO_MODES: dict[int, Mode | str] = {
     **{
         sub: mode
-        for mode, (main, sub) in _MAIN_SUB.items()
+        for mode, (main, sub) in MAIN_SUB.items()
         if main == MAIN_AUTO and mode is not Mode.DESCEND
     },
     0: Mode.MISSION,
-    9: _unavailable("Precision Landing"),
     **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},
 }
-
-
-def custom_mode(mode: Mode) -> int:
-    """Return PX4's custom_mode: main mode << 16 | sub mode << 24."""
-    main, sub = _MAIN_SUB[mode]
-    return main << 16 | sub << 24
 
 
 def base_mode(status: CommanderStatus) -> int:
@@ -69,7 +47,7 @@ def base_mode(status: CommanderStatus) -> int:
     bits: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     if status.mode is not Mode.ACRO:
         bits |= dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-    if _MAIN_SUB[status.mode][0] == MAIN_AUTO:
+    if MAIN_SUB[status.mode][0] == MAIN_AUTO:
         bits |= dialect.MAV_MODE_FLAG_AUTO_ENABLED | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
     if status.mode in WITH_STICKS:
         bits |= dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED

@@ -15,6 +15,7 @@ from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.complaints import Complaints
 from firmware_sim.mavlink.endpoint import Endpoint, Peer
+from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
 from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.senders import Senders
@@ -90,6 +91,7 @@ class MavlinkServer:
         self._system_id = SYSTEM_ID
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        self._events = EventBuffer()
         self._complaints = Complaints()
         self._first_in_turn = 0
         """Place of the client that is the next to get what it gets piece by piece."""
@@ -125,6 +127,7 @@ class MavlinkServer:
         self._complaints.restart()
         self._vibration = VibrationMeter()
         self._calibration = RunningCalibration()
+        self._events = EventBuffer()
         for clients in self._links:
             clients.restart(self._now_us)
             for client in clients:
@@ -161,6 +164,8 @@ class MavlinkServer:
         if sample is not None:
             self._vibration.update(sample)
         texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
+        for event in port.take_events():
+            self._events.add(event, now_us)
         self._send_pending(now_us)
         state: AutopilotState | None = None
         payloads: Payloads = {}
@@ -170,9 +175,7 @@ class MavlinkServer:
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
-            for text in texts:
-                for chunk in client.texts.encode(text):
-                    link.stream(chunk)
+            _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
             if names or client.announced_origin is None:
@@ -276,11 +279,13 @@ class MavlinkServer:
             self._now_us,
             self._announce,
             self._broadcast,
+            self._events,
             self._signing,
             self._system_id,
             storage=self._storage,
             calibration=self._calibration,
         )
+        client.events = EventSender(self._events)
         client.announced_origin = None
 
     def _discard(self) -> None:
@@ -335,6 +340,16 @@ class MavlinkServer:
         if self._port is None:
             return None
         return information.time_estimate_to_target(state, self._port.parameters.value)
+
+
+def _stream_news(client: Client, texts: Iterable[Message], now_us: int) -> None:
+    """Add texts, and the events that a client lacks, to its telemetry."""
+    for text in texts:
+        for chunk in client.texts.encode(text):
+            client.link.stream(chunk)
+    if client.events is not None:
+        for message in client.events.due(now_us):
+            client.link.stream(message)
 
 
 def _tell(clients: Iterable[Client], text: Message) -> None:

@@ -8,6 +8,9 @@ from firmware_sim.mavlink.codec import WireMessage, dialect
 CHUNK_BYTES = 50
 _LAST_ID = 65_535
 
+SAID_BY_EVENT = b"\t"
+"""Ends a text that is an event, too, as PX4's do: ground stations that know events pass it over."""
+
 REPLY_IDS = 32_768
 """First id of answers that are counted apart from the autopilot's texts: the ids of two consecutive
 long texts must differ."""
@@ -28,6 +31,8 @@ class TextEncoder:
         is followed by an empty one.
         """
         text = message.text.encode("ascii", errors="replace")
+        if message.event is not None:
+            text += SAID_BY_EVENT
         if len(text) <= CHUNK_BYTES:
             return [dialect.MAVLink_statustext_message(message.severity, text)]
         self._id = self._id % _LAST_ID + 1

@@ -33,6 +33,7 @@ DISARMED = (Severity.INFO, "Disarmed by external command")
 NO_ARM = (Severity.CRITICAL, "Arming denied: Resolve system health failures first")
 NOT_LANDED = (Severity.CRITICAL, "Disarming denied: not landed")
 LANDING = (Severity.INFO, "Landing at current position")
+PRECISELY = (Severity.INFO, "Precision landing")
 CUT = (Severity.INFO, "Disarmed by failsafe")
 LOCKED = (Severity.INFO, "Disarmed by lockdown")
 
@@ -79,6 +80,8 @@ EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {
     **{(Ask(m), p): asked(p, m) for m, p in product(Mode, Phase)},
     (Ask(Mode.LAND), GROUND): asked(GROUND, Mode.LAND, LANDING),
     (Ask(Mode.LAND), AIR): asked(AIR, Mode.LAND, LANDING),
+    (Ask(Mode.PRECISION_LAND), GROUND): asked(GROUND, Mode.PRECISION_LAND, PRECISELY),
+    (Ask(Mode.PRECISION_LAND), AIR): asked(AIR, Mode.PRECISION_LAND, PRECISELY),
     # A mode that lacks what it needs (offboard: a setpoint): on the ground disarmed yes, else no.
     **{(Ask(m, available=False), p): asked(p, m) for m, p in product(Mode, (BOOT, STANDBY))},
     **{
@@ -172,7 +175,10 @@ def test_readiness_is_told_wherever_it_counts(flight: Flight, healthy: bool) -> 
 
 # --- any order of events
 
-PASSING = {Mode.TAKEOFF, Mode.LAND, Mode.RETURN, Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND}
+PASSING = {
+    *(Mode.TAKEOFF, Mode.LAND, Mode.PRECISION_LAND, Mode.RETURN),
+    *(Mode.ORBIT, Mode.FOLLOW, Mode.DESCEND),
+}
 
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=60))

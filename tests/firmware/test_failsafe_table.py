@@ -162,7 +162,7 @@ def test_a_fence_is_escaped_by_mode_not_by_sticks_and_termination_by_nothing() -
 
 
 def test_already_returning_or_landing_it_only_warns() -> None:
-    for mode in (Mode.RETURN, Mode.LAND):
+    for mode in (Mode.RETURN, Mode.LAND, Mode.PRECISION_LAND):
         m = flying(mode, nav_rcl_act=2)
         m.step(manual_control_signal_lost=True)
         assert (m.action(), m.last.mode) == (Action.WARN, mode)
@@ -444,6 +444,7 @@ def _flies(mode: Mode, c: Conditions) -> bool:
         Mode.ACRO: not c.angular_velocity_invalid,
         Mode.DESCEND: level,
         Mode.TERMINATION: True,
+        Mode.PRECISION_LAND: guided,
     }[mode]
 
 
@@ -455,7 +456,7 @@ RULES: list[Callable[[Known], Action]] = [
     ),
     lambda k: (
         _pick(_LINK, k.p.nav_dll_act, Action.NONE)
-        if k.c.gcs_connection_lost and k.mode is not Mode.LAND
+        if k.c.gcs_connection_lost and k.mode not in (Mode.LAND, Mode.PRECISION_LAND)
         else Action.NONE
     ),
     lambda k: Action.RETURN if k.mode is Mode.MISSION and k.c.mission_failure else Action.NONE,
@@ -526,6 +527,9 @@ def second_opinion(k: Known) -> Action:
             (a for a, mode in _CHAIN if a >= worst and _flies(mode, k.c)), Action.TERMINATE
         )
     if k.mode in (Mode.LAND, Mode.RETURN) and worst is Action.RETURN and _flies(k.mode, k.c):
+        return Action.WARN
+    needless = worst in (Action.RETURN, Action.LAND)
+    if k.mode is Mode.PRECISION_LAND and needless and _flies(k.mode, k.c):
         return Action.WARN
     return worst
 

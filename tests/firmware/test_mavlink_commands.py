@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result
+from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.autopilot.navigation.plan import Kind
-from firmware_sim.mavlink.px4_custom_mode import custom_mode
 from tests.support.kinematic_autopilot import ORIGIN
 from tests.support.mavlink_clients import RawClient, Rig, text_of
 from tests.support.mission_kit import at
@@ -151,7 +151,6 @@ def test_an_unknown_main_mode_is_accepted_and_changes_nothing(rig: Rig) -> None:
     ("params", "text"),
     [
         ((1, 3, 2), "Switching to Position Slow is currently not available"),
-        ((1, 4, 9), "Switching to Precision Landing is currently not available"),
         ((1, 4, 99), "Unsupported auto mode"),
     ],
 )

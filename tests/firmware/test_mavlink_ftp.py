@@ -186,9 +186,12 @@ def test_the_component_metadata_describes_every_parameter(card: Card) -> None:
     assert metadata.uri == older.general_metadata_uri
     general = fetched(metadata.uri)
     assert crc32part(general) == metadata.file_crc == older.general_metadata_file_crc
-    (entry,) = json.loads(lzma.decompress(general))["metadataTypes"]
+    entries = {e["type"]: e for e in json.loads(lzma.decompress(general))["metadataTypes"]}
+    entry = entries[dialect.COMP_METADATA_TYPE_PARAMETER]
     parameters = fetched(entry["uri"])
     assert crc32part(parameters) == entry["fileCrc"]
+    of_events = entries[dialect.COMP_METADATA_TYPE_EVENTS]
+    assert crc32part(fetched(of_events["uri"])) == of_events["fileCrc"]
     described = {p["name"]: p for p in json.loads(lzma.decompress(parameters))["parameters"]}
     assert described.keys() == {spec.name for spec in SPECS}
     assert described["MPC_XY_VEL_MAX"] | {"shortDesc": ""} == {

@@ -154,7 +154,9 @@ def test_qgroundcontrol_connects(lost_every: int) -> None:
     metadata = station.request(dialect.MAVLINK_MSG_ID_COMPONENT_METADATA, "COMPONENT_METADATA")
     general = station.file(metadata.uri.removeprefix("mftp://"))
     assert crc32part(general) == metadata.file_crc
-    (entry,) = json.loads(lzma.decompress(general))["metadataTypes"]
+    entry, words = json.loads(lzma.decompress(general))["metadataTypes"]
+    events = json.loads(lzma.decompress(station.file(words["uri"].removeprefix("mftp://"))))
+    assert events["components"]["1"]["supported_protocols"] == ["health_and_arming_check"]
     described = json.loads(lzma.decompress(station.file(entry["uri"].removeprefix("mftp://"))))
     hash_check = dialect.MAVLink_param_request_read_message(1, 1, b"_HASH_CHECK", -1)
     assert station.ask(hash_check, "PARAM_VALUE", lambda m: m.param_id == "_HASH_CHECK")

@@ -19,6 +19,7 @@ from firmware_sim.autopilot.autopilot_state import (
 )
 from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
+from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle, peers
 from firmware_sim.mavlink.services.command import Command
@@ -139,6 +140,7 @@ class Manners:
             self.copter.time_us,
             lambda _: None,
             lambda *_: None,
+            EventBuffer(),
             Signing(lambda: 0),
         )
         kind = message.get_type()

@@ -28,11 +28,12 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
     Vector,
 )
+from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
-from firmware_sim.autopilot.requests import FollowedTarget, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -127,14 +128,17 @@ class KinematicAutopilot:
         self.setpoints: list[tuple[Setpoint, int]] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
+        self.takeoff_place: tuple[float, float] | None = None
         self.commands: list[str] = []
         self.looked_at: Geodetic | None = None
         self.requests: list[Request | None] = []
         self.sticks: list[tuple[Sticks, Source, int]] = []
+        self.landing_targets: list[LandingTarget] = []
         self.followed: list[FollowedTarget] = []
         self.attitudes: list[tuple[AttitudeDemand | RateDemand, int]] = []
         self.refusals: list[tuple[str, int]] = []
         self.messages: list[Message] = []
+        self.events: list[Event] = []
         self.offboard_loss_us = US_PER_S
         self.frozen = False
         """Only time passes: lets a test read what it has set."""
@@ -149,6 +153,13 @@ class KinematicAutopilot:
     def take_messages(self) -> list[Message]:
         taken, self.messages = self.messages, []
         return taken
+
+    def take_events(self) -> list[Event]:
+        taken, self.events = self.events, []
+        return taken
+
+    def tell_checks(self) -> None:
+        self.commands.append("tell checks")
 
     def arm(self, *, force: bool) -> Result:
         self.commands.append(f"arm force={force}")
@@ -176,8 +187,9 @@ class KinematicAutopilot:
         self.mode = Mode.TERMINATION
         return Result.ACCEPTED
 
-    def takeoff(self, altitude_m: float | None) -> Result:
+    def takeoff(self, altitude_m: float | None, place: tuple[float, float] | None = None) -> Result:
         self.takeoffs.append(altitude_m)
+        self.takeoff_place = place
         default = float(self.parameters.values["MIS_TAKEOFF_ALT"])
         self._target_height = default if altitude_m is None else altitude_m
         self.mode = Mode.TAKEOFF
@@ -226,6 +238,9 @@ class KinematicAutopilot:
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         self.sticks.append((sticks, source, time_us))
+
+    def landing_target(self, target: LandingTarget) -> None:
+        self.landing_targets.append(target)
 
     def follow(self, target: FollowedTarget) -> None:
         self.followed.append(target)

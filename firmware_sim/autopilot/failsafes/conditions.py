@@ -111,6 +111,7 @@ NEEDS: dict[Mode, Need] = {
     Mode.ACRO: Need.ANGULAR_VELOCITY | Need.MANUAL_CONTROL,
     Mode.DESCEND: _LEVEL | Need.NOT_ARMING,
     Mode.TERMINATION: Need.NOT_ARMING,
+    Mode.PRECISION_LAND: _GUIDED | Need.NOT_ARMING,
 }
 """What each mode needs."""
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.autopilot_state import Message, Mode
 from firmware_sim.autopilot.failsafes.actions import Action, Cause, Clear, Options, Takeover
+from firmware_sim.autopilot.failsafes.announcement import announcement
 from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, can_run
 from firmware_sim.autopilot.failsafes.fallback import mode_fallback, mode_of, possible
 from firmware_sim.autopilot.failsafes.settings import Settings
@@ -140,7 +141,9 @@ def update(
     choice = _select(state, vehicle, conditions, settings, intervention)
     text = None
     if choice.action > state.action or (choice.action is not Action.NONE and warned):
-        text = _text(choice, state.delay_us)
+        text = announcement(
+            choice.action, choice.delayed, choice.cause, vehicle.intended, state.delay_us
+        )
     intended = choice.intended
     if state.active and mode_of(choice.action, intended) is Mode.ORBIT:
         intended = Mode.HOLD  # A circle that was interrupted is not resumed.
@@ -307,18 +310,13 @@ def _select(
 def _already_on_the_way(
     intended: Mode, action: Action, delayed: Action, conditions: Conditions
 ) -> bool:
-    """Return whether a return is asked of a vehicle that lands or returns as it is."""
+    """Return whether a return is asked of a vehicle that lands or returns as it is.
+
+    A precision landing is not given up for an ordinary one either.
+    """
+    needless = (Action.RETURN, Action.LAND)[: 2 if intended is Mode.PRECISION_LAND else 1]
     return (
-        intended in (Mode.LAND, Mode.RETURN)
-        and Action.RETURN in (action, delayed)
+        intended in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND)
+        and (action in needless or delayed in needless)
         and can_run(intended, conditions)
     )
-
-
-def _text(choice: _Choice, delay_us: int) -> Message:
-    if choice.action is Action.HOLD and choice.delayed is not Action.NONE:
-        seconds = (delay_us + US_PER_S // 2) // US_PER_S
-        text = f"Failsafe activated: entering Hold for {seconds} seconds"
-    else:
-        text = "Failsafe activated"
-    return Message(Severity.CRITICAL, text)

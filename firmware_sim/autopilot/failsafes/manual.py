@@ -117,11 +117,17 @@ def checks() -> str:
         (
             check.text,
             (check.part.name or "").lower().replace("_", " "),
-            "by itself" if check.said else "when arming is refused",
+            _told(check),
         )
         for check in prearm.CHECKS
     )
     return _table(("text", "part", "told"), rows)
+
+
+def _told(check: prearm.Check) -> str:
+    if check.said:
+        return "by itself"
+    return "by an event alone" if check.blocks is prearm.never else "when arming is refused"
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import Health, Message, Mode, Setpoint, Severity
 from firmware_sim.autopilot.commander import Flight, Phase
 from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes.actions import Action
 from firmware_sim.autopilot.failsafes.conditions import BatteryWarning, Conditions, Need, lacking
 from firmware_sim.autopilot.failsafes.framework import (
@@ -26,7 +27,8 @@ from firmware_sim.autopilot.failsafes.framework import (
 )
 from firmware_sim.autopilot.failsafes.settings import Settings
 from firmware_sim.autopilot.failsafes.watch import Watch
-from firmware_sim.autopilot.prearm import ArmingSettings, Check, Readiness
+from firmware_sim.autopilot.prearm import Check
+from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
 from firmware_sim.interfaces import SensorSample
 
 LOOK_US = 100_000
@@ -34,9 +36,6 @@ LOOK_US = 100_000
 
 CHECK_US = 100_000
 """Time between two runs of the pre-arm checks [µs] (PX4: 10 Hz)."""
-
-REPORT_US = 2 * US_PER_S
-"""What keeps the vehicle from arming is told no more often than that (PX4's reporting interval)."""
 
 _GROUND = Phase.GROUND
 
@@ -53,8 +52,13 @@ class Decision(NamedTuple):
 class Supervisor:
     """The failsafes and pre-arm checks of one vehicle."""
 
-    def __init__(self, value: Callable[[str], float], estimator: Estimator) -> None:
-        """Take a lookup of PX4 parameter names, and the estimator."""
+    def __init__(
+        self,
+        value: Callable[[str], float],
+        estimator: Estimator,
+        tell: Callable[[Event], None] = lambda _event: None,
+    ) -> None:
+        """Take a lookup of PX4 parameter names, the estimator, and what sends an event."""
         self._value = value
         self._estimator = estimator
         self.watch = Watch(value, estimator)
@@ -75,6 +79,9 @@ class Supervisor:
         self._told: tuple[Check, ...] | None = None
         """Checks that were told as failing; None: nothing is told before the vehicle is ready."""
         self._told_us = 0
+        self._reporter = HealthReporter(tell)
+        self._asked = False
+        """Whether somebody wants the checks told anew."""
         self._check_us = 0
         self._checked = Phase.BOOT
         """Phase of the flight that was checked last."""
@@ -101,6 +108,10 @@ class Supervisor:
         if self.conditions.gcs_connection_lost:
             self.next_us = 0
 
+    def tell_checks(self) -> None:
+        """Tell all failing checks at the next look, also those that were told before."""
+        self._asked, self.next_us, self._check_us = True, 0, 0
+
     # --- looking
 
     def look(self, sample: SensorSample, flight: Flight) -> list[Message]:
@@ -116,6 +127,7 @@ class Supervisor:
             if readiness != self._ready:
                 self._ready, self.failing = readiness, prearm.failing(readiness)
                 self._armable = not prearm.blocking(self.failing, readiness)
+            self._reporter.update(readiness, now_us, force=self._asked)
             texts += self._report(now_us, flight)
         return texts
 
@@ -164,12 +176,15 @@ class Supervisor:
         """Return the checks that have begun to fail, once the vehicle has been ready."""
         if self._told is None:
             if flight.phase is Phase.BOOT:
+                self._asked = False
                 return []
             self._told = ()
-        if self.failing == self._told or now_us < self._told_us + REPORT_US:
+        unchanged = self.failing == self._told or now_us < self._told_us + REPORT_US
+        if unchanged and not self._asked:
             return []
-        new = [check for check in self.failing if check.said and check not in self._told]
-        self._told, self._told_us = self.failing, now_us
+        known = () if self._asked else self._told
+        new = [check for check in self.failing if check.said and check not in known]
+        self._told, self._told_us, self._asked = self.failing, now_us, False
         return [Message(check.severity, check.text) for check in new]
 
     # --- arming and modes

@@ -111,6 +111,7 @@ def _undeferred(answers: Mapping[int, Options]) -> dict[int, Options]:
     return {value: options._replace(deferrable=False) for value, options in answers.items()}
 
 
+_LANDING = (Mode.LAND, Mode.PRECISION_LAND)
 _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
 """NAV_RCL_ACT and NAV_DLL_ACT."""
 
@@ -218,8 +219,8 @@ TABLE: tuple[Row, ...] = (
     Row(
         Trigger.GCS,
         "Ground station lost",
-        "no ground station's HEARTBEAT for so long; not in Land",
-        lambda s: s.conditions.gcs_connection_lost and s.intended is not Mode.LAND,
+        "no ground station's HEARTBEAT for so long; not in Land or Precision Landing",
+        lambda s: s.conditions.gcs_connection_lost and s.intended not in _LANDING,
         _caused(_LINK_LOSS, Cause.GCS_LOSS),
         "NAV_DLL_ACT",
         related=("COM_DL_LOSS_T",),

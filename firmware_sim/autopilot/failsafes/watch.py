@@ -11,6 +11,7 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import (
     NO_BREACH,
     BatteryWarning,
@@ -195,14 +196,21 @@ class Watch:
         if self._gcs_us is not None and conditions.gcs_connection_lost is not self._gcs_lost:
             lost = self._gcs_lost = conditions.gcs_connection_lost
             text = "Connection to ground station lost" if lost else "GCS connection regained"
-            texts.append(Message(Severity.INFO, text))
+            event = events.GCS_LOST if lost else events.GCS_REGAINED
+            texts.append(Message(Severity.INFO, text, event.event()))
         fused = self._estimator.fuses_gps(now_us)
         if fused is not self._gps_fused:
             self._gps_fused = fused
             if phase >= _GROUND and fused:
-                texts.append(Message(Severity.INFO, "GNSS data fusion started"))
+                texts.append(
+                    Message(Severity.INFO, events.GNSS_STARTED.message, events.GNSS_STARTED.event())
+                )
             elif phase >= _GROUND:
-                texts.append(Message(Severity.WARNING, "GNSS data fusion stopped"))
+                texts.append(
+                    Message(
+                        Severity.WARNING, events.GNSS_STOPPED.message, events.GNSS_STOPPED.event()
+                    )
+                )
         estimator = self._estimator
         if estimator.consistency.restarts != self._restarts:
             self._restarts = estimator.consistency.restarts

@@ -31,6 +31,7 @@ from firmware_sim.mavlink.services.context import (
     for_vehicle,
     sender,
 )
+from firmware_sim.mavlink.services.navigation_commands import local_place
 from firmware_sim.mavlink.services.standard_modes import change_mode
 from firmware_sim.mavlink.services.termination import terminate
 from firmware_sim.mavlink.streams.units import INT32_MAX
@@ -59,21 +60,31 @@ def _arm_disarm(command: Command, context: Context) -> Result | None:
 
 
 def _takeoff(command: Command, context: Context) -> Result:
-    """Parameter 7: altitude above mean sea level [m], above home in a relative frame."""
-    altitude = command.params[6]
+    """Parameters 5 and 6: where to, 7: altitude above mean sea level [m].
+
+    In a relative frame the altitude is above home. NaN = straight up, to MIS_TAKEOFF_ALT.
+    """
+    altitude, (north, east, _) = command.params[6], local_place(command, context)
+    place = None if math.isnan(north) else (north, east)
     if not math.isfinite(altitude):
-        return context.port.takeoff(None)
+        return context.port.takeoff(None, place)
     if command.frame in _RELATIVE_FRAMES:
-        return context.port.takeoff(altitude)
+        return context.port.takeoff(altitude, place)
     home = context.port.state().home
     if home is None:
         return Result.TEMPORARILY_REJECTED
-    return context.port.takeoff(altitude - home.altitude_m)
+    return context.port.takeoff(altitude - home.altitude_m, place)
 
 
 def _set_mode(command: Command, context: Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
     return change_mode(base, main, sub, context)
+
+
+def _run_checks(_command: Command, context: Context) -> Result:
+    """Tell anew what keeps the vehicle from arming."""
+    context.port.tell_checks()
+    return Result.ACCEPTED
 
 
 def _reboot(command: Command, _context: Context) -> Result:
@@ -88,9 +99,11 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
     dialect.MAV_CMD_NAV_LAND: lambda _, context: context.port.set_mode(Mode.LAND),
+    dialect.MAV_CMD_NAV_LAND_LOCAL: (lambda _, context: context.port.set_mode(Mode.PRECISION_LAND)),
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, context: context.port.set_mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: terminate,
+    dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
     **logs.ACTIONS,

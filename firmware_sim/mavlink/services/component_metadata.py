@@ -1,8 +1,8 @@
-"""Component metadata: what a ground station learns of this vehicle's parameters, as files.
+"""Component metadata: what a ground station learns of parameters and events, as files.
 
 COMPONENT_METADATA (and the older COMPONENT_INFORMATION) say where the general file lies; that names
-the file with the parameters. Both are read over MAVLink FTP. Source of the formats:
-https://mavlink.io/en/services/component_information.html, `general.schema.json`,
+the files with the parameters and with the words of events. All are read over MAVLink FTP. Source of
+the formats: https://mavlink.io/en/services/component_information.html, `general.schema.json`,
 `parameter.schema.json`.
 """
 
@@ -18,6 +18,7 @@ from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.crc32 import crc32part
+from firmware_sim.mavlink.services import event_metadata
 from firmware_sim.mavlink.services.command import Command
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams.units import boot_ms
@@ -25,18 +26,23 @@ from firmware_sim.storage import Storage
 
 _FOLDER = "etc/extras"
 _GENERAL, _PARAMETERS = "component_general.json.xz", "parameters.json.xz"
-_TYPE_PARAMETERS = 1
-"""COMP_METADATA_TYPE_PARAMETER."""
+_EVENTS = "all_events.json.xz"
 
 
 @functools.cache
 def files() -> dict[str, bytes]:
     """Return the files by their names; made when they are first wanted."""
     parameters = _compressed({"version": 1, "parameters": [_described(s) for s in SPECS]})
-    uri = f"mftp://{_FOLDER}/{_PARAMETERS}"
-    entry = {"type": _TYPE_PARAMETERS, "uri": uri, "fileCrc": crc32part(parameters)}
-    general = _compressed({"version": 1, "metadataTypes": [entry]})
-    return {_GENERAL: general, _PARAMETERS: parameters}
+    events = _compressed(event_metadata.document())
+    entries = [
+        {"type": kind, "uri": f"mftp://{_FOLDER}/{name}", "fileCrc": crc32part(data)}
+        for kind, name, data in (
+            (dialect.COMP_METADATA_TYPE_PARAMETER, _PARAMETERS, parameters),
+            (dialect.COMP_METADATA_TYPE_EVENTS, _EVENTS, events),
+        )
+    ]
+    general = _compressed({"version": 1, "metadataTypes": entries})
+    return {_GENERAL: general, _PARAMETERS: parameters, _EVENTS: events}
 
 
 def provide(storage: Storage) -> None:

@@ -9,6 +9,7 @@ from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
+from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.services.ftp_session import FtpClient
 from firmware_sim.mavlink.services.log_transfer import LogDownload, LogListing, LogStream
@@ -31,9 +32,12 @@ class Context:
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators: to all clients of all links."""
+    """Sends a text to the operators: to all clients of all links. It is no event: those are part of
+    the telemetry, which an answer to a client must not change."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
+    events: EventBuffer
+    """The newest events, the same for all clients."""
     signing: Signing
     """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID

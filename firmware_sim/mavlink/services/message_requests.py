@@ -28,9 +28,17 @@ FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 """Messages that PX4 sends at rates of its own: no client can change them."""
 
 
+OF_MISSING_DEVICES = frozenset((370, 371))
+"""BATTERY_INFO and FUEL_STATUS, which no definitions here have: PX4 accepts a rate, and as it lacks
+the devices, sends nothing. A NaN for an id is accepted likewise."""
+
+
 def _set_message_interval(command: Command, context: Context) -> Result:
     """Parameter 1: message id; 2: interval [µs], 0 or not given = default, negative = off."""
-    name = _stream_name(command.integer(1), context)
+    number = command.integer(1)
+    if number is None or number in OF_MISSING_DEVICES:
+        return Result.ACCEPTED
+    name = _stream_name(number, context)
     if name is None or name in FIXED_RATE:
         return Result.FAILED
     interval = command.params[1]

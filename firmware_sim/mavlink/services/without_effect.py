@@ -14,7 +14,7 @@ from firmware_sim.mavlink.services.context import Context
 ACCEPTED = (
     dialect.MAV_CMD_DO_SET_ACTUATOR,
     dialect.MAV_CMD_DO_GO_AROUND,
-    dialect.MAV_CMD_RUN_PREARM_CHECKS,
+    dialect.MAV_CMD_EXTERNAL_WIND_ESTIMATE,
 )
 
 NOT_ACKNOWLEDGED = (

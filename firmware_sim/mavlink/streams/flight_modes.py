@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Mode
+from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.px4_custom_mode import custom_mode
 
 
 class KnownMode(NamedTuple):

@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Iterator
 
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.mavlink.codec import Values, dialect
-from firmware_sim.mavlink.px4_custom_mode import base_mode, custom_mode, system_status
+from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
 from firmware_sim.mavlink.streams.sensors import percent
 from firmware_sim.mavlink.streams.units import boot_ms, int16, uint16
 

@@ -1,0 +1,211 @@
+"""Enumerations that arguments of events are of: PX4's names and numbers.
+
+Source: PX4 1.16, src/lib/events/enums.json.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class ModeGroup(IntEnum):
+    """Flight modes as bits of what a check is about: 1 << PX4's navigation state."""
+
+    MANUAL = 1 << 0
+    ALTCTL = 1 << 1
+    POSCTL = 1 << 2
+    MISSION = 1 << 3
+    LOITER = 1 << 4
+    RTL = 1 << 5
+    ACRO = 1 << 10
+    OFFBOARD = 1 << 14
+    STAB = 1 << 15
+    TAKEOFF = 1 << 17
+    LAND = 1 << 18
+    FOLLOW_TARGET = 1 << 19
+    PRECLAND = 1 << 20
+    ORBIT = 1 << 21
+    VTOL_TAKEOFF = 1 << 22
+
+
+class Component(IntEnum):
+    """Parts of the vehicle; an argument of a check is the place of the bit."""
+
+    NONE = 1 << 0
+    ABSOLUTE_PRESSURE = 1 << 1
+    DIFFERENTIAL_PRESSURE = 1 << 2
+    GPS = 1 << 3
+    OPTICAL_FLOW = 1 << 4
+    VISION_POSITION = 1 << 5
+    DISTANCE_SENSOR = 1 << 6
+    REMOTE_CONTROL = 1 << 7
+    MOTORS_ESCS = 1 << 8
+    UTM = 1 << 9
+    LOGGING = 1 << 10
+    BATTERY = 1 << 11
+    COMMUNICATION_LINKS = 1 << 12
+    RATE_CONTROLLER = 1 << 13
+    ATTITUDE_CONTROLLER = 1 << 14
+    POSITION_CONTROLLER = 1 << 15
+    ATTITUDE_ESTIMATE = 1 << 16
+    LOCAL_POSITION_ESTIMATE = 1 << 17
+    MISSION = 1 << 18
+    AVOIDANCE = 1 << 19
+    SYSTEM = 1 << 20
+    CAMERA = 1 << 21
+    GIMBAL = 1 << 22
+    PAYLOAD = 1 << 23
+    GLOBAL_POSITION_ESTIMATE = 1 << 24
+    STORAGE = 1 << 25
+    PARACHUTE = 1 << 26
+    MAGNETOMETER = 1 << 27
+    ACCEL = 1 << 28
+    GYRO = 1 << 29
+    OPEN_DRONE_ID = 1 << 30
+
+    @property
+    def place(self) -> int:
+        """The place of its bit."""
+        return self.value.bit_length() - 1
+
+
+class ArmingReason(IntEnum):
+    """Why the vehicle was armed or disarmed."""
+
+    TRANSITION_TO_STANDBY = 0
+    STICK_GESTURE = 1
+    RC_SWITCH = 2
+    COMMAND_INTERNAL = 3
+    COMMAND_EXTERNAL = 4
+    MISSION_START = 5
+    AUTO_DISARM_LAND = 6
+    AUTO_DISARM_PREFLIGHT = 7
+    KILL_SWITCH = 8
+    LOCKDOWN = 9
+    FAILURE_DETECTOR = 10
+    SHUTDOWN = 11
+    UNIT_TEST = 12
+    RC_BUTTON = 13
+    FAILSAFE = 14
+
+
+class NavigationMode(IntEnum):
+    """Flight modes that a message names."""
+
+    MANUAL = 0
+    ALTCTL = 1
+    POSCTL = 2
+    AUTO_MISSION = 3
+    AUTO_LOITER = 4
+    AUTO_RTL = 5
+    ACRO = 6
+    OFFBOARD = 7
+    STAB = 8
+    POSITION_SLOW = 9
+    AUTO_TAKEOFF = 10
+    AUTO_LAND = 11
+    AUTO_FOLLOW_TARGET = 12
+    AUTO_PRECLAND = 13
+    ORBIT = 14
+    AUTO_VTOL_TAKEOFF = 15
+    UNKNOWN = 255
+
+
+class FailsafeAction(IntEnum):
+    """What a failsafe does: the numbers of `failsafes.actions.Action`."""
+
+    NONE = 0
+    WARN = 1
+    FALLBACK_POSCTRL = 2
+    FALLBACK_ALTCTRL = 3
+    FALLBACK_STABILIZED = 4
+    HOLD = 5
+    RTL = 6
+    LAND = 7
+    DESCEND = 8
+    DISARM = 9
+    TERMINATE = 10
+
+
+class FailsafeCause(IntEnum):
+    """What a failsafe's message names as the cause: in the order of `failsafes.actions.Cause`."""
+
+    GENERIC = 0
+    MANUAL_CONTROL_LOSS = 1
+    GCS_CONNECTION_LOSS = 2
+    LOW_BATTERY_LEVEL = 3
+    CRITICAL_BATTERY_LEVEL = 4
+    EMERGENCY_BATTERY_LEVEL = 5
+    LOW_REMAINING_FLIGHT_TIME = 6
+
+
+class Enumeration(NamedTuple):
+    """One enumeration of the metadata."""
+
+    base: str
+    """Type on the wire."""
+    members: type[IntEnum]
+    meaning: str
+    bitfield: bool = False
+
+
+ENUMERATIONS: Mapping[str, Enumeration] = {
+    "navigation_mode_group_t": Enumeration("uint32_t", ModeGroup, "Flight modes", bitfield=True),
+    "health_component_t": Enumeration("uint32_t", Component, "Parts of the vehicle", bitfield=True),
+    "arm_disarm_reason_t": Enumeration("uint8_t", ArmingReason, "Why it was armed or disarmed"),
+    "navigation_mode_t": Enumeration("uint8_t", NavigationMode, "Flight mode"),
+    "failsafe_action_t": Enumeration("uint8_t", FailsafeAction, "What a failsafe does"),
+    "failsafe_cause_t": Enumeration("uint8_t", FailsafeCause, "Why a failsafe acts"),
+}
+
+_WORDS: Mapping[tuple[type[IntEnum], int], str] = {
+    (type(member), member.value): words
+    for member, words in (
+        (ModeGroup.ALTCTL, "Altitude"),
+        (ModeGroup.POSCTL, "Position"),
+        (ModeGroup.LOITER, "Hold"),
+        (ModeGroup.RTL, "Return"),
+        (ModeGroup.STAB, "Stabilized"),
+        (ModeGroup.PRECLAND, "Precision land"),
+        (ModeGroup.VTOL_TAKEOFF, "VTOL takeoff"),
+        (Component.GPS, "GPS"),
+        (Component.MOTORS_ESCS, "Motors and ESCs"),
+        (Component.UTM, "UTM"),
+        (Component.ACCEL, "Accelerometer"),
+        (Component.GYRO, "Gyroscope"),
+        (ArmingReason.LOCKDOWN, "lockdown"),
+        (ArmingReason.FAILSAFE, "failsafe"),
+        (ArmingReason.COMMAND_INTERNAL, "internal command"),
+        (ArmingReason.COMMAND_EXTERNAL, "external command"),
+        (ArmingReason.AUTO_DISARM_LAND, "landing"),
+        (ArmingReason.AUTO_DISARM_PREFLIGHT, "auto preflight disarming"),
+        (NavigationMode.ALTCTL, "Altitude"),
+        (NavigationMode.POSCTL, "Position"),
+        (NavigationMode.AUTO_MISSION, "Mission"),
+        (NavigationMode.AUTO_LOITER, "Hold"),
+        (NavigationMode.AUTO_RTL, "Return"),
+        (NavigationMode.STAB, "Stabilized"),
+        (NavigationMode.AUTO_TAKEOFF, "Takeoff"),
+        (NavigationMode.AUTO_LAND, "Land"),
+        (NavigationMode.AUTO_FOLLOW_TARGET, "Follow Target"),
+        (NavigationMode.AUTO_PRECLAND, "Precision Landing"),
+        (NavigationMode.AUTO_VTOL_TAKEOFF, "VTOL Takeoff"),
+        (FailsafeAction.FALLBACK_POSCTRL, "Position mode"),
+        (FailsafeAction.FALLBACK_ALTCTRL, "Altitude mode"),
+        (FailsafeAction.FALLBACK_STABILIZED, "Stabilized mode"),
+        (FailsafeAction.RTL, "Return"),
+        (FailsafeAction.WARN, "warning"),
+        (FailsafeAction.DISARM, "disarming"),
+        (FailsafeAction.TERMINATE, "termination"),
+        (FailsafeCause.GCS_CONNECTION_LOSS, "GCS connection loss"),
+    )
+}
+"""Members whose words are not their names: members of two enumerations may be equal numbers."""
+
+
+def words(member: IntEnum) -> str:
+    """Return what operators read for a member of an enumeration."""
+    named = member.name.replace("_", " ").capitalize()
+    return _WORDS.get((type(member), member.value), named)

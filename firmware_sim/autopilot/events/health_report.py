@@ -1,0 +1,167 @@
+"""The health and arming report: which checks fail, and in which modes the vehicle can arm or fly.
+
+A report is an arming summary, one event for each failing check, and a health summary. Source: PX4
+1.16, commander/HealthAndArmingChecks/Common.cpp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.events.check_events import ARMING_SUMMARY, HEALTH_SUMMARY
+from firmware_sim.autopilot.events.definition import Event, Level
+from firmware_sim.autopilot.events.enumerations import Component
+from firmware_sim.autopilot.failsafes.conditions import NEEDS, Need, lacking
+from firmware_sim.autopilot.mode_numbers import STATE_BITS
+from firmware_sim.autopilot.prearm import CHECKS, Check
+from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Readiness
+
+ALL_MODES = 0xFFFFFFFF
+
+EXTERNAL_MODES = 0xFF << 23
+"""Eight modes that programs beside the autopilot may add: there are none."""
+
+REPORT_US = 2 * US_PER_S
+"""What has changed is told no more often than that [µs] (PX4's reporting interval)."""
+
+MAX_CHECKS = 14
+"""PX4 tells no more checks in one report."""
+
+
+class HealthReport(NamedTuple):
+    """What the checks found; equal reports are told once."""
+
+    can_arm: int
+    """Bits of the modes in which the vehicle can be armed."""
+    can_run: int
+    """Bits of the modes that can be chosen in flight."""
+    checks: tuple[Event, ...]
+    """Those that fail."""
+    arming_error: int = 0
+    """Bits of `Component`, as of all below."""
+    arming_warning: int = 0
+    present: int = 0
+    health_error: int = 0
+    health_warning: int = 0
+
+    def events(self) -> tuple[Event, ...]:
+        """Return what is sent, in order."""
+        whole = 0
+        return (
+            ARMING_SUMMARY.event(
+                whole, self.arming_error, self.arming_warning, self.can_arm, self.can_run
+            ),
+            *self.checks[:MAX_CHECKS],
+            HEALTH_SUMMARY.event(whole, self.present, self.health_error, self.health_warning),
+        )
+
+
+def health_report(readiness: Readiness) -> HealthReport:
+    """Return what the checks find, for all modes at once."""
+    in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}
+    told: list[Event] = []
+    blocked = arming_error = arming_warning = health_error = health_warning = 0
+    for check in CHECKS:
+        modes = _blocked_modes(check, readiness, in_modes)
+        if modes is None:
+            continue
+        blocked |= modes
+        about, bit = check.event, check.event.component.value
+        level = about.definition.level if check.level is None else check.level(readiness)
+        error, warning = level <= Level.ERROR, level is Level.WARNING
+        if about.is_health:
+            health_error |= bit * error
+            health_warning |= bit * warning
+        else:
+            arming_error |= bit * error
+            arming_warning |= bit * warning
+        shown = modes if check.shown is None else modes | _modes_needing(check.shown(readiness))
+        values = (shown or ALL_MODES, about.component.place, *about.values)
+        told.append(about.definition.event(*values, level=level))
+    return HealthReport(
+        ALL_MODES & ~EXTERNAL_MODES & ~blocked,
+        ALL_MODES & ~EXTERNAL_MODES & ~_cannot_run(readiness),
+        tuple(told),
+        arming_error,
+        arming_warning,
+        _present(readiness),
+        health_error,
+        health_warning,
+    )
+
+
+def _blocked_modes(
+    check: Check, readiness: Readiness, in_modes: dict[Mode, Readiness]
+) -> int | None:
+    """Return the modes in which a check keeps the vehicle from arming; None = it passes."""
+    if check.event.definition.name == _OF_PRESENT_MODE and not check.fails(readiness):
+        return None
+    failing = [mode for mode, there in in_modes.items() if check.fails(there)]
+    if not failing:
+        return None
+    blocks = check.blocks
+    stopped = [mode for mode in failing if blocks is None or blocks(in_modes[mode])]
+    if len(stopped) == len(Mode):
+        return ALL_MODES
+    return _bits(stopped)
+
+
+_OF_PRESENT_MODE = "check_modes_cannot_takeoff"
+"""Told only while the vehicle is in such a mode."""
+
+
+def _cannot_run(readiness: Readiness) -> int:
+    lacked = (mode for mode in Mode if lacking(mode, readiness.conditions) & ~Need.NOT_ARMING)
+    return _bits(lacked)
+
+
+def _modes_needing(need: Need) -> int:
+    modes = [mode for mode in Mode if NEEDS[mode] & need]
+    return ALL_MODES if len(modes) == len(Mode) else _bits(modes)
+
+
+def _bits(modes: Iterable[Mode]) -> int:
+    bits = 0
+    for mode in modes:
+        bits |= STATE_BITS[mode]
+    return bits
+
+
+def _present(r: Readiness) -> int:
+    """Return the parts of the vehicle that are there, whether they work or not."""
+    there = {
+        Component.GYRO: True,  # PX4 reports it for the accelerometer, too
+        Component.ABSOLUTE_PRESSURE: bool(r.settings.sys_has_baro),
+        Component.MAGNETOMETER: bool(r.settings.sys_has_mag),
+        Component.GPS: bool(r.settings.sys_has_gps) and r.gps,
+        Component.BATTERY: r.settings.cbrk_supply_chk != SUPPLY_CHECK_OFF,
+        Component.REMOTE_CONTROL: not r.conditions.manual_control_signal_lost,
+        Component.COMMUNICATION_LINKS: not r.conditions.gcs_connection_lost,
+        Component.LOCAL_POSITION_ESTIMATE: True,
+    }
+    return sum(part.value for part, here in there.items() if here)
+
+
+class HealthReporter:
+    """Tells a report when it differs from the last one told, and on demand."""
+
+    def __init__(self, tell: Callable[[Event], None]) -> None:
+        """Take what sends an event."""
+        self._tell = tell
+        self._seen: Readiness | None = None
+        self._report: HealthReport | None = None
+        self._told: HealthReport | None = None
+        self._told_us = 0
+
+    def update(self, readiness: Readiness, now_us: int, *, force: bool = False) -> None:
+        """Look at what the checks look at; tell at most every `REPORT_US`, unless forced."""
+        if readiness != self._seen or self._report is None:
+            self._seen, self._report = readiness, health_report(readiness)
+        due = self._report != self._told and now_us >= self._told_us + REPORT_US
+        if due or force:
+            self._told, self._told_us = self._report, now_us
+            for event in self._report.events():
+                self._tell(event)

@@ -1,0 +1,72 @@
+"""What operators are told when a failsafe begins: PX4's text, and the event with its cause.
+
+Source: PX4 1.16, commander/failsafe/framework.cpp.
+"""
+
+from __future__ import annotations
+
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.enumerations import FailsafeCause
+from firmware_sim.autopilot.failsafes.actions import Action, Cause
+from firmware_sim.autopilot.mode_numbers import custom_mode
+
+_WARNINGS = {
+    Cause.BATTERY_LOW: events.FAILSAFE_BATTERY_LOW,
+    Cause.BATTERY_CRITICAL: events.FAILSAFE_BATTERY_CRITICAL,
+    Cause.BATTERY_EMERGENCY: events.FAILSAFE_BATTERY_EMERGENCY,
+    Cause.FLIGHT_TIME_LOW: events.FAILSAFE_TIME_LOW,
+}
+"""Warnings with words of their own."""
+
+_DISENGAGING = (Action.DESCEND, Action.FALLBACK_ALTITUDE, Action.FALLBACK_STABILIZED)
+
+_CAUSES = dict(zip(Cause, FailsafeCause, strict=True))
+
+
+def announcement(
+    action: Action, delayed: Action, cause: Cause, intended: Mode, delay_us: int
+) -> Message:
+    """Return what is told of an action that begins.
+
+    Args:
+        action: What is done now.
+        delayed: What follows the wait in Hold; NONE = it is no wait.
+        cause: What is named as the cause.
+        intended: The mode that the user asked for.
+        delay_us: How long the wait still lasts [µs].
+    """
+    waits = action is Action.HOLD and delayed is not Action.NONE
+    seconds = (delay_us + US_PER_S // 2) // US_PER_S
+    text = "Failsafe activated"
+    if waits:
+        text = f"{text}: entering Hold for {seconds} seconds"
+        event = _wait(delayed, cause, custom_mode(intended), seconds)
+    elif action is Action.WARN:
+        event = _warning(cause, custom_mode(intended))
+    else:
+        event = _beginning(action, cause, custom_mode(intended))
+    return Message(Severity.CRITICAL, text, event)
+
+
+def _wait(delayed: Action, cause: Cause, mode: int, seconds: int) -> Event:
+    if cause is Cause.GENERIC:
+        return events.FAILSAFE_HOLD_GENERIC.event(mode, delayed, seconds)
+    return events.FAILSAFE_HOLD.event(mode, delayed, seconds, _CAUSES[cause])
+
+
+def _warning(cause: Cause, mode: int) -> Event:
+    if cause is Cause.GENERIC:
+        return events.FAILSAFE_WARN_GENERIC.event(mode)
+    named = _WARNINGS.get(cause)
+    return named.event() if named else events.FAILSAFE_WARN.event(mode, _CAUSES[cause])
+
+
+def _beginning(action: Action, cause: Cause, mode: int) -> Event:
+    if cause is not Cause.GENERIC:
+        return events.FAILSAFE.event(mode, action, _CAUSES[cause])
+    if action in _DISENGAGING:
+        return events.FAILSAFE_DISENGAGED.event(mode, action)
+    return events.FAILSAFE_GENERIC.event(mode, action)
