@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from airl_mav.arena.footprints import Boxes, Floats, segments_clear
-from airl_mav.arena.geometry import Tour
+from airl_mav.arena.geometry import Arena, Tour
 from airl_mav.profiles.arena import MovingObstacles
 
 LEG_MIN_M = 1.0
@@ -22,6 +23,10 @@ BATCH = 32
 BATCHES = 8
 HOMING_LEGS = 16
 """Legs tried for a free way home before the walk goes back the way it came."""
+
+
+ROUNDING_S = 1e-9
+"""Way-points that are passed closer to each other are one."""
 
 
 def draw_tour(
@@ -61,6 +66,34 @@ def draw_tour(
         elapsed += math.dist(here, target) / speed + kind.dwell_s
         points.append(target)
     return _timed([*points, *points[-2::-1]], speed, kind.dwell_s)
+
+
+def set_out_later(arena: Arena, later_s: float) -> Arena:
+    """Return the arena whose moving obstacles are so much later [s] where they are in this one.
+
+    At `later_s` they stand where this one has them at time 0, and walk on as they do there; before
+    that they walk the ends of their tours, which are closed.
+    """
+    if not arena.tours or later_s == 0.0:
+        return arena
+    tours = tuple(_begun_at(tour, -later_s % float(tour.times_s[-1])) for tour in arena.tours)
+    center = arena.obstacles.center.copy()
+    center[arena.n_static :, :2] = [tour.points[0] for tour in tours]
+    return replace(arena, obstacles=replace(arena.obstacles, center=center), tours=tours)
+
+
+def _begun_at(tour: Tour, at_s: float) -> Tour:
+    """Return the same closed way, begun where it is at `at_s` [s] of 0 to its period."""
+    period = float(tour.times_s[-1])
+    here = [[np.interp(at_s, tour.times_s, axis) for axis in tour.points.T]]
+    # The first point is the last one again.
+    times, points = (tour.times_s[1:] - at_s) % period, tour.points[1:]
+    order = np.argsort(times, kind="stable")
+    order = order[(times[order] > ROUNDING_S) & (times[order] < period - ROUNDING_S)]
+    return Tour(
+        np.concatenate([[0.0], times[order], [period]]),
+        np.concatenate([here, points[order], here]),
+    )
 
 
 def _draw_waypoint(

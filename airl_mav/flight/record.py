@@ -47,7 +47,7 @@ class EpisodeRecord:
     goal_radius_m: float
     time_limit_s: float
     started_us: int
-    """Simulated time of the reset [µs]: moving obstacles count from here."""
+    """Simulated time of the reset [µs]: moving obstacles count from here, see `tours_s`."""
     navigation_us: int | None
     """Simulated time at which the policy took over [µs]; None when it never did."""
     ended_us: int
@@ -72,6 +72,9 @@ class EpisodeRecord:
     """What failed, as asked for or as a client injected it, in the order of its beginning."""
     zone: int | None = None
     """Curriculum zone that the goal was drawn in; None: the whole arena."""
+    tours_s: float = 0.0
+    """When, after the reset, moving obstacles are where the seed's tours begin [s]; 0 in older
+    records, whose obstacles began them at the reset."""
     sha256: dict[str, str] | None = None
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA

@@ -190,6 +190,7 @@ def judged_record(
         started_us=started_us,
         navigation_us=navigation_us,
         ended_us=verdict.time_us,
+        tours_s=scenario.takeoff_s,
         quality=quality,
         **known,
     )

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
+from airl_mav.arena.tours import set_out_later
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
 from airl_mav.flight.record import EpisodeRecord
@@ -58,13 +59,14 @@ def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict
             spec = specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
             check_trust(record.arena, spec)
         if record.index not in arenas:
-            arenas[record.index] = generate(
+            arena = generate(
                 specs[record.arena],
                 record.arena_seed,
                 name=record.arena,
                 vehicle_width_m=vehicle.body.width_m,
                 zone=record.zone,
             )
+            arenas[record.index] = set_out_later(arena, record.tours_s)
     return arenas
 
 

@@ -35,7 +35,7 @@ def why_out_of_date(declared: Declared, folder: Path = RESULTS) -> str:
     record = read_record(declared.name, folder)
     if record.made.command != declared.command:
         return f"Flown by another command: {record.made.command}"
-    return out_of_date(record.made)
+    return out_of_date(record)
 
 
 def behaviour_differs(path: Path) -> tuple[Difference, ...]:

@@ -62,7 +62,7 @@ def body(name: str, records: dict[str, Record], page: object) -> str:
     for record in found.records:
         if record not in records:
             raise UsageError(f"{page}: results: {name}: no results/{record}.json")
-    lines = [made_line(each, records[each].made) for each in found.records]
+    lines = [made_line(records[each]) for each in found.records]
     return "\n\n".join([found.render(records), "<br>\n".join(lines)])
 
 

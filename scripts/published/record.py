@@ -13,11 +13,15 @@ from airl_mav.core.files import read_json, write_json
 from airl_mav.experiments.behaviour import read_behaviour
 from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import POLICIES, find_policy, policy_names
+from published.changes import read_changes, stands
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
 BEHAVIOUR_FILE = RESULTS / "behaviour.json"
 """The samples that today's code flies; `results.py fingerprint` holds them against it."""
+
+CHANGES_FILE = RESULTS / "changes.toml"
+"""What the changes from earlier fingerprints to that of today touch."""
 
 SCHEMA = 1
 
@@ -152,10 +156,12 @@ def shipped_policies() -> Mapping[str, str]:
     return {name: sha256 for name, sha256 in known.items() if sha256 is not None}
 
 
-def out_of_date(made: Made) -> str:
+def out_of_date(record: Record) -> str:
     """Return why figures are not those of today's code, as a sentence; empty: they are."""
+    made, runs = record.made, [(run.level, run.arena) for run in record.runs.values()]
     flown = f"Flown on {made.date} with version {made.version}"
-    if made.behaviour != behaviour_today():
+    changes = read_changes(CHANGES_FILE)
+    if not stands(made.behaviour, behaviour_today(), changes, record.name, runs):
         return f"{flown}, before today's flight behaviour."
     shipped = shipped_policies()
     others = [name for name, sha256 in made.policies.items() if shipped.get(name) != sha256]

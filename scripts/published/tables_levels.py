@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from published.blocks import Records, block
 from published.record import MEASURES, Figure, Record
-from published.text import both, interval_cell, number, percent, rate, table
+from published.text import NONE, both, interval_cell, number, percent, rate, table
 
 # --- levels
 
@@ -41,6 +41,16 @@ def ladder_late(records: Records) -> str:
 @block("ladder-crowded", "ladder-crowded")
 def ladder_crowded(records: Records) -> str:
     return _levels((("", records["ladder-crowded"]),))
+
+
+@block("ladder-empty", "ladder-empty")
+def ladder_empty(records: Records) -> str:
+    return _levels((("", records["ladder-empty"]),))
+
+
+@block("ladder-one-arena", "ladder-one-arena")
+def ladder_one_arena(records: Records) -> str:
+    return _levels((("", records["ladder-one-arena"]),))
 
 
 @block("sitl", "sitl")
@@ -121,4 +131,9 @@ def _levels(parts: tuple[tuple[str, Record], ...], target_level: str = "lockstep
                     interval_cell(change_of),
                 )
             )
+            if field == "flight_time_s":
+                # One long flight can make a mean.
+                median = gap.median_flight_time
+                change = f"{number(median, 1, '+')} %"
+                rows.append(("its median by pairs", NONE, NONE, change, interval_cell(median)))
     return table(("same seeds", "gym", target_level, "difference", "95 % interval"), rows)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 
 from airl_mav.profiles.published import PublishedRun
-from published.record import Figure, FlownRun, Made, out_of_date
+from published.record import Figure, FlownRun, Record, out_of_date
 
 NONE = "–"
 
@@ -64,11 +64,12 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]], numbers: int = 
     return "\n".join(re.sub(" +", " ", f"| {' | '.join(line)} |") for line in lines)
 
 
-def made_line(name: str, made: Made) -> str:
+def made_line(record: Record) -> str:
     """Return the line under a table: what flew it, and whether today's code would fly it so."""
+    made = record.made
     commit = f"commit {made.commit[:7]}" if made.commit else f"version {made.version}"
-    line = f"`{made.command}` · {made.date}, {commit}, {made.cpu} · `results/{name}.json`"
-    stale = out_of_date(made)
+    line = f"`{made.command}` · {made.date}, {commit}, {made.cpu} · `results/{record.name}.json`"
+    stale = out_of_date(record)
     return f"{line} · **{stale}**" if stale else line
 
 

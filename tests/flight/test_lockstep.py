@@ -88,6 +88,14 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
     assert np.all(reference.latency["accepted_us"] > 0), "every decision reached the autopilot"
 
 
+def test_a_take_off_takes_about_as_long_as_movers_are_told(reference: FlownEpisode) -> None:
+    record = reference.record
+    assert record.navigation_us is not None
+    took_s = (record.navigation_us - record.started_us) / US_PER_S
+    # At 2.5 m/s half a second is little more than the width of an obstacle.
+    assert record.tours_s == pytest.approx(took_s, abs=0.5)
+
+
 def test_a_flight_on_a_full_disk_goes_on_without_its_logs(
     scenario: ResolvedScenario, reference: FlownEpisode, tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ import pytest
 from airl_mav.core.errors import UsageError
 from airl_mav.core.provenance import provenance
 from airl_mav.experiments import roofline as roofline_module
+from airl_mav.experiments.behaviour import read_behaviour
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.statistics import aggregate
@@ -19,6 +20,7 @@ from airl_mav.report.saved_table import write_table
 from airl_mav.report.table import Column, TableView
 from airl_mav.scenario.model import Scenario
 from published import coverage, flying, pages, record, tables_policies
+from published.changes import Change, read_changes, stands
 from published.collect import collect
 from published.declared import Declared, read_declared
 from published.record import Made, Record
@@ -87,9 +89,9 @@ def test_an_older_behaviour_is_said_under_its_tables(
 
 
 def test_another_file_of_a_policy_is_out_of_date(fresh: Record) -> None:
-    made = fresh.made
-    retrained = made.model_copy(update={"policies": {"static-obstacles": "0" * 64}})
-    assert record.out_of_date(made) == ""
+    made = fresh.made.model_copy(update={"policies": {"static-obstacles": "0" * 64}})
+    retrained = fresh.model_copy(update={"made": made})
+    assert record.out_of_date(fresh) == ""
     assert "another file of `static-obstacles`" in record.out_of_date(retrained)
 
 
@@ -97,9 +99,68 @@ def test_results_without_a_fingerprint_are_marked(
     records: dict[str, Record], fresh: Record
 ) -> None:
     made = fresh.made.model_copy(update={"behaviour": None})
-    without = [each.made for each in records.values() if each.made.behaviour is None]
-    for each in (made, *without):
+    without = [each for each in records.values() if each.made.behaviour is None]
+    for each in (fresh.model_copy(update={"made": made}), *without):
         assert "before today's flight behaviour" in record.out_of_date(each)
+
+
+# --- changes of which it is known what they touch
+
+OLDER, OLD, TODAY = "0" * 16, "1" * 16, "2" * 16
+MOVERS = Change(
+    before=OLD,
+    after=TODAY,
+    why="movers",
+    flights=("lockstep, crowded",),
+    levels=("lockstep", "sitl"),
+    arenas=("crowded",),
+    untouched=("one-goal",),
+)
+WALLS = MOVERS.model_copy(update={"before": OLDER, "after": OLD, "arenas": ("walls",)})
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "name", "flown", "expected"),
+    [
+        (TODAY, "x", [("lockstep", "crowded")], True),
+        (OLD, "x", [("lockstep", "crowded")], False),
+        (OLD, "x", [("gym", "crowded")], True),
+        (OLD, "x", [("gym", "crowded"), ("sitl", "crowded")], False),
+        (OLD, "x", [("lockstep", "walls")], True),
+        (OLDER, "x", [("lockstep", "walls")], False),
+        (OLDER, "x", [("lockstep", "crowded")], False),
+        (OLDER, "x", [("lockstep", "dense")], True),
+        (OLD, "one-goal", [], True),
+        (OLD, "other", [], False),
+        ("3" * 16, "x", [("gym", "dense")], False),
+        (None, "x", [("gym", "dense")], False),
+    ],
+)
+def test_a_result_stands_where_no_change_touches_it(
+    behaviour: str | None, name: str, flown: list[tuple[str, str]], expected: bool
+) -> None:
+    changes = {each.before: each for each in (MOVERS, WALLS)}
+    assert stands(behaviour, TODAY, changes, name, flown) is expected
+
+
+def test_changes_that_lead_nowhere_end() -> None:
+    back = WALLS.model_copy(update={"after": OLDER})
+    assert not stands(OLDER, TODAY, {OLDER: back}, "x", [("gym", "dense")])
+
+
+def test_the_changes_written_down_name_flights_that_are_flown_and_results_that_are_there(
+    records: dict[str, Record],
+) -> None:
+    changes = read_changes(record.CHANGES_FILE)
+    flown = read_behaviour(record.BEHAVIOUR_FILE).flights
+    for change in changes.values():
+        assert set(change.untouched) <= set(records)
+        # A change may be told to touch more than was seen, never less.
+        for name in change.flights:
+            assert name in flown
+            level, arena, *_ = name.split(", ")
+            assert level in change.levels and arena in change.arenas
+        assert not any(records[name].runs for name in change.untouched), "known by its runs"
 
 
 # --- marks

@@ -25,6 +25,7 @@ from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
 from airl_mav.arena.placement import place_all
+from airl_mav.arena.tours import set_out_later
 from airl_mav.arena.zones import zone_of, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import ArenaSpec
@@ -346,6 +347,29 @@ def test_movers_are_where_their_tours_say() -> None:
     np.testing.assert_allclose(
         arena.centers_at(period_us + 7_000_000)[n], arena.centers_at(7_000_000)[n], atol=1e-5
     )
+
+
+def test_movers_that_set_out_later_walk_the_same_way() -> None:
+    arena = make(shipped("dynamic-obstacles"), 1)
+    first = arena.tours[0]
+    # Between way-points, on each of one tour, and after more than a whole tour.
+    for later_s in (0.0, 0.3, 10.9, *first.times_s, first.times_s[-1] + 10.9):
+        later = set_out_later(arena, float(later_s))
+        np.testing.assert_array_equal(later.centers_at(0), later.obstacles.center)
+        np.testing.assert_array_equal(later.goal, arena.goal)
+        for tour in later.tours:
+            assert tour.times_s[0] == 0.0
+            assert (np.diff(tour.times_s) > 0.0).all()
+            np.testing.assert_array_equal(tour.points[0], tour.points[-1])
+        for time_us in range(0, 130_000_000, 1_700_000):
+            # A microsecond's rounding at 2.5 m/s.
+            np.testing.assert_allclose(
+                later.centers_at(time_us + round(later_s * 1e6)),
+                arena.centers_at(time_us),
+                atol=3e-6,
+            )
+    standing = make(shipped("static-obstacles"), 1)
+    assert set_out_later(standing, 10.9) is standing
 
 
 def test_too_dense_is_refused_with_counts_after_bounded_work(
