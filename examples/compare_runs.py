@@ -1,12 +1,15 @@
-"""Compare two runs over pairs of flights: the default policy in calm air and in wind."""
+"""Compare two runs over pairs of flights: the default policy in calm air and in wind.
+
+In the batch twin, where forty flights take seconds; `level="lockstep"` flies them through MAVSDK.
+"""
 
 from airl_mav import Scenario, rehearse
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.report.comparison.runs import compare_folders
 
-calm = rehearse(Scenario(level="lockstep", episodes=4), out="runs/calm")
+calm = rehearse(Scenario(level="gym", episodes=20), out="runs/calm")
 windy = rehearse(
-    Scenario(level="lockstep", episodes=4, wind=WindSettings(east_m_s=4.0, gust_m_s=1.5)),
+    Scenario(level="gym", episodes=20, wind=WindSettings(east_m_s=4.0, gust_m_s=1.5)),
     out="runs/windy",
 )
 

@@ -45,6 +45,6 @@ print(
     f"seed 7: {arena.n_static} trunks, goal {arena.goal[0]:.1f} m north, {arena.goal[1]:.1f} m east"
 )
 
-run = rehearse(Scenario(arena=str(file), level="lockstep", episodes=2, seed=7))
+run = rehearse(Scenario(arena=str(file), level="gym", episodes=2, seed=7))
 for episode in run.episodes:
     print(f"seed {episode.seed}: {episode.outcome.value}, {episode.reason}")

@@ -43,7 +43,7 @@ if __name__ == "__main__":
         Scenario(
             policy=policy,
             arena="no-obstacles",
-            level="lockstep",
+            level="gym",
             episodes=1,
             time_limit_s=20.0,
         )

@@ -154,6 +154,7 @@ def test_a_campaign_that_is_stopped_goes_on(tmp_path: Path, reference: Path, wor
 
 
 @pytest.mark.slow
+@pytest.mark.nightly  # A run that is killed, on the same engine: test_evaluate_lockstep.py.
 def test_a_campaign_that_is_killed_leaves_nobody_behind_and_goes_on(tmp_path: Path) -> None:
     root, episodes = tmp_path / "root", 100
     words = ["-m", "tests.support.campaign_kit", f"{root}", f"{episodes}"]

@@ -416,6 +416,7 @@ companion()
 """
 
 
+@pytest.mark.nightly  # In lockstep: test_limit_flights.py, test_pilot_hands_over.py.
 def test_policy_that_raises_lands(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports) as vehicle:
@@ -432,6 +433,7 @@ def test_policy_that_raises_lands(tmp_path: Path, ground: Ground) -> None:
 # --- a sensor or the link falls silent
 
 
+@pytest.mark.nightly  # In lockstep: test_lockstep.py.
 def test_silent_camera_is_named(tmp_path: Path, ground: Ground) -> None:
     """A relay of frames stops in flight."""
     ports = choose_ports(ground.port)
@@ -524,6 +526,7 @@ class UdpRelay:
             each.close()
 
 
+@pytest.mark.nightly  # In lockstep: test_limit_flights.py.
 def test_link_lost_one_way_does_not_fly_on(tmp_path: Path, ground: Ground) -> None:
     """MAVSDK would repeat the last setpoint for ever to a vehicle that still hears it."""
     ports = choose_ports(ground.port)
