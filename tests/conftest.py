@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.util import find_spec
 
 import pytest
 from hypothesis import settings
+
+from tests.support.ports import reserved_instance
 
 if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     collect_ignore = [
@@ -36,3 +39,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
     order = sorted(range(len(items)), key=lambda index: not named[index])
     items[:] = [items[index] for index in order]
+
+
+@pytest.fixture
+def px4_instance() -> Iterator[int]:
+    """Give an instance number of PX4's that no other test uses meanwhile."""
+    with reserved_instance() as instance:
+        yield instance

@@ -34,11 +34,18 @@ from firmware_sim.external.running_program import RunningProgram, program_at
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.plant.plant import Plant
-from tests.support.ports import LOOPBACK
+from tests.support.ports import CONDUCTED_INSTANCE as INSTANCE
+from tests.support.ports import LOOPBACK, reserved_conducted
 from tests.support.px4_peer import write_build
 
-INSTANCE = 6
 NEEDS_PROC = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="Linux has it")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_instances() -> Iterator[None]:
+    """Keep the ports that are bound here for this module alone."""
+    with reserved_conducted():
+        yield
 
 
 def fine() -> None:
@@ -147,14 +154,14 @@ def asked(build: Path, instance: int) -> Aircraft:
 
 def test_side_by_side_each_takes_an_instance_of_its_own(tmp_path: Path) -> None:
     build, vehicle = write_build(tmp_path / "px4"), load_vehicle("quad")
-    flown = [conducted_px4(asked(build, 4), vehicle, None) for _ in range(2)]
+    flown = [conducted_px4(asked(build, INSTANCE), vehicle, None) for _ in range(2)]
     try:
         first, second = (px4.instance for px4 in flown)
-        assert 4 <= first < second
+        assert INSTANCE <= first < second
     finally:
         for px4 in flown:
             px4.stack.close()
-    again = conducted_px4(asked(build, 4), vehicle, None)
+    again = conducted_px4(asked(build, INSTANCE), vehicle, None)
     again.stack.close()
     assert again.instance == first
 

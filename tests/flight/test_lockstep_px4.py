@@ -110,12 +110,12 @@ def test_an_answer_that_never_comes_ends_the_flight(monkeypatch: pytest.MonkeyPa
 # --- PX4's stand-in
 
 
-def scenario(px4: Path, folder: Path, **changes: object) -> Scenario:
-    """Return a short flight of it; another instance than a PX4 that somebody may fly here."""
+def scenario(px4: Path, instance: int, folder: Path, **changes: object) -> Scenario:
+    """Return a short flight of it."""
     return Scenario(
         firmware="px4",
         level="lockstep",
-        real={"px4_dir": str(px4), "instance": 4},
+        real={"px4_dir": str(px4), "instance": instance},
         seed=SEED,
         episodes=1,
         **{"arena": str(write_arena(folder, 10.0)), **changes},
@@ -123,8 +123,10 @@ def scenario(px4: Path, folder: Path, **changes: object) -> Scenario:
 
 
 @pytest.mark.slow
-def test_a_flight_with_its_stand_in(tmp_path: Path) -> None:
-    run = rehearse(scenario(write_build(tmp_path / "px4"), tmp_path), out=tmp_path / "run")
+def test_a_flight_with_its_stand_in(tmp_path: Path, px4_instance: int) -> None:
+    run = rehearse(
+        scenario(write_build(tmp_path / "px4"), px4_instance, tmp_path), out=tmp_path / "run"
+    )
     (flown,) = run.episodes
     assert flown.outcome is Outcome.SUCCESS
     assert (flown.invalid, flown.notes, flown.slipped_us) == ((), (), 0)
@@ -140,8 +142,9 @@ def test_a_flight_with_its_stand_in(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_flight_that_loses_it_every_time(tmp_path: Path) -> None:
-    resolved = resolve(scenario(write_build(tmp_path / "px4", "--fault", "die@1"), tmp_path))
+def test_a_flight_that_loses_it_every_time(tmp_path: Path, px4_instance: int) -> None:
+    build = write_build(tmp_path / "px4", "--fault", "die@1")
+    resolved = resolve(scenario(build, px4_instance, tmp_path))
     with pytest.raises(LockstepError, match="flight 000, seed 11: lost 3 times; at last PX4"):
         fly(resolved, resolved.fresh_policy(SEED), 0, SEED, log=tmp_path / "log")
     assert (tmp_path / "log").read_text().count("peer: die") == 3
@@ -152,10 +155,10 @@ def test_a_flight_that_loses_it_every_time(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(REAL is None, reason="AIRL_PX4_DIR names no PX4")
-def test_real_px4_flies_as_the_built_in(tmp_path: Path) -> None:
+def test_real_px4_flies_as_the_built_in(tmp_path: Path, px4_instance: int) -> None:
     assert REAL is not None
     arena = {"arena": "static-obstacles"}
-    asked = scenario(Path(REAL), tmp_path, **arena)
+    asked = scenario(Path(REAL), px4_instance, tmp_path, **arena)
     reference = Scenario(level="lockstep", seed=SEED, episodes=1, **arena)
     flown, built_in = (
         fly(r, r.fresh_policy(SEED), 0, SEED).record for r in (resolve(asked), resolve(reference))

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import random
 import signal
-import socket
 import sys
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +14,7 @@ import pytest
 from pymavlink import mavutil
 
 from tests.support.hitl_peer import HitlPeer
-from tests.support.ports import LOOPBACK, choose_ports, free_ports
+from tests.support.ports import choose_ports, free_ports
 from tests.support.processes import (
     ROOT,
     SITL,
@@ -37,25 +34,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mar
 SPEED = "6"
 
 
-def free_instance() -> int:
-    """Return an instance number of PX4's none of whose ports is taken. Not 0: somebody may fly."""
-    instances = list(range(1, 10))
-    random.SystemRandom().shuffle(instances)
-    for n in instances:
-        with ExitStack() as held:
-            try:
-                tcp = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
-                tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                tcp.bind((LOOPBACK, 4560 + n))
-                for port in (14540, 14580, 18570, 14280, 14030, 13030):
-                    udp = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                    udp.bind((LOOPBACK, port + n))
-            except OSError:
-                continue
-            return n
-    raise AssertionError("no instance is free")
-
-
 def sitl(firmware: str, *options: str, report: bool = False) -> list[str]:
     _, (camera,) = free_ports(0, 1)
     return [
@@ -65,9 +43,9 @@ def sitl(firmware: str, *options: str, report: bool = False) -> list[str]:
     ]
 
 
-def px4(build: Path, *options: str, report: bool = False) -> list[str]:
-    instance = ("--instance", str(free_instance()))
-    return sitl("px4", "--px4-dir", str(build), *instance, *options, report=report)
+def px4(build: Path, instance: int, *options: str, report: bool = False) -> list[str]:
+    number = ("--instance", str(instance))
+    return sitl("px4", "--px4-dir", str(build), *number, *options, report=report)
 
 
 def leashed(process: Running) -> list[int]:
@@ -87,7 +65,7 @@ def setup(folder: Path) -> dict[str, Any]:
     return info["setup"]
 
 
-def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
+def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path, px4_instance: int) -> None:
     """It dies in its first flight only; the rehearsal takes a new one, and says so."""
     healthy = write_build(tmp_path / "healthy")
     build = write_build(tmp_path / "px4", "--fault", "die@12")
@@ -99,7 +77,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
         f"touch {mark}\n{faulty}"
     )
     arena = write_arena(tmp_path, 10.0)
-    with running(px4(build, "--arena", str(arena), report=True), tmp_path) as process:
+    with running(px4(build, px4_instance, "--arena", str(arena), report=True), tmp_path) as process:
         programs = wait_until(lambda: leashed(process), "PX4")
         assert process.wait(250.0) == 0, process.text()
         for pid in programs:
@@ -129,43 +107,42 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path) -> None:
         assert (run / name).read_text(encoding="utf-8") == ""
 
 
-def test_a_wrong_motor_order_is_found_on_the_ground(tmp_path: Path) -> None:
+def test_a_wrong_motor_order_is_found_on_the_ground(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4", "--fault", "motors")
-    with running(px4(build), tmp_path) as process:
+    with running(px4(build, px4_instance), tmp_path) as process:
         assert process.wait(100.0) == 2, process.text()
     (line,) = [line for line in process.text().splitlines() if "error" in line]
     assert "wrong motor order" in line
     assert not (tmp_path / "run").exists()
 
 
-def test_px4_does_not_outlive_a_killed_rehearsal(tmp_path: Path) -> None:
+def test_px4_does_not_outlive_a_killed_rehearsal(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4")
-    with running(px4(build), tmp_path) as process:
+    with running(px4(build, px4_instance), tmp_path) as process:
         (program,) = wait_until(lambda: leashed(process), "PX4")
         process.process.send_signal(signal.SIGKILL)
         wait_until(lambda: not is_running(program), "PX4 to end", 60.0)
 
 
 @pytest.mark.nightly
-def test_a_px4_that_never_comes_is_waited_for_in_vain(tmp_path: Path) -> None:
-    instance = free_instance()
-    words = sitl("px4", "--px4-connect", "--instance", str(instance), "--firmware-timeout", "2")
+def test_a_px4_that_never_comes_is_waited_for_in_vain(tmp_path: Path, px4_instance: int) -> None:
+    words = sitl("px4", "--px4-connect", "--instance", str(px4_instance), "--firmware-timeout", "2")
     with running(words, tmp_path) as process:
         assert process.wait(100.0) == 2, process.text()
-    assert f"PX4 did not connect to TCP port {4560 + instance} within 2 s" in process.text()
-    assert f"bin/px4 -d -i {instance}; do sleep 1; done" in process.text()
+    assert f"PX4 did not connect to TCP port {4560 + px4_instance} within 2 s" in process.text()
+    assert f"bin/px4 -d -i {px4_instance}; do sleep 1; done" in process.text()
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.nightly
-def test_a_rehearsal_with_ardupilot(tmp_path: Path) -> None:
+def test_a_rehearsal_with_ardupilot(tmp_path: Path, px4_instance: int) -> None:
     program = tmp_path / "arducopter"
     peer = ROOT / "tests" / "support" / "ardupilot_peer.py"
     program.write_text(f'#!/bin/sh\nexec env PYTHONPATH={ROOT} {sys.executable} {peer} "$@"\n')
     program.chmod(0o755)
     ports = choose_ports()
     words = [
-        *sitl("ardupilot", "--ardupilot-dir", str(program), "--instance", str(free_instance())),
+        *sitl("ardupilot", "--ardupilot-dir", str(program), "--instance", str(px4_instance)),
         *("--api-port", str(ports.api), "--gcs-port", str(ports.gcs)),
         *("--arena", str(write_arena(tmp_path, 10.0))),
     ]

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import fcntl
+import random
 import socket
-from contextlib import ExitStack
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
 
 LOOPBACK = "127.0.0.1"
+
+CONDUCTED_INSTANCE = 8
+"""Instance of PX4's, and the next one, of tests that bind its ports themselves."""
 
 
 def free_ports(udp: int, tcp: int) -> tuple[list[int], list[int]]:
@@ -21,6 +30,55 @@ def free_ports(udp: int, tcp: int) -> tuple[list[int], list[int]]:
                 each.bind((LOOPBACK, 0))
             found.append([each.getsockname()[1] for each in sockets])
     return found[0], found[1]
+
+
+@contextmanager
+def reserved_instance() -> Iterator[int]:
+    """Reserve one of PX4's instance numbers, which fix its ports, and give it.
+
+    No other test has it meanwhile, of another worker or checkout either: between the search for
+    free ports and their use by a program that starts lie seconds. Instance 0 is never given:
+    somebody may fly it here.
+    """
+    instances = list(range(1, CONDUCTED_INSTANCE))
+    random.SystemRandom().shuffle(instances)
+    for instance in instances:
+        with _lock_of(instance) as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            if _ports_are_free(instance):
+                yield instance
+                return
+    raise AssertionError("no instance is free")
+
+
+@contextmanager
+def reserved_conducted() -> Iterator[None]:
+    """Reserve `CONDUCTED_INSTANCE` and the next one; another checkout's tests are waited for."""
+    with _lock_of(CONDUCTED_INSTANCE) as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _lock_of(instance: int) -> TextIO:
+    """Open the file whose lock reserves an instance; whatever happens, it ends with the process."""
+    return (Path(tempfile.gettempdir()) / f"airl-mav-tests-px4-{instance}.lock").open("a")
+
+
+def _ports_are_free(instance: int) -> bool:
+    with ExitStack() as held:
+        try:
+            tcp = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            tcp.bind((LOOPBACK, 4560 + instance))
+            for port in (14540, 14580, 18570, 14280, 14030, 13030):
+                udp = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                udp.bind((LOOPBACK, port + instance))
+        except OSError:
+            return False
+    return True
 
 
 @dataclass(frozen=True)
