@@ -307,8 +307,7 @@ class BuiltinAutopilot:
     def start_mission(self, index: int) -> Result:
         """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
         if not self._navigator.mission_is_valid(self._situation()):
-            denied = events.MISSION_DENIED
-            self.say(Message(Severity.CRITICAL, denied.message, denied.event()))
+            self.say(Message.of(Severity.CRITICAL, events.MISSION_DENIED))
             return Result.DENIED
         if not -1 <= index < len(self.plans.mission):
             return Result.DENIED
@@ -354,7 +353,7 @@ class BuiltinAutopilot:
 
     def return_to_launch(self) -> None:
         """End the mission and return."""
-        self.say(Message(Severity.INFO, "Returning to launch", events.RETURNING.event()))
+        self.say(Message.of(Severity.INFO, events.RETURNING))
         self.set_mode(Mode.RETURN)
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
@@ -385,8 +384,7 @@ class BuiltinAutopilot:
             return
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
-            took_over = events.PILOT_TOOK_OVER
-            self._say(Message(Severity.INFO, took_over.message, took_over.event()))
+            self._say(Message.of(Severity.INFO, events.PILOT_TOOK_OVER))
 
     def follow(self, target: FollowedTarget) -> None:
         """Hand over where the target is that Follow follows."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.definition import Definition, Event
 from firmware_sim.interfaces import BatterySample, GpsFix
 
 Vector = NDArray[np.float64]
@@ -111,6 +111,11 @@ class Message:
     text: str
     event: Event | None = field(default=None, compare=False)
     """The same as an event, for ground stations that know it; None = there is none."""
+
+    @classmethod
+    def of(cls, severity: Severity, definition: Definition) -> Message:
+        """Return the words of an event without arguments, and the event."""
+        return cls(severity, definition.message, definition.event())
 
 
 class Result(IntEnum):

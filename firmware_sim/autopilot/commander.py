@@ -123,16 +123,15 @@ def _critical(text: str, event: Told) -> Message:
     return Message(Severity.CRITICAL, text, event)
 
 
-_ARM_DENIED, _NOT_LANDED_YET = events.ARM_DENIED, events.DISARM_DENIED
 _BY_COMMAND = events.ARMED_BY.event(ArmingReason.COMMAND_EXTERNAL)
 _IGNORE = Row()
 _TEMP = Result.TEMPORARILY_REJECTED
-_NO_ARM = Row(result=_TEMP, text=_critical(_ARM_DENIED.message, _ARM_DENIED.event()))
-_NOT_LANDED = Row(result=_TEMP, text=_critical(_NOT_LANDED_YET.message, _NOT_LANDED_YET.event()))
+_NO_ARM = Row(result=_TEMP, text=Message.of(Severity.CRITICAL, events.ARM_DENIED))
+_NOT_LANDED = Row(result=_TEMP, text=Message.of(Severity.CRITICAL, events.DISARM_DENIED))
 _B, _S, _G, _A = Phase
 _ARMED = Row(phase=_G, text=_info("Armed by external command", _BY_COMMAND))
-_LIFTED = Row(phase=_A, text=_info("Takeoff detected", events.TAKEOFF_DETECTED.event()))
-_LANDED = Row(phase=_G, text=_info("Landing detected", events.LANDING_DETECTED.event()))
+_LIFTED = Row(phase=_A, text=Message.of(Severity.INFO, events.TAKEOFF_DETECTED))
+_LANDED = Row(phase=_G, text=Message.of(Severity.INFO, events.LANDING_DETECTED))
 
 
 def _ask(mode: Mode, text: Message | None = None) -> Row:

@@ -36,6 +36,8 @@ class Check(NamedTuple):
     shown: Callable[[Readiness], Need] | None = None
     """Ground stations show it in modes that need one of these, too; None: where it blocks alone,
     in all modes if it blocks nowhere."""
+    of_present_mode: bool = False
+    """Whether it is told only while the vehicle is in a mode in which it fails."""
 
 
 def never(_readiness: Readiness) -> bool:
@@ -296,6 +298,7 @@ CHECKS: tuple[Check, ...] = (
         "Preflight Fail: Mode not suitable for arming",
         events.MODE_CANNOT_ARM,
         said=False,
+        of_present_mode=True,
     ),
     Check(
         Part.ESTIMATOR,

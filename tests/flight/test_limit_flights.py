@@ -8,20 +8,18 @@ import pytest
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.stage import Stage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.piloting import NATIVE_T2_US, TRANSPORT_US
-from companion.mission import MissionResult, fly_mission
+from airl_mav.scenario.piloting import TRANSPORT_US
+from companion.mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.simulation import EpisodeSetup, Simulation
-from tests.support.lockstep_kit import demo_scenario
+from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 
 FAR_SEED = 3
 """A flight of several seconds."""
@@ -78,17 +76,7 @@ def test_who_takes_over_has_the_vehicle(mode: Mode, breaks: bool) -> None:
         policy = Creeps(break_after_a_long_thought)
 
         def program() -> None:
-            results.append(
-                fly_mission(
-                    *(stage.link, stage.camera, policy, (500.0, 0.0), stage.clock),
-                    *(stage.abandon, stage.abandon, lambda _: None),
-                    pilot_settings=PilotSettings(),
-                    watchdog_settings=WatchdogSettings(),
-                    limit_settings=LimitSettings(),
-                    guard=stage.clock,
-                    latency=FixedSampler(NATIVE_T2_US),
-                )
-            )
+            results.append(fly_as_companion(stage, policy, (500.0, 0.0)))
 
         simulation = stage.run(setup, program)
         until_us = simulation.time_us + 3 * US_PER_S

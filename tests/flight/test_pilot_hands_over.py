@@ -15,18 +15,17 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.stage import Stage
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
-from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.piloting import NATIVE_T2_US, TRANSPORT_US
-from companion.mission import MissionResult, fly_mission
+from airl_mav.scenario.model import PilotSettings
+from airl_mav.scenario.piloting import TRANSPORT_US
+from companion.mission import MissionResult
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.simulation import EpisodeSetup, Simulation
-from tests.support.lockstep_kit import demo_scenario
+from tests.support.lockstep_kit import demo_scenario, fly_as_companion
 from tests.support.ports import LOOPBACK, choose_ports
 from tests.support.processes import ground_station, running, wait_until
 
@@ -97,16 +96,10 @@ def fly_with(
         stage.firmware.on_tick = look_on
 
         def program() -> None:
+            policy, goal = Deciding(act), (AHEAD_M, 0.0)
             results.append(
-                fly_mission(
-                    *(stage.link, stage.camera, Deciding(act), (AHEAD_M, 0.0), stage.clock),
-                    *(stop, stage.abandon, phases.append),
-                    pilot_settings=PilotSettings(),
-                    watchdog_settings=WatchdogSettings(),
-                    limit_settings=LimitSettings(),
-                    guard=stage.clock,
-                    latency=FixedSampler(NATIVE_T2_US),
-                    start="offboard",
+                fly_as_companion(
+                    stage, policy, goal, stop=stop, phase=phases.append, start="offboard"
                 )
             )
 

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import sys
+import threading
+from collections.abc import Callable
 from typing import Any
 
+from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.stage import Stage
+from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.progress import Observer
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, WatchdogSettings
+from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.scenario.stand_alone import Start
+from companion.mission import MissionResult, fly_mission
 
 SEED = 11
 """A short flight: two seconds to the goal."""
@@ -28,6 +36,31 @@ class Speaking(Observer):
 def demo_scenario(**changes: Any) -> ResolvedScenario:
     """Return a short flight in lockstep; `changes` are fields of the scenario."""
     return resolve(Scenario(**({"level": "lockstep", "time_limit_s": 60.0} | changes)))
+
+
+def fly_as_companion(
+    stage: Stage,
+    policy: Policy,
+    goal: tuple[float, float],
+    *,
+    stop: threading.Event | None = None,
+    phase: Callable[[str], None] = lambda _: None,
+    start: Start = "arm",
+) -> MissionResult:
+    """Fly a mission on a stage with default settings; it is what `Stage.run` calls.
+
+    `stop` ends it early, `phase` is told its phases; by default nobody does and nobody is.
+    """
+    return fly_mission(
+        *(stage.link, stage.camera, policy, goal, stage.clock),
+        *(stage.abandon if stop is None else stop, stage.abandon, phase),
+        pilot_settings=PilotSettings(),
+        watchdog_settings=WatchdogSettings(),
+        limit_settings=LimitSettings(),
+        guard=stage.clock,
+        latency=FixedSampler(NATIVE_T2_US),
+        start=start,
+    )
 
 
 def main(flights: int) -> None:

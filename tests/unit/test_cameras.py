@@ -189,9 +189,11 @@ def test_the_newest_image_becomes_a_frame_stamped_when_it_was_taken(
     np.testing.assert_array_equal(received.frame.depth_mm, np.full((48, 64), 4000))
     assert source.wait(0, 0.01) is None, "the same is not new"
     camera.give(*(DepthImage(plane(WIDE, mm), 0) for mm in (3000, 2000)))
-    while source.latest().frame.sequence < 2:  # type: ignore[union-attr]
-        assert source.wait(source.latest().frame.sequence, 30.0)  # type: ignore[union-attr]
-    assert source.latest().frame.depth_mm[0, 0] == 2000  # type: ignore[union-attr]
+    while received.frame.sequence < 2:
+        newer = source.wait(received.frame.sequence, 30.0)
+        assert newer is not None
+        received = newer
+    assert received.frame.depth_mm[0, 0] == 2000
 
 
 @pytest.mark.parametrize(

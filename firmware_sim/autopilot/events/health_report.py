@@ -97,7 +97,7 @@ def _blocked_modes(
     check: Check, readiness: Readiness, in_modes: dict[Mode, Readiness]
 ) -> int | None:
     """Return the modes in which a check keeps the vehicle from arming; None = it passes."""
-    if check.event.definition.name == _OF_PRESENT_MODE and not check.fails(readiness):
+    if check.of_present_mode and not check.fails(readiness):
         return None
     failing = [mode for mode, there in in_modes.items() if check.fails(there)]
     if not failing:
@@ -107,10 +107,6 @@ def _blocked_modes(
     if len(stopped) == len(Mode):
         return ALL_MODES
     return _bits(stopped)
-
-
-_OF_PRESENT_MODE = "check_modes_cannot_takeoff"
-"""Told only while the vehicle is in such a mode."""
 
 
 def _cannot_run(readiness: Readiness) -> int:

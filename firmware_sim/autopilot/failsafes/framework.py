@@ -314,7 +314,9 @@ def _already_on_the_way(
 
     A precision landing is not given up for an ordinary one either.
     """
-    needless = (Action.RETURN, Action.LAND)[: 2 if intended is Mode.PRECISION_LAND else 1]
+    needless = {Action.RETURN}
+    if intended is Mode.PRECISION_LAND:
+        needless.add(Action.LAND)
     return (
         intended in (Mode.LAND, Mode.RETURN, Mode.PRECISION_LAND)
         and (action in needless or delayed in needless)

@@ -202,15 +202,9 @@ class Watch:
         if fused is not self._gps_fused:
             self._gps_fused = fused
             if phase >= _GROUND and fused:
-                texts.append(
-                    Message(Severity.INFO, events.GNSS_STARTED.message, events.GNSS_STARTED.event())
-                )
+                texts.append(Message.of(Severity.INFO, events.GNSS_STARTED))
             elif phase >= _GROUND:
-                texts.append(
-                    Message(
-                        Severity.WARNING, events.GNSS_STOPPED.message, events.GNSS_STOPPED.event()
-                    )
-                )
+                texts.append(Message.of(Severity.WARNING, events.GNSS_STOPPED))
         estimator = self._estimator
         if estimator.consistency.restarts != self._restarts:
             self._restarts = estimator.consistency.restarts

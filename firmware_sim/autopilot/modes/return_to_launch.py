@@ -15,7 +15,6 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.events import flight_events as events
-from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, here, triple
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.mission import Mission
@@ -131,7 +130,7 @@ class ReturnToLaunch(FlightMode):
         elif self._stage is _Stage.DESCEND and abs(down - self._waiting_down) < radius:
             self._stage, self._waiting_since_us = _Stage.WAIT, time_us
             if delay < 0.0:
-                self._context.say(_told(events.RTL_LOITERING))
+                self._context.say(Message.of(Severity.INFO, events.RTL_LOITERING))
         elif self._stage is _Stage.WAIT and self._waiting_since_us is not None:
             waited_s = (time_us - self._waiting_since_us) / US_PER_S
             if 0.0 <= delay <= waited_s:
@@ -145,7 +144,7 @@ class ReturnToLaunch(FlightMode):
         if self._precise:
             north, east, _ = self._home.position
             self._precision.begin((north, east, down), required=asked == _REQUIRED)
-        self._context.say(_told(events.RTL_LAND))
+        self._context.say(Message.of(Severity.INFO, events.RTL_LAND))
 
     def _height(self, state: Vector) -> float:
         """Return the height above where it will land [m]."""
@@ -155,7 +154,3 @@ class ReturnToLaunch(FlightMode):
         """Return the horizontal distance from home [m]."""
         (north, east, _), home = triple(state, P), self._home.position
         return math.hypot(north - home[0], east - home[1])
-
-
-def _told(definition: Definition) -> Message:
-    return Message(Severity.INFO, definition.message, definition.event())
