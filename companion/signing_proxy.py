@@ -110,12 +110,13 @@ class SigningProxy:
             self._stored.save_due()
 
     def _from_vehicle(self, data: bytes, address: tuple[str, int]) -> None:
-        signing = self._stored.signing
-        for frame in frames_of(data):
-            if signing.accepts(frame):
-                if frame[2] & 1:
-                    self._vehicle = address  # not by an unsigned heartbeat
-                self._inner.sendto(frame, self._mavsdk)
+        accepted = [frame for frame in frames_of(data) if self._stored.signing.accepts(frame)]
+        if any(frame[2] & 1 for frame in accepted):
+            self._vehicle = address  # not by an unsigned heartbeat
+        if accepted:
+            # What comes together goes on together: in lockstep a second of telemetry comes at
+            # once, and frame by frame it would not fit into MAVSDK's socket.
+            self._inner.sendto(b"".join(accepted), self._mavsdk)
 
     def _from_mavsdk(self, data: bytes) -> None:
         if self._vehicle is None:

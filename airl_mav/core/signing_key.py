@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from pathlib import Path
@@ -81,10 +82,15 @@ class StoredSigning:
             self.save()
 
     def save(self) -> None:
-        """Write the newest time stamp."""
+        """Write the newest time stamp, where it can be written: no flight ends over it.
+
+        A program that begins without it takes the calendar's time, and what was sent in the last
+        minute before could be replayed to it.
+        """
         self._next_us = self._clock.time_us() + SAVE_EVERY_US
         if self._path is not None and self.signing.key is not None:
-            replace_file(_stamp_path(self._path), f"{self.signing.timestamp}\n".encode())
+            with contextlib.suppress(OSError):
+                replace_file(_stamp_path(self._path), f"{self.signing.timestamp}\n".encode())
 
     def _store_key(self) -> None:
         """Keep a key that came over a link, or forget it."""

@@ -3,7 +3,8 @@
 MAVSDK repeats setpoints at 20 Hz, sends heartbeats and asks for messages by the wall clock, from
 threads of its own. None of that may reach a flight that is to be the same every time. So here a
 setpoint that only repeats the last one is dropped, and repeated in simulated time instead; what
-passes is stamped with simulated time and numbered anew.
+passes is stamped with simulated time and numbered anew. Nothing is signed here: that is the
+wire's matter (`wire`), and its key stays the one of the start.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ class Inbound:
             return NOTHING
         message = messages[0]
         number = message.get_msgId()
-        if number in _BY_THE_WALL_CLOCK:
+        if number in _BY_THE_WALL_CLOCK or number == dialect.MAVLINK_MSG_ID_SETUP_SIGNING:
             return NOTHING
         if number in _SETPOINTS:
             return self._take_setpoint(message, now_us)

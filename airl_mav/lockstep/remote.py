@@ -12,6 +12,7 @@ from pathlib import Path
 
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.signing_key import StoredSigning
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.conductor import Conductor
@@ -20,6 +21,7 @@ from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.link import BOOT_UNIX_US, builtin_vehicle
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US
+from airl_mav.lockstep.wire import Wire
 from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, episode_of
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
@@ -39,6 +41,7 @@ class RemoteStage:
         endpoint: UdpEndpoint,
         frames: FrameServer,
         *,
+        stored: StoredSigning | None = None,
         broken_off: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda _line: None,
     ) -> None:
@@ -48,6 +51,7 @@ class RemoteStage:
             asked: How it flies: transport, turns, pace, who judges.
             endpoint: Where the companion is, or will be.
             frames: Where its camera's frames go.
+            stored: The key by which both sign; None: nobody does.
             broken_off: Asked while the companion is waited for; True gives it up.
             say: Is told what happens, a line at a time.
         """
@@ -55,8 +59,9 @@ class RemoteStage:
         self._say = say
         self._digest = FlightDigest()
         camera = TokenCamera(frames, round(asked.transport_ms * US_PER_MS))
+        self._wire = Wire(endpoint, stored, say)
         self._partner = TokenPartner(
-            endpoint,
+            self._wire,
             camera,
             turn_us=asked.turn_us,
             patience_s=asked.companion_timeout,
@@ -125,6 +130,7 @@ class RemoteStage:
     def close(self) -> None:
         """Let the companion go and forget the flight; the sockets are their owner's to close."""
         self._partner.close()
+        self._wire.close()
         self.firmware.close()
 
     def _enter(self, phase: str, time_us: int) -> None:
@@ -153,6 +159,7 @@ def fly_vehicle_in_lockstep(
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
     ports = asked.open_ports
+    stored = None if asked.signing_key is None else StoredSigning(asked.signing_key)
     with (
         closing(
             UdpEndpoint(
@@ -160,14 +167,16 @@ def fly_vehicle_in_lockstep(
                 (asked.companion_host, ports.api_port),
                 local_option="--api-local-port",
                 remote_option="--api-port",
-                insecure=asked.insecure,
+                insecure=asked.insecure or stored is not None,
             )
         ) as endpoint,
         closing(CameraServer(f"tcp://{asked.bind}:{ports.camera_port or '*'}")) as camera,
     ):
         episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle, asked.plant)
-        stage = RemoteStage(asked, endpoint, camera, broken_off=stop.is_set, say=listener.say)
+        stage = RemoteStage(
+            asked, endpoint, camera, stored=stored, broken_off=stop.is_set, say=listener.say
+        )
         with closing(stage):
             stage.firmware.on_message = listener.text
             stage.firmware.on_log_lost = listener.say

@@ -15,6 +15,7 @@ from companion.conducted import ConductedClock
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.program import Mission
+from companion.signing_proxy import signed
 from companion.token_camera import TokenFrameSource
 from companion.token_clock import TokenTurns
 
@@ -47,7 +48,8 @@ def fly_in_lockstep(
         How it ended, and the fingerprint of what the policy saw.
 
     Raises:
-        UsageError: The connection is none, or the policy cannot use the camera.
+        UsageError: The connection is none, the key cannot be used, or the policy cannot use the
+            camera.
         LinkError: No flight controller is heard.
         Abandoned: The simulator gives no turn any more.
     """
@@ -61,8 +63,9 @@ def fly_in_lockstep(
 
     with (
         closing(open_camera(asked.camera, clock)) as frames,
+        signed(asked.connect, asked.signing_key) as url,
         # Who gives turns is heard, however long the wall clock says that it was silent.
-        closing(MavsdkLink(asked.connect, clock, abandon, heard=lambda: True)) as link,
+        closing(MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
     ):
         link.set_timeout(ANSWER_TIMEOUT_S)
         waiting()

@@ -16,17 +16,14 @@ from dataclasses import dataclass
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.lockstep.camera import TokenCamera
-from airl_mav.lockstep.frames import datagrams, newest_heartbeat
+from airl_mav.lockstep.frames import newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
+from airl_mav.lockstep.wire import Heard, Wire
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import COMPANION_TIMEOUT_S, LONGEST_REST_US, TURN_US
 from companion.tokens import Order as Word
 from companion.tokens import Phase, TurnBack, TurnGiven
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
-from firmware_sim.mavlink.endpoint import UdpEndpoint
-
-LONGEST_DATAGRAM = 1400
-"""Frames of telemetry share a datagram up to this size [bytes]; MAVSDK reads 2048 at a time."""
+from firmware_sim.mavlink.codec import Encoder, dialect
 
 KNOCK_S = 0.1
 """Before the companion is there, a heartbeat goes out so often [wall s]."""
@@ -54,7 +51,7 @@ class TokenPartner:
 
     def __init__(
         self,
-        endpoint: UdpEndpoint,
+        wire: Wire,
         camera: TokenCamera,
         *,
         turn_us: int = TURN_US,
@@ -65,7 +62,7 @@ class TokenPartner:
         """Wait for nobody yet.
 
         Args:
-            endpoint: Where the companion is, or will be.
+            wire: Where the companion is, or will be.
             camera: Its frames.
             turn_us: A companion that does not say when it wants the next turn has it so long
                 after [µs].
@@ -74,7 +71,7 @@ class TokenPartner:
                 and, for this flight, the companion.
             phase: Called with each phase that the companion tells, and the simulated time [µs].
         """
-        self._endpoint = endpoint
+        self._wire = wire
         self._camera = camera
         self._turn_us, self._patience_s = turn_us, patience_s
         self._broken_off = broken_off
@@ -82,7 +79,6 @@ class TokenPartner:
         self._order: Word = ""
         self._ordered = threading.Event()
         self._encoder = Encoder()
-        self._decoder = Decoder(datagrams=True)
         self._heartbeat = b""
         self._heard = False
         """Whether the companion is there: before, nothing but heartbeats is sent."""
@@ -92,15 +88,10 @@ class TokenPartner:
         self._rest: _Rest | None = None
         self._unseen = False
         """Whether the camera's newest frame has not been sent yet."""
-        self._early: list[WireMessage] = []
+        self._early: list[Heard] = []
         """What came before the first turn."""
         self._phases: set[str] = set()
         """Told in this turn."""
-        socket = endpoint.fileno()
-        if socket is None:
-            raise ValueError("the endpoint is closed")
-        self._socket = socket
-        endpoint.receive()  # what is left of another flight
 
     @property
     def turns(self) -> int:
@@ -126,7 +117,7 @@ class TokenPartner:
         if self._number == 0:
             self._backlog.append(frames)
         if self._heard:
-            self._send_frames(frames)
+            self._wire.send(frames)
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps; see `turns.Partner`."""
@@ -139,7 +130,7 @@ class TokenPartner:
         over = TurnGiven(self._number, now_us)
         self._number += 1
         # What is left from before must not fill the socket's buffer.
-        self._hear([*self._early, *self._received()], over, handle)
+        self._hear([*self._early, *self._wire.receive()], over, handle)
         self._early.clear()
         self._phases.clear()
         given = TurnGiven(self._number, now_us, self._camera.sequence, self._order)
@@ -193,11 +184,11 @@ class TokenPartner:
     def _knock(self) -> bool:
         """Send heartbeats until the companion answers with anything; False: broken off."""
         while not self._broken_off():
-            self._endpoint.send(self._heartbeat)
-            if self._wait(KNOCK_S) and (early := self._received()):
+            self._wire.send(self._heartbeat)
+            if self._wait(KNOCK_S) and (early := self._wire.receive()):
                 self._early = early
                 self._heard = True
-                self._send_frames(b"".join(self._backlog))
+                self._wire.send(b"".join(self._backlog))
                 return True
         return False
 
@@ -215,7 +206,7 @@ class TokenPartner:
             stopwatch = WallClock()
             while (left_s := again_s - stopwatch.time_us() / US_PER_S) > 0.0:
                 if self._wait(left_s):
-                    back = self._hear(self._received(), given, handle)
+                    back = self._hear(self._wire.receive(), given, handle)
                     if back is not None:
                         return back
                 if self._broken_off():
@@ -229,26 +220,28 @@ class TokenPartner:
         """Send again what goes before the turn."""
         if self._number == 1:
             # The companion may have come up while the telemetry was being sent.
-            self._send_frames(b"".join(self._backlog))
+            self._wire.send(b"".join(self._backlog))
         else:
             # MAVSDK gives a vehicle up after 3 s without one, by the wall clock.
-            self._endpoint.send(self._heartbeat)
+            self._wire.send(self._heartbeat)
 
-    def _hear(
-        self, messages: list[WireMessage], given: TurnGiven, handle: Handle
-    ) -> TurnBack | None:
+    def _hear(self, heard: list[Heard], given: TurnGiven, handle: Handle) -> TurnBack | None:
         """Handle what has arrived; return the turn if it is given back.
+
+        Who gives a turn back is the companion: nobody else is heard from then on.
 
         Raises LockstepError for words that cannot be understood.
         """
         found = None
-        for message in messages:
+        for peer, message in ((each.peer, each.message) for each in heard):
             text = message.text if message.get_type() == "STATUSTEXT" else ""
             if (back := TurnBack.parse(text)) is not None:
                 if back.number > given.number:
                     raise LockstepError(f"the companion's {text!r}: accepted: D{given.number}")
                 if back.number == given.number:
                     found = back
+                    if given.number > 0:  # 0: before the first turn there is none to give back
+                        self._wire.keep_to(peer)
             elif _TURN_BACK.match(text):
                 raise LockstepError(
                     f"the companion's {text!r}; accepted: D<turn> [<wake_us> [<setpoints> "
@@ -268,22 +261,14 @@ class TokenPartner:
 
     # --- the socket
 
-    def _received(self) -> list[WireMessage]:
-        chunks = self._endpoint.receive()
-        return [message for chunk in chunks for message in self._decoder.feed(chunk)]
-
     def _say(self, given: TurnGiven) -> None:
         text = given.text().encode()
         message = dialect.MAVLink_statustext_message(dialect.MAV_SEVERITY_DEBUG, text)
-        self._endpoint.send(self._encoder.pack(message))
-
-    def _send_frames(self, frames: bytes) -> None:
-        for datagram in datagrams(frames, LONGEST_DATAGRAM):
-            self._endpoint.send(datagram)
+        self._wire.send(self._encoder.pack(message))
 
     def _wait(self, seconds: float) -> bool:
         """Wait until something arrives; return whether it has."""
-        ready, _, _ = select.select([self._socket], [], [], min(seconds, SLICE_S))
+        ready, _, _ = select.select([self._wire.socket], [], [], min(seconds, SLICE_S))
         return bool(ready)
 
 

@@ -222,8 +222,8 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
     check_ports(asked.open_ports, any_camera=True)
     speed = asked.speed
     level: LevelName = "lockstep" if asked.lockstep else "sitl"
-    if asked.signing_key is not None and (asked.lockstep or asked.firmware != "builtin"):
-        raise FieldError("signing_key", asked.signing_key, "without lockstep, firmware builtin")
+    if asked.signing_key is not None and asked.firmware != "builtin":
+        raise FieldError("signing_key", asked.signing_key, "with firmware builtin")
     check_plant(asked)
     check_firmware(asked, "sitl", speed)
     if asked.lockstep and asked.firmware != "builtin":
@@ -271,8 +271,6 @@ def check_companion(asked: StandAloneCompanion) -> None:
         raise FieldError("check", asked.check, "without lockstep")
     if asked.lockstep and asked.start != "arm":
         raise FieldError("start", asked.start, "arm in lockstep, where nobody else flies")
-    if asked.lockstep and asked.signing_key is not None:
-        raise FieldError("signing_key", asked.signing_key, "without lockstep")
     _check_folder("log", asked.log)
 
 

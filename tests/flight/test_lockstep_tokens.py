@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
+from airl_mav.core.signing_key import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.remote import RemoteStage
@@ -173,7 +174,9 @@ def test_stopped_and_loaded_processes_fly_the_same(
 
 
 @contextmanager
-def staged(reference: Reference) -> Iterator[tuple[RemoteStage, TestPorts]]:
+def staged(
+    reference: Reference, stored: StoredSigning | None = None
+) -> Iterator[tuple[RemoteStage, TestPorts]]:
     ports = choose_ports()
     endpoint = UdpEndpoint(
         (LOOPBACK, ports.api_local),
@@ -190,7 +193,7 @@ def staged(reference: Reference) -> Iterator[tuple[RemoteStage, TestPorts]]:
     with (
         closing(endpoint),
         closing(camera),
-        closing(RemoteStage(asked, endpoint, camera)) as stage,
+        closing(RemoteStage(asked, endpoint, camera, stored=stored)) as stage,
     ):
         warm_up(reference.scenario.vehicle)
         stage.load(reference.setup, None)
@@ -234,6 +237,8 @@ class Relay:
 
     def __init__(self, near_port: int, far_port: int) -> None:
         self.dropped: Counter[str] = Counter()
+        self.unsigned = 0
+        """Datagrams that begin with a frame without a signature."""
         self._near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._near.bind((LOOPBACK, near_port))
         self._far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -258,6 +263,7 @@ class Relay:
                     self._near.sendto(data, self._vehicle)
 
     def _lost(self, data: bytes) -> bool:
+        self.unsigned += not data[2] & 1
         text = data[11:-2] if int.from_bytes(data[7:10], "little") == 253 else b""
         word = re.match(rb"[FD](?=\d)", text)
         if word is None or self._rng.random() > 0.1:
@@ -272,25 +278,41 @@ class Relay:
         self._far.close()
 
 
-def test_lost_words_do_not_change_the_flight(reference: Reference, tmp_path: Path) -> None:
-    with staged(reference) as (stage, ports):
+@pytest.fixture
+def key(tmp_path: Path) -> Path:
+    path = tmp_path / "key"
+    write_key(path, bytes(range(1, 33)))
+    return path
+
+
+def test_neither_lost_words_nor_a_key_change_the_flight(
+    reference: Reference, tmp_path: Path, key: Path
+) -> None:
+    """The reference is flown in one process, where there is no wire to sign."""
+    with staged(reference, StoredSigning(key)) as (stage, ports):
         far = choose_ports().api
+        words = companion_words(far, ports.camera, reference, "--signing-key", str(key))
         with (
             closing(Relay(ports.api, far)) as relay,
-            running(companion_words(far, ports.camera, reference), tmp_path) as companion,
+            running(words, tmp_path) as companion,
         ):
             lanes = fly_staged(stage)
             assert companion.wait() == 0, companion.text()
     assert min(relay.dropped["F"], relay.dropped["D"]) >= 10, relay.dropped
+    assert relay.unsigned == 0
     assert lanes | lanes_in(companion.text()) == reference.lanes
 
 
-def test_companion_that_dies_ends_the_flight(reference: Reference, tmp_path: Path) -> None:
-    ports = choose_ports()
-    words = firmware_words(ports, "--companion-timeout", "1", "--speed", "15.0")
+def test_companion_that_dies_ends_the_flight(
+    reference: Reference, tmp_path: Path, key: Path
+) -> None:
+    ports, signed = choose_ports(), ("--signing-key", str(key))
+    words = firmware_words(ports, "--companion-timeout", "1", "--speed", "15.0", *signed)
     with (
         running(words, tmp_path) as firmware,
-        running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
+        running(
+            companion_words(ports.api, ports.camera, reference, *signed), tmp_path
+        ) as companion,
     ):
         firmware.wait_for_text("arming")
         companion.process.kill()

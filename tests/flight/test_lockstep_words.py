@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,9 +15,12 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
+from airl_mav.core.signing_key import StoredSigning, write_key
 from airl_mav.lockstep.camera import TokenCamera
+from airl_mav.lockstep.inbound import Inbound
 from airl_mav.lockstep.tokens import TokenPartner
 from airl_mav.lockstep.turns import LockstepError, Turn
+from airl_mav.lockstep.wire import Wire
 from airl_mav.rehearsal.supervisor import Order
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from companion.tokens import Phase, TurnBack, TurnGiven
@@ -78,17 +82,29 @@ class NoCamera:
         """Nothing to do."""
 
 
+def mav_of(key: bytes | None) -> Any:
+    """Return pymavlink's end of a link, which signs, and demands signatures, where it has a key."""
+    mav = dialect.MAVLink(None, 245, 191)
+    mav.robust_parsing = True
+    if key is not None:
+        mav.signing.secret_key = key
+        mav.signing.link_id = 3
+        mav.signing.timestamp = int((time.time() - 1_420_070_400) * 1e5)
+        mav.signing.sign_outgoing = True
+    return mav
+
+
 class Mate:
     """A companion that gives each turn back with the next of some texts."""
 
-    def __init__(self, *texts: str) -> None:
+    def __init__(self, *texts: str, key: bytes | None = None) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind((LOOPBACK, 0))
         self.socket.settimeout(0.1)
         self.heard: list[Any] = []
         self.datagrams: list[int] = []
         self._texts = list(texts)
-        self._mav = dialect.MAVLink(None, 245, 191)
+        self._mav = mav_of(key)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -128,15 +144,27 @@ class Mate:
 
 
 @contextmanager
-def partner(mate: Mate, **settings: Any) -> Iterator[TokenPartner]:
-    server: FrameServer = NoCamera()
+def wired(
+    mate: Mate, stored: StoredSigning | None = None, say: Any = lambda _: None
+) -> Iterator[tuple[Wire, Any]]:
+    """Give the vehicle's end, and its address."""
     remote = mate.socket.getsockname()
     with (
         closing(
             UdpEndpoint((LOOPBACK, 0), remote, local_option="local", remote_option="remote")
         ) as endpoint,
         closing(mate),
-        closing(TokenPartner(endpoint, TokenCamera(server, 0), **settings)) as made,
+        closing(Wire(endpoint, stored, say)) as wire,
+    ):
+        yield wire, endpoint.local
+
+
+@contextmanager
+def partner(mate: Mate, **settings: Any) -> Iterator[TokenPartner]:
+    server: FrameServer = NoCamera()
+    with (
+        wired(mate) as (wire, _),
+        closing(TokenPartner(wire, TokenCamera(server, 0), **settings)) as made,
     ):
         made.send(heartbeat())
         yield made
@@ -274,6 +302,139 @@ def test_phases_are_told_once() -> None:
     ):
         vehicle.turn(NOW_US, lambda _: None)
     assert told == [("arming", NOW_US)]
+
+
+# --- strangers, and who has no key
+
+
+KEY = bytes(range(5, 37))
+
+
+class Stranger:
+    """Somebody else on the onboard link, with a key or without."""
+
+    def __init__(self, vehicle: Any, key: bytes | None = None) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOOPBACK, 0))
+        self.socket.settimeout(0.2)
+        self._vehicle, self._mav = vehicle, mav_of(key)
+
+    def say(self, text: str) -> None:
+        self.send(dialect.MAVLink_statustext_message(7, text.encode()))
+
+    def send(self, message: Any) -> None:
+        self.socket.sendto(message.pack(self._mav), self._vehicle)
+
+    def hears_nothing(self) -> bool:
+        try:
+            self.socket.recv(4096)
+        except TimeoutError:
+            return True
+        return False
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def land() -> Any:
+    return dialect.MAVLink_command_long_message(1, 1, 21, 0, 0, 0, 0, 0, 0, 0, 0)
+
+
+def test_who_gave_the_first_turn_back_is_the_companion() -> None:
+    """Another program on its port ends no flight, commands nothing and is sent nothing."""
+    told: list[str] = []
+    handled: list[bytes] = []
+    mate = Mate("D1 200000 0", "D2 300000 0", "D3 400000 0")
+    mate.start()
+    with (
+        wired(mate, say=told.append) as (wire, vehicle),
+        closing(TokenPartner(wire, TokenCamera(NoCamera(), 0))) as made,
+        closing(Stranger(vehicle)) as other,
+    ):
+        made.send(heartbeat())
+        assert made.turn(NOW_US, lambda _: None).wake_us == 200_000
+        for text in ("D2 end", "D2 soon", "D99 900000", "P2 navigating"):
+            other.say(text)
+        other.send(land())
+        other.socket.sendto(b"\xfd" * 300, vehicle)
+        assert made.turn(200_000, lambda frame: handled.append(frame)).wake_us == 300_000
+        made.send(heartbeat())
+        assert other.hears_nothing()
+        assert made.turn(300_000, lambda frame: handled.append(frame)).wake_us == 400_000
+        assert wire.foreign == 6
+    assert [f for f in handled if int.from_bytes(f[7:10], "little") != 0] == []
+    assert any("not the companion's" in line for line in told)
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> StoredSigning:
+    path = tmp_path / "key"
+    write_key(path, KEY)
+    return StoredSigning(path)
+
+
+def test_turns_pass_signed(stored: StoredSigning) -> None:
+    """What the vehicle's end hands on is as without a key; every frame of the wire is signed."""
+    mate = Mate("D1 200000 0", "D2 end", key=KEY)
+    mate.start()
+    pings = [Encoder().pack(dialect.MAVLink_ping_message(i, i, 0, 0)) for i in range(100)]
+    with (
+        wired(mate, stored) as (wire, _),
+        closing(TokenPartner(wire, TokenCamera(NoCamera(), 0))) as made,
+    ):
+        made.send(heartbeat() + b"".join(pings))
+        assert made.turn(NOW_US, lambda _: None).wake_us == 200_000
+        assert made.turn(200_000, lambda _: None).wake_us is None
+        assert wire.refused == 0
+    assert all(m.get_signed() for m in mate.heard)
+    assert [m.seq for m in mate.heard if m.get_type() == "PING"][:100] == list(range(100))
+    assert max(mate.datagrams) <= 1400
+
+
+@pytest.mark.parametrize("key", [None, bytes(32 * [9])], ids=["unsigned", "wrong key"])
+def test_without_the_key_no_turn_is_given_back(key: bytes | None, stored: StoredSigning) -> None:
+    told: list[str] = []
+    stop = threading.Event()
+    with (
+        wired(Mate(), stored, told.append) as (wire, vehicle),
+        closing(TokenPartner(wire, TokenCamera(NoCamera(), 0), broken_off=stop.is_set)) as made,
+        closing(Stranger(vehicle, key)) as other,
+    ):
+        made.send(heartbeat())
+        other.say("D1 200000 0")
+        other.send(land())
+        other.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+        threading.Timer(0.3, stop.set).start()
+        assert made.turn(NOW_US, lambda _: None).wake_us is None
+        assert made.turns == 0
+        assert wire.refused == (2 if key is None else 3)  # a heartbeat may be unsigned, as in PX4
+        assert other.hears_nothing()
+    assert "bad signature" in told[0]
+
+
+def test_a_replayed_turn_is_refused(stored: StoredSigning) -> None:
+    with (
+        wired(Mate(), stored) as (wire, vehicle),
+        closing(Stranger(vehicle, KEY)) as mate,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as thief,
+    ):
+        frame = dialect.MAVLink_statustext_message(7, b"D1 end").pack(mate._mav)
+        mate.socket.sendto(frame, vehicle)
+        thief.sendto(frame, vehicle)
+        assert [each.message.text for each in _arrived(wire)] == ["D1 end"]
+        assert wire.refused == 1
+
+
+def _arrived(wire: Wire) -> list[Any]:
+    time.sleep(0.05)  # both lie in the socket's buffer then
+    return wire.receive()
+
+
+def test_the_key_of_the_start_stays() -> None:
+    """SETUP_SIGNING would have the vehicle sign within the flight, by the calendar."""
+    setup = dialect.MAVLink_setup_signing_message(1, 1, list(KEY), 1)
+    passed = Inbound().take(setup.pack(mav_of(None)), NOW_US)
+    assert passed.deliver == ()
 
 
 # --- options
