@@ -18,7 +18,8 @@ from airl_mav.experiments.experiment import (
 from airl_mav.faults.model import Fault
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
-from airl_mav.policy.card import MeasuredResult, add_result
+from airl_mav.policy.card import MeasuredResult
+from airl_mav.policy.card_writing import add_result
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario
 

@@ -26,8 +26,8 @@ from airl_mav.policy.card import (
     load_card,
     open_model,
     read_model,
-    write_card,
 )
+from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import Encoded, encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation

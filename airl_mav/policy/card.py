@@ -16,13 +16,12 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
-from airl_mav.core.files import read_json, replace_file, write_json
+from airl_mav.core.files import read_json
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import SHIPPED as SHIPPED_LAYOUTS
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
-from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.vehicle import Camera
 
@@ -295,47 +294,6 @@ def open_model(
         return OnnxRuntime(model, card.observation, card.actions, threads, card.state)
     except ValueError as error:
         raise UsageError(f"{folder / ONNX_FILE}: {error}") from None
-
-
-def write_card(folder: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy that it is for; the old card stays until the new is whole.
-
-    Its page for people, `README.md`, is written after it, unless somebody else's has that name.
-
-    Raises:
-        UsageError: The folder holds another policy, or none.
-    """
-    read_model(folder, card)
-    if card.torch_sha256 is not None:
-        read_torch_program(folder, card)
-    plain = {"schema": SCHEMA, **card.model_dump(mode="json")}
-    write_json(folder / CARD_FILE, plain)
-    write_model_card(folder, card)
-
-
-def write_model_card(folder: Path, card: PolicyCard) -> None:
-    """Write a card's page for people, unless the folder has one that was not made so."""
-    page = folder / MODEL_CARD_FILE
-    if not page.exists() or MARK.encode() in page.read_bytes():
-        replace_file(page, model_card(card).encode())
-
-
-def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
-    """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
-
-    Raises:
-        UsageError: See `read_card`.
-    """
-    card = read_card(folder)
-    others = [each for each in card.results if _conditions(each) != _conditions(result)]
-    results = tuple(sorted([*others, result], key=_conditions))
-    card = card.model_copy(update={"results": results})
-    write_card(folder, card)
-    return card
-
-
-def _conditions(result: MeasuredResult) -> tuple[str, str, str]:
-    return result.level, result.arena, result.latency or ""
 
 
 def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:

@@ -15,8 +15,8 @@ from airl_mav.policy.card import (
     load_card,
     read_model,
     read_torch_program,
-    write_card,
 )
+from airl_mav.policy.card_writing import write_card
 
 
 def copy_policy(

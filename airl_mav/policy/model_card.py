@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from airl_mav.policy.card import MeasuredResult, PolicyCard
+from airl_mav.policy.card import MeasuredResult, PolicyCard
 
 MODEL_CARD_FILE = "README.md"
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest, write_card
+from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest
+from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec
 from airl_mav.policy.runtime import ACTION, outputs_of
 

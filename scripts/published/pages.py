@@ -15,7 +15,8 @@ from pathlib import Path
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
-from airl_mav.policy.card import MeasuredResult, read_card, write_card
+from airl_mav.policy.card import MeasuredResult, read_card
+from airl_mav.policy.card_writing import write_card
 from published import tables_gap, tables_levels, tables_policies
 from published.blocks import block_of
 from published.declared import read_declared

@@ -27,7 +27,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from airl_mav.cli import main
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.card import load_card, open_model, read_card, write_card
+from airl_mav.policy.card import load_card, open_model, read_card
+from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.learned import decide, load_learned
 from airl_mav.profiles.computer import load_computer

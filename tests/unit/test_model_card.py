@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from airl_mav.policy.card import MeasuredResult, add_result, read_card, write_card
+from airl_mav.policy.card import MeasuredResult, read_card
+from airl_mav.policy.card_writing import add_result, write_card
 from airl_mav.policy.model_card import MODEL_CARD_FILE, QUALITIES, model_card
 from airl_mav.profiles.loading import profiles_dir
 
@@ -28,7 +29,7 @@ def folder(tmp_path: Path) -> Path:
 def test_the_shipped_pages_say_what_their_cards_say(shipped: Path) -> None:
     card = read_card(shipped)
     page = (shipped / MODEL_CARD_FILE).read_text(encoding="utf-8")
-    assert page == model_card(card), "written by airl_mav.policy.card.write_model_card"
+    assert page == model_card(card), "written by airl_mav.policy.card_writing.write_model_card"
     _, front, body = page.split("---\n", 2)
     told = yaml.safe_load(front)
     assert told["library_name"] == "airl-mav"

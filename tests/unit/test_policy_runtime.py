@@ -26,7 +26,8 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy import learned, registry
 from airl_mav.policy.action_sets import ActionSpec, commands
-from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card, write_card
+from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card
+from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import ObservationSpec, encode_layout
 from airl_mav.policy.learned import LearnedPolicy, decide, load_learned
 from airl_mav.policy.observation import Kinematics, Observation, encode
