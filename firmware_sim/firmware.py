@@ -20,6 +20,7 @@ from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.flight_log.log_folder import ULOG_SUFFIX, LogFolder
+from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -64,12 +65,13 @@ class FlightStack(Protocol):
         """
         ...
 
-    def connect(self, tick: Callable[[], int]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
         """Open its MAVLink, after its first tick.
 
         Args:
             tick: Flies one more tick and returns its simulated time [µs], for firmware that needs
                 simulated time to get ready.
+            truth: Returns the true state, for clients that ask for it (HIL_STATE_QUATERNION).
 
         Raises:
             UsageError: External firmware is silent, or is set up for another vehicle.
@@ -135,11 +137,11 @@ class BuiltinFlightStack:
             autopilot.parameters.on_change(self._changed)
         return autopilot
 
-    def connect(self, tick: Callable[[], int]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
         """Attach the autopilot to the MAVLink server."""
         del tick
         if self._autopilot is not None:
-            self._server.attach(self._autopilot)
+            self._server.attach(self._autopilot, truth)
 
     def close(self) -> None:
         """Save parameters that are not saved yet, and close the links."""
@@ -260,7 +262,7 @@ class Firmware:
             self._failing.begin(simulation.faults)
         simulation.tick()
         powered_us = simulation.time_us
-        self.flight_stack.connect(self._tick_on_the_ground)
+        self.flight_stack.connect(self._tick_on_the_ground, simulation.plant.truth)
         if simulation.time_us > powered_us:
             # The time that external firmware took to boot is no part of the episode.
             simulation.begin()

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, Event
+from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.interfaces import BatterySample, GpsFix
 
 Vector = NDArray[np.float64]
@@ -290,5 +291,10 @@ class AutopilotState(NamedTuple):
     """Where an automatic mode is going, local NED [m]; None in other modes."""
     home_yaw: float = 0.0
     """Heading at home [rad]."""
-    has_pilot: bool = False
-    """Whether a pilot's sticks are heard."""
+    sticks: Sticks | None = None
+    """A pilot's; None = none are heard."""
+
+    @property
+    def has_pilot(self) -> bool:
+        """Whether a pilot's sticks are heard."""
+        return self.sticks is not None

@@ -84,5 +84,5 @@ def snapshot(
         destination=None if demand is None else parts.guidance.destination,
         home_yaw=context.home_yaw,
         health=parts.supervisor.health(sample.time_us),
-        has_pilot=context.sticks is not None,
+        sticks=context.sticks,
     )

@@ -15,7 +15,7 @@ from firmware_sim.external.launcher import Launcher
 from firmware_sim.external.observer import Observer
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
-from firmware_sim.interfaces import ActuatorControls, SensorSample
+from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.simulation import EpisodeSetup
@@ -148,16 +148,18 @@ class ExternalFlightStack:
         self._observer.restart()
         return ExternalFlightController(self._launcher, self._observer)
 
-    def connect(self, tick: Callable[[], int]) -> None:
+    def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
         """Run the boot sequence on the ground until the frame is checked and it may be armed.
 
         Args:
             tick: Flies a tick and returns its simulated time [µs].
+            truth: Not needed: its simulator interface has it.
 
         Raises:
             FirmwareMissingError: It is silent, has another frame, or never gets ready to arm.
             FirmwareLostError: It died.
         """
+        del truth
         airframe, observer = self._launcher.airframe, self._observer
         parameters = observer.parameters
         self._until(tick, lambda: observer.heard, "a MAVLink heartbeat")

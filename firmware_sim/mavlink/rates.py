@@ -45,6 +45,7 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 10.0,
         "ESC_STATUS": 10.0,
+        "RC_CHANNELS": 20.0,
     }
 )
 """Onboard (API) link, 14580 -> 14540 [Hz]."""
@@ -77,6 +78,7 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "ORBIT_EXECUTION_STATUS": 5.0,
         "ESC_INFO": 1.0,
         "ESC_STATUS": 1.0,
+        "RC_CHANNELS": 5.0,
     }
 )
 """Ground station link, 18570 -> 14550 [Hz]."""

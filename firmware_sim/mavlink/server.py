@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import chain
 
 from airl_mav.core.clock import Clock
@@ -11,6 +11,7 @@ from airl_mav.core.signing import Signing
 from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.complaints import Complaints
@@ -18,12 +19,14 @@ from firmware_sim.mavlink.endpoint import Endpoint, Peer
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
 from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
+from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder, information, sensors
-from firmware_sim.mavlink.streams.status import system_time
+from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
+from firmware_sim.mavlink.streams.status import manual_control, system_time
 from firmware_sim.mavlink.streams.vibration import VibrationMeter
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -79,6 +82,7 @@ class MavlinkServer:
                 sets one, which is forgotten with the server.
         """
         self._port: AutopilotPort | None = None
+        self._truth: Callable[[], Truth] | None = None
         self._clock = clock
         self._stored = signing
         self._signing = (
@@ -86,6 +90,7 @@ class MavlinkServer:
         )
         self._storage = storage or Storage()
         self._calibration = RunningCalibration()
+        self._radio = Radio()
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
@@ -105,6 +110,9 @@ class MavlinkServer:
             "BATTERY_STATUS": self._battery_status,
             "TIME_ESTIMATE_TO_TARGET": self._time_estimate,
             "TIMESYNC": peers.timesync_request,
+            "HIL_STATE_QUATERNION": self._hil_state_quaternion,
+            "MAG_CAL_REPORT": self._mag_cal_report,
+            "MANUAL_CONTROL": lambda state: manual_control(state, self._system_id),
         }
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)
@@ -112,15 +120,15 @@ class MavlinkServer:
         if port is not None:
             self.attach(port)
 
-    def attach(self, port: AutopilotPort) -> None:
-        """Replace the autopilot, between two episodes.
+    def attach(self, port: AutopilotPort, truth: Callable[[], Truth] | None = None) -> None:
+        """Replace the autopilot, between two episodes; `truth` is what clients ask for as such.
 
         Clients and the rates that they have set are kept; running parameter lists and messages for
         the old autopilot (stale setpoints) are dropped. Simulated time may start anew.
         """
         if self._port is not None:
             self._discard()
-        self._port = port
+        self._port, self._truth = port, truth
         self._forget_us = 0
         self._system_id = _system_id(port)
         self._senders.forget()
@@ -284,6 +292,7 @@ class MavlinkServer:
             self._system_id,
             storage=self._storage,
             calibration=self._calibration,
+            radio=self._radio,
         )
         client.events = EventSender(self._events)
         client.announced_origin = None
@@ -297,7 +306,11 @@ class MavlinkServer:
                     client.link.ignored += 1
 
     def _link_builders(self) -> dict[str, Builder]:
-        return {**self._builders, "PING": peers.ping_requests()}
+        return {
+            **self._builders,
+            "PING": peers.ping_requests(),
+            "RC_CHANNELS": self._radio.updates(),
+        }
 
     def _dispatch(self, client: Client, message: WireMessage) -> bool:
         if (message.get_srcSystem(), message.get_srcComponent()) == (self._system_id, COMPONENT_ID):
@@ -335,6 +348,15 @@ class MavlinkServer:
         if self._port is None:
             return None
         return sensors.battery_status(state, self._port.parameters)
+
+    def _hil_state_quaternion(self, _state: AutopilotState) -> Values | None:
+        if self._truth is None:
+            return None
+        truth = self._truth()
+        return hil_state_quaternion(truth, truth.time_us)
+
+    def _mag_cal_report(self, _state: AutopilotState) -> Values | None:
+        return None if self._port is None else sensors.mag_cal_report(self._port.parameters.value)
 
     def _time_estimate(self, state: AutopilotState) -> Values | None:
         if self._port is None:

@@ -17,6 +17,7 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, Truth
 from firmware_sim.mavlink.codec import Encoder, Layout, Values
+from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
 
 BATTERY = BatterySample(16.0, 10.0, 100.0, 0.9)
 
@@ -125,7 +126,7 @@ def test_the_true_state() -> None:
         100.0,
         1.0,
     )
-    message = decoded(hil.STATE, hil.state_quaternion(truth, 5_000))
+    message = decoded(hil.STATE, hil_state_quaternion(truth, 5_000))
     assert message.time_usec == 5_000
     assert message.attitude_quaternion == pytest.approx([half, 0.0, 0.0, half])
     rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
@@ -138,7 +139,7 @@ def test_a_metre_north_and_east_on_the_globe() -> None:
     truth = Truth(
         1, np.array([1.0, 1.0, 0.0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0.0, 1.0
     )
-    message = decoded(hil.STATE, hil.state_quaternion(truth, 1))
+    message = decoded(hil.STATE, hil_state_quaternion(truth, 1))
     # On a sphere of 6 371 km a metre is 89.93e-7 deg, over the cosine of the latitude to the east.
     assert message.lat - 473_977_430 == 90
     assert message.lon - 85_455_940 == round(89.93 / math.cos(math.radians(47.397743)))

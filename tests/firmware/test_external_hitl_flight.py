@@ -162,4 +162,4 @@ def test_a_board_that_does_not_tell_its_frame_stays_on_the_ground(
         return simulation.time_us
 
     with pytest.raises(FirmwareMissingError, match=r"the parameters .*HIL_ACT_FUNC1"):
-        stack.connect(tick)
+        stack.connect(tick, simulation.plant.truth)

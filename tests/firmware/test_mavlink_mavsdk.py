@@ -25,7 +25,9 @@ from mavsdk.plugins.telemetry import FlightMode, LandedState, Telemetry
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.location import HOME
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Setpoint, Severity
+from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import (
@@ -330,3 +332,18 @@ def test_a_ground_stations_heartbeat_reaches_the_autopilot() -> None:
                 return bool(pacer.bench.autopilot.gcs_heartbeats)
 
         wait_for(heard)
+
+
+def test_the_true_state_is_there_for_who_asks() -> None:
+    """MAVSDK's ground truth: PX4 SITL has it, too."""
+    with mavsdk_over_memory() as (companion, pacer):
+        telemetry = companion.plugin(Telemetry)
+        still = np.zeros(3)
+        with pacer.lock:
+            truth = Truth(0, np.array([0.0, 0.0, -30.0]), still, np.eye(4)[0], still, 0.0, 1.0)
+            pacer.bench.server.attach(pacer.bench.autopilot, lambda: truth)
+        assert math.isnan(telemetry.ground_truth().latitude_deg)
+        telemetry.set_rate_ground_truth(20.0)
+        above = pytest.approx(HOME.altitude_m + 30.0, abs=0.01)
+        wait_for(lambda: telemetry.ground_truth().absolute_altitude_m == above)
+        assert telemetry.ground_truth().latitude_deg == pytest.approx(HOME.latitude_deg)

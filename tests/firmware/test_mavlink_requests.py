@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 
+from airl_mav.core.frames import Geodetic, geodetic_to_local
+from airl_mav.core.location import HOME
+from firmware_sim.autopilot.manual_control import Sticks
+from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.streams.status import CAPABILITIES
+from firmware_sim.mavlink.streams.status import CAPABILITIES, manual_control
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import Rig
 
@@ -83,7 +89,7 @@ def test_get_message_interval(rig: Rig) -> None:
     "number",
     [
         *(148, 242, 245, 0, 1, 2, 4, 24, 26, 30, 32, 49, 93, 105, 111, 147, 264),
-        *(290, 291, 300, 331, 375, 436),
+        *(137, 192, 235, 290, 291, 300, 331, 375, 436),
     ],
 )
 def test_requested_messages_come_before_their_acknowledgement(rig: Rig, number: int) -> None:
@@ -148,3 +154,102 @@ def test_data_streams_only_ever_speed_up(rig: Rig) -> None:
     before_ignored = rig.bench.server.counters()["onboard"].ignored
     ask(77, 4)
     assert rig.bench.server.counters()["onboard"].ignored == before_ignored + 1
+
+
+# --- what a PX4 SITL sends to who asks for it
+
+
+def requested(rig: Rig, name: str) -> Any:
+    result, messages = rig.command(512, getattr(dialect, f"MAVLINK_MSG_ID_{name}"))
+    assert result == ACCEPTED
+    (message,) = [m for m in messages if m.get_type() == name]
+    return message
+
+
+def test_the_true_state_is_sent_to_who_asks_and_to_nobody_else() -> None:
+    rig = Rig()
+    assert rig.command(512, dialect.MAVLINK_MSG_ID_HIL_STATE_QUATERNION)[0] == DENIED  # no plant
+    truth = Truth(
+        rig.autopilot.time_us,
+        np.array([100.0, -50.0, -20.0]),
+        np.array([1.0, -2.0, 400.0]),
+        np.array([math.sqrt(0.5), 0.0, 0.0, -math.sqrt(0.5)]),
+        np.array([0.1, -0.2, 0.3]),
+        power_w=0.0,
+        battery_remaining=1.0,
+    )
+    rig.bench.server.attach(rig.autopilot, lambda: truth)
+    rig.bench.run(2.0)
+    for end in (rig.client, rig.station):
+        assert end.count()["HIL_STATE_QUATERNION"] == 0
+    message = requested(rig, "HIL_STATE_QUATERNION")
+    there = geodetic_to_local(
+        Geodetic(message.lat / 1e7, message.lon / 1e7, message.alt / 1e3), HOME
+    )
+    np.testing.assert_allclose(there, truth.position, atol=0.01)
+    assert (message.vx, message.vy, message.vz) == (100, -200, 32_767)  # saturated
+    np.testing.assert_allclose(message.attitude_quaternion, truth.quaternion, atol=1e-6)
+    assert message.yawspeed == pytest.approx(0.3)
+    rig.command(511, dialect.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 40_000)
+    rig.client.received()
+    rig.bench.run(1.0)
+    assert rig.client.count()["HIL_STATE_QUATERNION"] == 25
+    assert rig.station.count()["HIL_STATE_QUATERNION"] == 0
+
+
+def test_the_whole_vehicle_in_one_message(rig: Rig) -> None:
+    before = requested(rig, "HIGH_LATENCY2")
+    assert (before.type, before.autopilot) == (2, 12)
+    assert before.latitude == pytest.approx(47.397743e7, abs=100)
+    assert before.altitude == 489
+    assert before.wp_num == 0xFFFF
+    assert before.failure_flags == dialect.HL_FAILURE_FLAG_RC_RECEIVER
+    rig.climb()
+    after = requested(rig, "HIGH_LATENCY2")
+    assert after.altitude == 492
+    assert after.custom_mode == 3 << 8 | 4  # AUTO, LOITER
+
+
+def test_a_calibrated_compass_is_reported(rig: Rig) -> None:
+    report = requested(rig, "MAG_CAL_REPORT")
+    assert report.cal_status == dialect.MAG_CAL_SUCCESS
+    assert (report.ofs_x, report.diag_y, report.offdiag_z) == (0.0, 1.0, 0.0)
+    rig.autopilot.parameters.values["CAL_MAG0_ID"] = 0
+    assert rig.command(512, dialect.MAVLINK_MSG_ID_MAG_CAL_REPORT)[0] == DENIED
+
+
+def test_a_pilots_sticks_are_told(rig: Rig) -> None:
+    """PX4 sends the throttle from -1000 on, though it takes it from 0 on."""
+    assert rig.command(512, dialect.MAVLINK_MSG_ID_MANUAL_CONTROL)[0] == DENIED
+    state = rig.autopilot.state()._replace(sticks=Sticks(0.5, -1.0, -0.25, 0.1))
+    assert state.has_pilot
+    fields = dict(
+        zip(
+            dialect.MAVLink_manual_control_message.fieldnames,
+            manual_control(state, 7) or (),
+            strict=True,
+        )
+    )
+    assert [fields[name] for name in ("target", "x", "y", "z", "r")] == [7, -1000, 500, -250, 100]
+
+
+def override(**widths: int) -> Any:
+    nothing = {f"chan{n}_raw": 65_535 if n <= 8 else 0 for n in range(1, 19)}
+    return dialect.MAVLink_rc_channels_override_message(1, 1, **{**nothing, **widths})
+
+
+def test_the_channels_of_a_radio_come_back_once_each(rig: Rig) -> None:
+    """MAVROS shows them as rc/in, QGroundControl on its radio page."""
+    rig.bench.run(1.0)
+    assert rig.client.count()["RC_CHANNELS"] == rig.station.count()["RC_CHANNELS"] == 0
+    rig.client.send(override(chan1_raw=1100, chan3_raw=1500, chan9_raw=1900))
+    rig.bench.run(1.0)
+    for end in (rig.client, rig.station):
+        (channels,) = [m for m in end.received() if m.get_type() == "RC_CHANNELS"]
+        assert (channels.chancount, channels.rssi) == (9, 100)
+        assert (channels.chan1_raw, channels.chan2_raw, channels.chan9_raw) == (1100, 65_535, 1900)
+        assert channels.chan10_raw == channels.chan18_raw == 65_535
+    rig.client.send(override())
+    rig.bench.run(0.5)
+    (channels,) = [m for m in rig.client.received() if m.get_type() == "RC_CHANNELS"]
+    assert (channels.chancount, channels.rssi, channels.chan1_raw) == (0, 0, 65_535)

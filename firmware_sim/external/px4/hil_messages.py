@@ -11,10 +11,9 @@ import math
 from typing import NamedTuple, TypeAlias
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
-from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
-from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
 
 SENSOR = layout("HIL_SENSOR")
@@ -122,21 +121,6 @@ def gps(fix: GpsFix, time_us: int) -> Values:
         fix.satellites,
         _ID,
         _YAW_UNAVAILABLE,
-    )
-
-
-def state_quaternion(truth: Truth, time_us: int) -> Values:
-    """Return HIL_STATE_QUATERNION at the firmware's time [µs].
-
-    Airspeeds and accelerations are left at 0: `Truth` does not have them, and PX4 only logs them.
-    """
-    return (
-        time_us,
-        *truth.quaternion.tolist(),
-        *truth.angular_velocity.tolist(),
-        *_geodetic(local_to_geodetic(truth.position, HOME)),
-        *(_fit(v * _CM, _INT16) for v in truth.velocity.tolist()),
-        *(0, 0, 0, 0, 0),
     )
 
 

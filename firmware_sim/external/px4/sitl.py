@@ -19,6 +19,7 @@ from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
+from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
 
 ANSWER_S = 5.0
 """Longest wait for an answer [wall s]."""
@@ -210,7 +211,7 @@ class Px4Bridge:
             # Keeps its phase, skips what it missed.
             late_us = now_us - self._state_due_us
             self._state_due_us = now_us + self._state_us - late_us % self._state_us
-            state = hil.state_quaternion(self._truth(), now_us)
+            state = hil_state_quaternion(self._truth(), now_us)
             data += encoder.frame(hil.STATE, hil.STATE.payload(state))
         data += encoder.frame(hil.SENSOR, hil.SENSOR.payload(hil.sensor(sample, now_us)))
         self._sent_us = now_us

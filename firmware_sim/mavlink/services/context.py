@@ -11,6 +11,7 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
+from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.services.ftp_session import FtpClient
 from firmware_sim.mavlink.services.log_transfer import LogDownload, LogListing, LogStream
 from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
@@ -54,6 +55,8 @@ class Context:
     """The client's part in the shell."""
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
     """The vehicle's, the same for all clients."""
+    radio: Radio = field(default_factory=Radio)
+    """The newest channels of a radio, the same for all clients."""
     log_listing: LogListing | None = None
     """The entries of logs that are still to be sent."""
     log_download: LogDownload | None = None

@@ -49,8 +49,9 @@ def handle_manual_control(message: WireMessage, context: Context) -> bool:
 def handle_channels(message: WireMessage, context: Context) -> bool:
     """RC_CHANNELS_OVERRIDE: roll, pitch, throttle, yaw as channels 1..4 of a usual radio.
 
-    Pulling the pitch stick lengthens its pulse. Nothing is taken while one of the four is missing.
+    Pulling the pitch stick lengthens its pulse. Nothing is flown while one of the four is missing.
     """
+    context.radio.hear(message, context.now_us)
     raw = (message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw)
     if any(width in _NO_CHANNEL for width in raw):
         return False

@@ -15,6 +15,7 @@ from firmware_sim.mavlink.streams import (
     actuators,
     flight_modes,
     gimbal,
+    high_latency,
     information,
     pose,
     sensors,
@@ -47,6 +48,8 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "SYS_STATUS": status.sys_status,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
+        # PX4's simulator hands one measurement to two barometers.
+        "SCALED_PRESSURE2": sensors.scaled_pressure,
         "MISSION_CURRENT": status.mission_current,
         "FENCE_STATUS": status.fence_status,
         "HOME_POSITION": pose.home_position,
@@ -62,6 +65,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "SCALED_IMU": sensors.scaled_imu,
         "FLIGHT_INFORMATION": information.flight_information,
         "PROTOCOL_VERSION": information.protocol_version,
+        "HIGH_LATENCY2": high_latency.high_latency2,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.vehicle import atmosphere
@@ -63,6 +64,26 @@ def scaled_pressure(state: AutopilotState) -> Values:
     """Static pressure [hPa] and temperature [0.01 °C]."""
     temperature = units.int16(state.temperature_c * 100.0)
     return units.boot_ms(state.time_us), state.pressure_hpa, _NO_AIRSPEED, temperature
+
+
+def mag_cal_report(value: Callable[[str], float]) -> Values | None:
+    """Calibration of the compass [gauss], of the parameters; nothing while it has none."""
+    if not value("CAL_MAG0_ID"):
+        return None
+    number, being_calibrated, autosaved, fitness = 0, 0, 0, 0.0
+    confidence, scale, turned = 1.0, 1.0, max(0, int(value("CAL_MAG0_ROT")))
+    return (
+        number,
+        being_calibrated,
+        dialect.MAG_CAL_SUCCESS,
+        autosaved,
+        fitness,
+        *(value(f"CAL_MAG0_{axis}{kind}") for kind in ("OFF", "SCALE", "ODIAG") for axis in "XYZ"),
+        confidence,
+        turned,
+        turned,
+        scale,
+    )
 
 
 def gps_raw_int(state: AutopilotState) -> Values | None:

@@ -79,6 +79,10 @@ _PRESENT = (
 _LOGGED = dialect.MAV_SYS_STATUS_LOGGING
 """Present once it is armed: the log begins then."""
 
+_AUXILIARY = 6
+_ALL_AUXILIARY = 0b1111_1100
+"""MANUAL_CONTROL.enabled_extensions: PX4 has six auxiliary axes, at rest here."""
+
 _RADIO = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _NONE_EXTENDED, _PARACHUTE = 0, dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 
@@ -93,6 +97,20 @@ def heartbeat(state: AutopilotState) -> Values:
         custom_mode(status.mode),
         system_status(status, can_arm=state.health.armable),
         _MAVLINK_VERSION,
+    )
+
+
+def manual_control(state: AutopilotState, system_id: int) -> Values | None:
+    """A pilot's sticks [1e-3], the throttle from -1000 on, as PX4 sends it; nothing without."""
+    sticks = state.sticks
+    if sticks is None:
+        return None
+    buttons = more_buttons = no_axis = 0
+    return (
+        system_id,
+        *(int16(share * 1e3) for share in (sticks.pitch, sticks.roll, sticks.throttle, sticks.yaw)),
+        *(buttons, more_buttons, _ALL_AUXILIARY, no_axis, no_axis),
+        *(0,) * _AUXILIARY,
     )
 
 
