@@ -114,9 +114,12 @@ class Message:
     """The same as an event, for ground stations that know it; None = there is none."""
 
     @classmethod
-    def of(cls, severity: Severity, definition: Definition) -> Message:
-        """Return the words of an event without arguments, and the event."""
-        return cls(severity, definition.message, definition.event())
+    def of(
+        cls, severity: Severity, definition: Definition, *values: float, text: str | None = None
+    ) -> Message:
+        """Return an event with its arguments, and its text; None = the words of the event."""
+        words = definition.message if text is None else text
+        return cls(severity, words, definition.event(*values))
 
 
 class Result(IntEnum):

@@ -6,7 +6,17 @@ src/modules/mavlink/streams/HEARTBEAT.hpp, checked against a running PX4 1.16.
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import WITH_STICKS, Arming, CommanderStatus, Mode
+from firmware_sim.autopilot.autopilot_state import (
+    WITH_STICKS,
+    Arming,
+    CommanderStatus,
+    Message,
+    Mode,
+    Severity,
+)
+from firmware_sim.autopilot.events.command_events import AUTO_MODE_UNSUPPORTED
+from firmware_sim.autopilot.events.enumerations import NavigationMode
+from firmware_sim.autopilot.events.flight_events import MODE_NOT_AVAILABLE
 from firmware_sim.autopilot.mode_numbers import (
     MAIN_AUTO,
     MAIN_POSCTL,
@@ -15,30 +25,39 @@ from firmware_sim.autopilot.mode_numbers import (
 )
 from firmware_sim.mavlink.codec import dialect
 
+_CRITICAL = Severity.CRITICAL
+_UNSUPPORTED = Message.of(_CRITICAL, AUTO_MODE_UNSUPPORTED)
 
-def _unavailable(name: str) -> str:
-    return f"Switching to {name} is currently not available"
+
+def _unavailable(name: str, mode: NavigationMode, main: int, sub: int) -> Message:
+    """Return PX4's refusal of a mode that it knows by name."""
+    number = sub << 24 | main << 16
+    text = f"Switching to {name} is currently not available"
+    return Message.of(_CRITICAL, MODE_NOT_AVAILABLE, number, mode, text=text)
 
 
-# What can be asked for, by main mode, in AUTO and POSCTL by sub mode. The texts: modes of a real
+# What can be asked for, by main mode, in AUTO and POSCTL by sub mode. The messages: modes of a real
 # PX4 that are known by name and never available.
-_MAIN_MODES: dict[int, Mode | str] = {
+_MAIN_MODES: dict[int, Mode | Message] = {
     main: mode
     for mode, (main, sub) in MAIN_SUB.items()
     if main not in (MAIN_AUTO, MAIN_TERMINATION) and sub == 0
 }
-_POSITION_MODES: dict[int, Mode | str] = {
+_POSITION_MODES: dict[int, Mode | Message] = {
     **{sub: mode for mode, (main, sub) in MAIN_SUB.items() if main == MAIN_POSCTL},
-    2: _unavailable("Position Slow"),
+    2: _unavailable("Position Slow", NavigationMode.POSITION_SLOW, MAIN_POSCTL, 2),
 }
-_AUTO_MODES: dict[int, Mode | str] = {
+_AUTO_MODES: dict[int, Mode | Message] = {
     **{
         sub: mode
         for mode, (main, sub) in MAIN_SUB.items()
         if main == MAIN_AUTO and mode is not Mode.DESCEND
     },
     0: Mode.MISSION,
-    **{sub: _unavailable(f"External {sub - 10}") for sub in range(11, 19)},
+    **{
+        10 + n: _unavailable(f"External {n}", NavigationMode(15 + n), MAIN_AUTO, 10 + n)
+        for n in range(1, 9)
+    },
 }
 
 
@@ -70,22 +89,22 @@ def system_status(status: CommanderStatus, *, can_arm: bool) -> int:
     return int(dialect.MAV_STATE_STANDBY if standby else dialect.MAV_STATE_UNINIT)
 
 
-def requested_mode(base: int, main: int, sub: int) -> Mode | str | None:
+def requested_mode(base: int, main: int, sub: int) -> Mode | Message | None:
     """Return what DO_SET_MODE's parameters 1..3 (MAV_MODE_FLAG bits, main, sub mode) ask for.
 
-    A text is PX4's for the operator, why the mode cannot be flown. None: PX4 accepts and changes
+    A message is PX4's for the operator, why the mode cannot be flown. None: PX4 accepts and changes
     nothing (its answer to an unknown main mode).
     """
     if not base & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return _from_base_mode(base)
     if main == MAIN_AUTO:
-        return _AUTO_MODES.get(sub, "Unsupported auto mode")
+        return _AUTO_MODES.get(sub, _UNSUPPORTED)
     if main == MAIN_POSCTL:
         return _POSITION_MODES.get(sub, Mode.POSITION)
     return _MAIN_MODES.get(main)
 
 
-def _from_base_mode(base: int) -> Mode | str | None:
+def _from_base_mode(base: int) -> Mode | Message | None:
     """PX4's reading of the bits of clients that know no custom modes."""
     if base & dialect.MAV_MODE_FLAG_AUTO_ENABLED:
         return _AUTO_MODES[4]

@@ -334,8 +334,11 @@ class MavlinkServer:
 
     def _announce(self, text: Message) -> None:
         """Tell the operators once a tick: a client that repeats itself must not flood others."""
-        if text not in self._texts and len(self._texts) < TEXTS_PER_TICK:
-            self._texts.append(text)
+        if text in self._texts or len(self._texts) >= TEXTS_PER_TICK:
+            return
+        self._texts.append(text)
+        if text.event is not None:
+            self._events.add(text.event, self._now_us)
 
     def _broadcast(self, name: str, payload: bytes) -> None:
         for client in self._all():

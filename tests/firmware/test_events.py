@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.events import Events, EventsError, LogLevel
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
@@ -324,6 +325,104 @@ def test_a_mode_that_is_not_available_is_refused_with_an_event() -> None:
     rig.close()
 
 
+def command(number: int, *given: float) -> Any:
+    return dialect.MAVLink_command_long_message(1, 1, number, 0, *given, *[0.0] * (7 - len(given)))
+
+
+def local(frame: int, mask: int) -> Any:
+    return dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, frame, mask, *[1.0] * 11)
+
+
+def globe(frame: int, mask: int) -> Any:
+    return dialect.MAVLink_set_position_target_global_int_message(
+        0, 1, 1, frame, mask, *(1, 1), *[1.0] * 9
+    )
+
+
+def target(frame: int) -> Any:
+    return dialect.MAVLink_landing_target_message(
+        0, 0, frame, *[0.0] * 8, [1.0, 0.0, 0.0, 0.0], 2, position_valid=1
+    )
+
+
+@pytest.mark.parametrize(
+    ("refused", "text", "words"),
+    [
+        (
+            command(400, 2.5),
+            "Unsupported ARM_DISARM param: 2.500",
+            "Unsupported ARM_DISARM param: 2.5",
+        ),
+        (command(2600), None, "Control high latency failed! Telemetry unavailable"),
+        (command(176, 1, 4, 99), None, "Unsupported auto mode"),
+        (
+            command(176, 1, 4, 13),
+            "Switching to External 3 is currently not available",
+            "Switching to mode 'External 3' is currently not possible",
+        ),
+        (
+            local(9, 0),
+            "SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported",
+            "SET_POSITION_TARGET_LOCAL_NED: coordinate frame 9 unsupported",
+        ),
+        (
+            local(1, 0xFFF),
+            "SET_POSITION_TARGET_LOCAL_NED invalid",
+            "SET_POSITION_TARGET_LOCAL_NED: invalid, missing position, velocity or acceleration",
+        ),
+        (
+            local(1, 0x200),
+            "SET_POSITION_TARGET_LOCAL_NED force not supported",
+            "SET_POSITION_TARGET_LOCAL_NED: FORCE is not supported",
+        ),
+        (globe(1, 0), None, "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame 1"),
+        (
+            target(8),
+            "Landing target: coordinate frame 8 unsupported",
+            "Landing target: unsupported coordinate frame 8",
+        ),
+        (
+            dialect.MAVLink_mission_set_current_message(1, 1, 7),
+            "WPM: WP CURR CMD: Not in list",
+            "New mission waypoint sequence out of bounds",
+        ),
+        (
+            dialect.MAVLink_mission_request_int_message(1, 1, 0, 0),
+            "WPM: REJ. CMD: partner id mismatch",
+            "Rejecting mission request command, component or system ID mismatch",
+        ),
+        (command(241, 0, 0, 0, 1), None, "Calibration: Disabling RC input"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_services_refuse_is_an_event(refused: Any, text: str | None, words: str) -> None:
+    """Everybody is told, in PX4's words for those who read events and for those who do not."""
+    rig = Rig()
+    rig.client.send(refused)
+    rig.bench.run(0.1)
+    heard = [*rig.client.received(), *rig.station.received()]
+    said = "".join(m.text for m in heard if m.get_type() == "STATUSTEXT")
+    assert said == 2 * f"{text or words}\t"
+    (event, same) = [m for m in heard if m.get_type() == "EVENT"]
+    assert event.id == same.id
+    assert read(Event(event.id, event.log_levels, bytes(event.arguments)))[0] == words
+
+
+def test_nobody_arms_while_a_radio_is_calibrated() -> None:
+    rig = Rig()
+    assert rig.command(241, 0, 0, 0, 1)[0] == Result.ACCEPTED
+    assert rig.command(400, 1)[0] == Result.TEMPORARILY_REJECTED
+    assert rig.command(241, *[0.0] * 7)[0] == Result.ACCEPTED
+    assert rig.command(400, 1)[0] == Result.ACCEPTED
+    rig.bench.tick()
+    told = [m.text for m in rig.station.received() if m.get_type() == "STATUSTEXT"]
+    assert told[:3] == [
+        "Calibration: Disabling RC input\t",
+        "Arming denied: calibrating\t",
+        "Calibration: Restoring RC input\t",
+    ]
+
+
 def test_a_station_has_the_checks_told_anew() -> None:
     rig = Rig()
     station = RawClient(rig.bench.gcs)
@@ -383,4 +482,9 @@ def test_mavsdk_understands_events_and_the_health_report(flight: Flown) -> None:
     assert "Mode not suitable for arming" in [
         problem.message for problem in report().current_mode_intention.problems
     ]
+    nowhere = '{"target_system": 1, "target_component": 1, "seq": 7}'
+    direct = flight.companion.plugin(MavlinkDirect)
+    direct.send_message(MavlinkMessage("MISSION_SET_CURRENT", 245, 190, 1, 1, nowhere))
+    unlisted = "New mission waypoint sequence out of bounds"
+    wait_for(lambda: unlisted in [e.message for e in heard])
     events.unsubscribe_events(handle)

@@ -23,7 +23,7 @@ def calibrate(rig: Rig, number: int = 0, value: float = 0.0) -> int:
 def texts(rig: Rig, seconds: float) -> list[str]:
     rig.bench.run(seconds)
     found = [m for m in rig.client.received() if m.get_type() == "STATUSTEXT"]
-    return [m.text for m in found]
+    return [m.text.removesuffix("\t") for m in found]
 
 
 @pytest.mark.parametrize(

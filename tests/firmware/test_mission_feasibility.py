@@ -20,6 +20,7 @@ def checked(*items: PlanItem, landed: bool = True, **parameters: float) -> tuple
         landed=landed,
         inside_fence=lambda place: place.latitude_deg < ORIGIN.latitude_deg + 0.0005,
     )
+    assert all(message.event is not None for message in verdict.messages)
     return verdict.valid, [message.text for message in verdict.messages]
 
 

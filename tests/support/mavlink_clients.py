@@ -99,7 +99,9 @@ class RawClient:
 
 def text_of(messages: list[Any]) -> list[tuple[int, str]]:
     """Return (severity, text) of each STATUSTEXT."""
-    return [(m.severity, m.text) for m in messages if m.get_type() == "STATUSTEXT"]
+    said = [m for m in messages if m.get_type() == "STATUSTEXT"]
+    # A tab ends what is an event, too: tests/firmware/test_events.py looks at it.
+    return [(m.severity, m.text.removesuffix("\t")) for m in said]
 
 
 class Rig:

@@ -110,6 +110,14 @@ class NavigationMode(IntEnum):
     AUTO_PRECLAND = 13
     ORBIT = 14
     AUTO_VTOL_TAKEOFF = 15
+    EXTERNAL1 = 16
+    EXTERNAL2 = 17
+    EXTERNAL3 = 18
+    EXTERNAL4 = 19
+    EXTERNAL5 = 20
+    EXTERNAL6 = 21
+    EXTERNAL7 = 22
+    EXTERNAL8 = 23
     UNKNOWN = 255
 
 
@@ -192,6 +200,7 @@ _WORDS: Mapping[tuple[type[IntEnum], int], str] = {
         (NavigationMode.AUTO_FOLLOW_TARGET, "Follow Target"),
         (NavigationMode.AUTO_PRECLAND, "Precision Landing"),
         (NavigationMode.AUTO_VTOL_TAKEOFF, "VTOL Takeoff"),
+        *((NavigationMode[f"EXTERNAL{n}"], f"External {n}") for n in range(1, 9)),
         (FailsafeAction.FALLBACK_POSCTRL, "Position mode"),
         (FailsafeAction.FALLBACK_ALTCTRL, "Altitude mode"),
         (FailsafeAction.FALLBACK_STABILIZED, "Stabilized mode"),

@@ -14,6 +14,7 @@ from airl_mav.core.frames import Vector, quat_yaw, wrap_pi
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, OrbitStatus, Severity
 from firmware_sim.autopilot.error_state import RATES, P, Q
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.autopilot.modes.interface import (
     NAN,
     FlightContext,
@@ -135,7 +136,7 @@ class Orbit(FlightMode):
             radius, clockwise = abs(request.radius_m), request.radius_m > 0.0
         speed = abs(self._speed) if math.isnan(request.speed_m_s) else request.speed_m_s
         if not LEAST_RADIUS_M <= radius <= self._context.value("MC_ORBIT_RAD_MAX"):
-            self._context.say(Message(Severity.CRITICAL, "Orbit radius limit exceeded"))
+            self._context.say(Message.of(Severity.CRITICAL, events.ORBIT_TOO_WIDE))
             return
         fastest = min(FASTEST_M_S, math.sqrt(MOST_M_S2 * radius))
         speed = min(fastest, max(-fastest, speed))

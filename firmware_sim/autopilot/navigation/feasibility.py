@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.geography import distance_m
 from firmware_sim.autopilot.navigation.plan import NavCommand, PlanItem
 
@@ -67,7 +69,7 @@ def check(
         return Verdict(valid=False)
     if home is None:
         text = "Not yet ready for mission, no position lock."
-        return Verdict(False, (Message(Severity.INFO, text),))
+        return Verdict(False, (Message.of(Severity.INFO, events.NO_POSITION, text=text),))
     found = _first_invalid(items, landed=landed)
     if found is None:
         found = [
@@ -77,74 +79,77 @@ def check(
         ]
     found += _fence(items, home, inside_fence)
     warnings = _first_far_away(items, home, value("MIS_DIST_1WP"))
-    return Verdict(not found, tuple(_critical(text) for text in [*warnings, *found]))
+    return Verdict(not found, (*warnings, *found))
 
 
-def _critical(text: str) -> Message:
-    return Message(Severity.CRITICAL, text)
+def _critical(definition: Definition, *values: float, text: str | None = None) -> Message:
+    return Message.of(Severity.CRITICAL, definition, *values, text=text)
 
 
-def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[str] | None:
+def _first_invalid(items: tuple[PlanItem, ...], *, landed: bool) -> list[Message] | None:
     for number, item in enumerate(items, start=1):
         if item.command not in FLYABLE:
-            return [f"Mission rejected: item {number}: unsupported cmd: {item.command}"]
+            text = f"Mission rejected: item {number}: unsupported cmd: {item.command}"
+            return [_critical(events.UNSUPPORTED_COMMAND, number, item.command, text=text)]
         if number == 1 and item.command == _N.LAND and landed:
-            return ["Mission rejected: starts with landing"]
+            return [_critical(events.STARTS_WITH_LANDING)]
     return None
 
 
-def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[str]:
+def _takeoffs(items: tuple[PlanItem, ...], home: Geodetic) -> list[Message]:
     passed = False
     for item in items:
         if item.command in _TAKEOFFS:
             if item.place(home.altitude_m).altitude_m <= home.altitude_m:
-                return ["Mission rejected: Takeoff altitude below home altitude!"]
+                text = "Mission rejected: Takeoff altitude below home altitude!"
+                least = 0.0 if item.altitude_is_relative else home.altitude_m
+                return [_critical(events.TAKEOFF_TOO_LOW, least, text=text)]
             if passed:
-                return ["Mission rejected: takeoff not first waypoint item"]
+                text = "Mission rejected: takeoff not first waypoint item"
+                return [_critical(events.TAKEOFF_NOT_FIRST, text=text)]
         passed = passed or item.command in _NEVER_FIRST
     return []
 
 
-def _vehicle_type(items: tuple[PlanItem, ...]) -> list[str]:
+def _vehicle_type(items: tuple[PlanItem, ...]) -> list[Message]:
     if any(item.command in _VTOL for item in items):
-        return ["Mission rejected: Mission contains VTOL items but vehicle is not a VTOL"]
+        return [_critical(events.VTOL_ITEMS)]
     return []
 
 
-def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> list[str]:
+def _required(items: tuple[PlanItem, ...], required: int, *, landed: bool) -> list[Message]:
     """Return what MIS_TKO_LAND_REQ asks for and the mission lacks."""
     commands = {item.command for item in items}
     takeoff, land = not commands.isdisjoint(_TAKEOFFS), _N.LAND in commands
     missing = {
-        1: None if takeoff else "Takeoff waypoint required.",
-        2: None if land else "Landing waypoint/pattern required.",
-        3: None if takeoff and land else "Takeoff or Landing item missing.",
+        1: None if takeoff else events.TAKEOFF_MISSING,
+        2: None if land else events.LAND_MISSING,
+        3: None if takeoff and land else events.TAKEOFF_OR_LAND_MISSING,
         4: _not_both(takeoff=takeoff, land=land),
         5: _not_both(takeoff=takeoff, land=land)
         if landed
-        else (None if land else "Landing waypoint/pattern required."),
+        else (None if land else events.LAND_MISSING_IN_AIR),
     }.get(required)
-    return [] if missing is None else [f"Mission rejected: {missing}"]
+    return [] if missing is None else [_critical(missing, text=f"{missing.message}.")]
 
 
-def _not_both(*, takeoff: bool, land: bool) -> str | None:
+def _not_both(*, takeoff: bool, land: bool) -> Definition | None:
     if takeoff == land:
         return None
-    if takeoff:
-        return "Add Landing item or remove Takeoff."
-    return "Add Takeoff item or remove Landing."
+    return events.ADD_LANDING if takeoff else events.ADD_TAKEOFF
 
 
 def _fence(
     items: tuple[PlanItem, ...], home: Geodetic, inside_fence: Callable[[Geodetic], bool]
-) -> list[str]:
+) -> list[Message]:
     for number, item in enumerate(items, start=1):
         if item.has_position and not inside_fence(item.place(home.altitude_m)):
-            return [f"Geofence violation for waypoint {number}"]
+            text = f"Geofence violation for waypoint {number}"
+            return [_critical(events.OUTSIDE_FENCE, number, text=text)]
     return []
 
 
-def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) -> list[str]:
+def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) -> list[Message]:
     """Return the warning that the first waypoint is far off; it has no effect on validity."""
     first = next((item for item in items if item.has_position), None)
     if first is None or most_m <= 0.0:
@@ -152,4 +157,5 @@ def _first_far_away(items: tuple[PlanItem, ...], home: Geodetic, most_m: float) 
     away = distance_m((first.x, first.y), (home.latitude_deg, home.longitude_deg))
     if not away >= most_m:
         return []
-    return [f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"]
+    text = f"First waypoint far away from home: {int(away)}m. Correct mission loaded?"
+    return [_critical(events.FIRST_FAR_AWAY, int(away), text=text)]

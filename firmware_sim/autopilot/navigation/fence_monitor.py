@@ -10,6 +10,8 @@ from collections.abc import Callable
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import FenceStatus, Message, Mode, Severity
+from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.fence import Area, all_allow, allows, areas
 from firmware_sim.autopilot.navigation.fence_prediction import point_ahead
 from firmware_sim.autopilot.navigation.flown_item import Situation
@@ -96,13 +98,12 @@ class FenceMonitor:
         for area in areas(fence.items):
             flying = not now.landed and self._value("GF_ACTION") > 0.0
             if not allows(area, now.home):
-                self._refuse("Home position")
+                self._refuse(events.FENCE_WITHOUT_HOME)
             elif flying and not allows(area, place()):
-                self._refuse("current vehicle position")
+                self._refuse(events.FENCE_WITHOUT_VEHICLE)
             else:
                 kept.append(area)
         self._areas = tuple(kept)
 
-    def _refuse(self, what: str) -> None:
-        text = f"Geofence invalid, doesn't contain {what}"
-        self._say(Message(Severity.CRITICAL, text))
+    def _refuse(self, why: Definition) -> None:
+        self._say(Message.of(Severity.CRITICAL, why))

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.command import Action, Command
@@ -120,11 +121,11 @@ def _silent(_context: Context) -> Iterator[Step]:
 
 
 def _trim(_context: Context) -> Iterator[Step]:
-    yield _info("trim cal done")
+    yield Step(0.0, Message.of(Severity.INFO, events.TRIMMED, text="trim cal done"))
 
 
 def _rc_begins(_context: Context) -> Iterator[Step]:
-    yield _info("Calibration: Disabling RC input")
+    yield Step(0.0, Message.of(Severity.INFO, events.RC_CALIBRATION))
 
 
 Routine = Callable[[Context], Iterator[Step]]
@@ -161,13 +162,18 @@ def _calibrate(command: Command, context: Context) -> Result:
     for (number, value), (sensor, routine) in ROUTINES.items():
         if asked[number] == value:
             running.start(sensor, routine(context), context.now_us)
+            running.radio = running.radio or routine is _rc_begins
             return Result.ACCEPTED
     if asked[_ESC] == 1:
         text = "[cal] calibration failed: Disconnect battery and try again"
         context.announce(Message(Severity.CRITICAL, text))
         return Result.DENIED
-    # What is no number is none of PX4's calibrations, nor a cancellation.
-    return Result.ACCEPTED if command.integer(4) == 0 else Result.UNSUPPORTED
+    if command.integer(4) != 0:
+        return Result.UNSUPPORTED  # what is no number is no cancellation either
+    if running.radio:
+        running.radio = False
+        context.announce(Message.of(Severity.INFO, events.RC_CALIBRATED))
+    return Result.ACCEPTED
 
 
 def _quick_magnetometer(command: Command, context: Context) -> Result:

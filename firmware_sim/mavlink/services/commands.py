@@ -12,6 +12,7 @@ import math
 from operator import attrgetter
 
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services import (
     calibration,
@@ -51,11 +52,15 @@ _RELATIVE_FRAMES = (
 def _arm_disarm(command: Command, context: Context) -> Result | None:
     force = command.integer(2) == FORCE_MAGIC
     if command.integer(1) == 1:
+        if context.calibration.forbids_arming:
+            context.announce(Message.of(Severity.CRITICAL, events.ARM_WHILE_CALIBRATING))
+            return Result.TEMPORARILY_REJECTED
         return context.port.arm(force=force)
     if command.integer(1) == 0:
         return context.port.disarm(force=force)
-    text = f"Unsupported ARM_DISARM param: {command.params[0]:.3f}"
-    context.announce(Message(Severity.CRITICAL, text))
+    asked = command.params[0]
+    text = f"Unsupported ARM_DISARM param: {asked:.3f}"
+    context.announce(Message.of(Severity.CRITICAL, events.ARM_PARAMETER, asked, text=text))
     return None
 
 

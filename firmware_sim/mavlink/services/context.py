@@ -33,8 +33,9 @@ class Context:
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators: to all clients of all links. It is no event: those are part of
-    the telemetry, which an answer to a client must not change."""
+    """Sends a text to the operators, to all clients of all links; and its event, if it is one.
+    Events are part of the telemetry, which is to be the same every time in lockstep: nothing that
+    clients ask by the wall clock there leads to a text."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
     events: EventBuffer

@@ -9,7 +9,12 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
-from firmware_sim.autopilot.events import check_events, flight_events
+from firmware_sim.autopilot.events import (
+    check_events,
+    command_events,
+    flight_events,
+    mission_events,
+)
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Definition, sub_id
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
@@ -21,7 +26,7 @@ _NAMESPACE = "px4"
 
 def definitions() -> Iterator[Definition]:
     """Yield every event that this vehicle can send."""
-    for module in (flight_events, check_events):
+    for module in (flight_events, mission_events, command_events, check_events):
         for value in _values(module):
             if isinstance(value, Definition):
                 yield value

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.autopilot.requests import LandingTarget
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
@@ -24,7 +25,8 @@ def handle(message: WireMessage, context: Context) -> bool:
         text = f"Landing target: coordinate frame {message.frame} unsupported"
         if text not in context.refusals:
             context.refusals.add(text)
-            context.announce(Message(Severity.CRITICAL, text))
+            event = events.LANDING_TARGET_FRAME
+            context.announce(Message.of(Severity.CRITICAL, event, message.frame, text=text))
         return False
     position = message.x, message.y, message.z
     if not all(map(math.isfinite, position)):

@@ -9,6 +9,8 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
@@ -53,8 +55,7 @@ def handle_list(message: WireMessage, context: Context) -> bool:
         and transfer.partner == partner
     )
     if transfer.activity is not _IDLE and not again:
-        text = "Mission download request ignored, already active"
-        context.announce(Message(Severity.INFO, text))
+        context.announce(Message.of(Severity.INFO, events.DOWNLOAD_IGNORED))
         return True
     transfer.activity, transfer.kind = _SENDING, message.mission_type
     transfer.index, transfer.partner = 0, partner
@@ -72,10 +73,10 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     transfer = context.transfer
     transfer.integer = message.get_type() == "MISSION_REQUEST_INT"
     if sender(message) != transfer.partner:
-        _complain(context, "WPM: REJ. CMD: partner id mismatch")
+        _complain(context, "WPM: REJ. CMD: partner id mismatch", events.REQUEST_OF_ANOTHER)
         return True
     if transfer.activity is _RECEIVING:
-        _complain(context, "WPM: REJ. CMD: Busy")
+        _complain(context, "WPM: REJ. CMD: Busy", events.REQUEST_WHILE_BUSY)
         return True
     if transfer.activity is _IDLE or transfer.kind != message.mission_type:
         return False
@@ -84,9 +85,9 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     if index == transfer.index < transfer.count:
         transfer.index += 1
     elif index != transfer.index - 1:
-        return _break_off(context, "WPM: REJ. CMD: Req. WP was unexpected")
+        return _break_off(context, events.REQUEST_UNEXPECTED)
     if index >= len(_items(context, transfer.kind)):
-        return _break_off(context, "WPM: REJ. CMD: Req. WP was unexpected")
+        return _break_off(context, events.REQUEST_BEYOND_END)
     _send_item(context, index)
     return True
 
@@ -95,7 +96,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
     """MISSION_ACK: the end of a download, or a client's word on our requests."""
     transfer = context.transfer
     if sender(message) != transfer.partner:
-        _complain(context, "REJ. WP CMD: partner id mismatch")
+        _complain(context, "REJ. WP CMD: partner id mismatch", events.ACK_OF_ANOTHER)
         return True
     if transfer.activity is _SENDING and transfer.kind == message.mission_type:
         transfer.activity = _IDLE
@@ -119,7 +120,7 @@ def handle_count(message: WireMessage, context: Context) -> bool:
     transfer, partner = context.transfer, sender(message)
     _settle(transfer)
     if transfer.activity is _SENDING:
-        _complain(context, "WPM: IGN MISSION_COUNT: Busy")
+        _complain(context, "WPM: IGN MISSION_COUNT: Busy", events.COUNT_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
     transfer.heard_us = context.now_us
@@ -127,7 +128,7 @@ def handle_count(message: WireMessage, context: Context) -> bool:
         if partner != transfer.partner:
             _acknowledge(context, partner, _ERROR)
         elif transfer.index:
-            _complain(context, "WPM: REJ. CMD: Busy")
+            _complain(context, "WPM: REJ. CMD: Busy", events.COUNT_WHILE_RECEIVING)
             _acknowledge(context, partner, _ERROR)
         else:
             _request(context)  # it seems that our request was lost
@@ -165,13 +166,13 @@ def handle_item(message: WireMessage, context: Context) -> bool:
     transfer, partner = context.transfer, sender(message)
     transfer.integer = mission_items.is_int(message)
     if partner != transfer.partner:
-        _complain(context, "REJ. MIS ITEM: partner id mismatch")
+        _complain(context, "REJ. MIS ITEM: partner id mismatch", events.ITEM_OF_ANOTHER)
         return True
     if message.mission_type != transfer.kind:
         _acknowledge(context, partner, _ERROR)
         return True
     if transfer.activity is _SENDING:
-        _complain(context, "IGN MISSION_ITEM: Busy")
+        _complain(context, "IGN MISSION_ITEM: Busy", events.ITEM_WHILE_SENDING)
         _acknowledge(context, partner, _ERROR)
         return True
     if transfer.activity is _IDLE:
@@ -179,7 +180,7 @@ def handle_item(message: WireMessage, context: Context) -> bool:
             # The last item once more: our acknowledgement was lost.
             _acknowledge(context, partner, _ACCEPTED, transfer.checksum)
         else:
-            _complain(context, "IGN MISSION_ITEM: No transfer")
+            _complain(context, "IGN MISSION_ITEM: No transfer", events.ITEM_WITHOUT_TRANSFER)
             _acknowledge(context, partner, _ERROR)
         return True
     transfer.heard_us = context.now_us
@@ -192,7 +193,7 @@ def _take_item(message: WireMessage, context: Context) -> bool:
     transfer = context.transfer
     item, kind = mission_items.parse(message), Kind(transfer.kind)
     if isinstance(item, int):
-        _complain(context, "IGN MISSION_ITEM: Invalid item")
+        _complain(context, "IGN MISSION_ITEM: Invalid item", events.ITEM_INVALID)
         _acknowledge(context, transfer.partner, item)
         _end_upload(context)
         return True
@@ -225,7 +226,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
     transfer, kind = context.transfer, message.mission_type
     _settle(transfer)
     if transfer.activity is not _IDLE:
-        _complain(context, "WPM: IGN CLEAR CMD: Busy")
+        _complain(context, "WPM: IGN CLEAR CMD: Busy", events.CLEAR_WHILE_BUSY)
         return True
     transfer.kind = kind
     for cleared in Kind:
@@ -240,9 +241,9 @@ def handle_set_current(message: WireMessage, context: Context) -> bool:
     plans = context.port.plans
     _settle(context.transfer)
     if context.transfer.activity is not _IDLE:
-        _complain(context, "WPM: IGN WP CURR CMD: Busy")
+        _complain(context, "WPM: IGN WP CURR CMD: Busy", events.CURRENT_WHILE_BUSY)
     elif message.seq >= len(plans.mission):
-        _complain(context, "WPM: WP CURR CMD: Not in list")
+        _complain(context, "WPM: WP CURR CMD: Not in list", events.CURRENT_NOT_LISTED)
     else:
         plans.set_current(message.seq)
         context.transfer.told_current = -1
@@ -273,7 +274,7 @@ def send_pending(context: Context) -> None:
 def _check_timeouts(context: Context) -> None:
     transfer, now_us = context.transfer, context.now_us
     if now_us - transfer.heard_us > TIMEOUT_US:
-        _complain(context, "Operation timeout")
+        _complain(context, "Operation timeout", events.TIMED_OUT)
         _end_upload(context)
     elif transfer.activity is _RECEIVING and now_us - transfer.sent_us > RETRY_US:
         _request(context)
@@ -337,14 +338,14 @@ def _acknowledge(context: Context, target: tuple[int, int], result: int, identit
     )
 
 
-def _complain(context: Context, text: str) -> None:
-    context.announce(Message(Severity.CRITICAL, text))
+def _complain(context: Context, text: str, event: Definition) -> None:
+    context.announce(Message.of(Severity.CRITICAL, event, text=text))
 
 
-def _break_off(context: Context, text: str) -> bool:
+def _break_off(context: Context, why: Definition) -> bool:
     context.transfer.activity = _IDLE
     _acknowledge(context, context.transfer.partner, _ERROR)
-    _complain(context, text)
+    _complain(context, "WPM: REJ. CMD: Req. WP was unexpected", why)
     return True
 
 

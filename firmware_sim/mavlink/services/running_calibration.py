@@ -22,9 +22,16 @@ class RunningCalibration:
 
     def __init__(self) -> None:
         self.sensor = ""
+        self.radio = False
+        """Whether a ground station calibrates a radio: it ends that with a cancellation."""
         self._steps: Iterator[Step] = iter(())
         self._next: Step | None = None
         self._due_us = 0
+
+    @property
+    def forbids_arming(self) -> bool:
+        """Whether PX4 refuses to arm meanwhile."""
+        return self.active or self.radio
 
     @property
     def active(self) -> bool:

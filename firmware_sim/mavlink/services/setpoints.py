@@ -15,9 +15,11 @@ from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import Geodetic, geodetic_to_local, heading_to_ned, quat_yaw
 from airl_mav.vehicle.rotation import rotate
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 
+_CRITICAL = Severity.CRITICAL
 _POSITION_SHIFT, _VELOCITY_SHIFT, _ACCELERATION_SHIFT = 0, 3, 6
 """First bit of each vector's three ignore bits (POSITION_TARGET_TYPEMASK)."""
 
@@ -49,9 +51,11 @@ def handle_local(message: WireMessage, context: Context) -> bool:
             forward, right, down = acceleration.tolist()
             acceleration = np.array(rotate((w, x, y, z), (forward, right, down)))
     else:
-        return _reject(context, f"{message.get_type()} coordinate frame {frame} unsupported")
+        text = f"{message.get_type()} coordinate frame {frame} unsupported"
+        return _reject(context, Message.of(_CRITICAL, events.LOCAL_FRAME, frame, text=text))
     if not _commands_something(position, velocity, acceleration):
-        return _reject(context, f"{message.get_type()} invalid")
+        text = f"{message.get_type()} invalid"
+        return _reject(context, Message.of(_CRITICAL, events.LOCAL_INVALID, text=text))
     return _offer(message, position, velocity, acceleration, context)
 
 
@@ -65,7 +69,7 @@ def handle_global(message: WireMessage, context: Context) -> bool:
         frame = message.coordinate_frame
         if frame not in _FRAMES_ABOVE:
             text = f"{message.get_type()} invalid coordinate frame {frame}"
-            return _reject(context, text)
+            return _reject(context, Message.of(_CRITICAL, events.GLOBAL_FRAME, frame, text=text))
         position = _from_globe(message, _FRAMES_ABOVE[frame], context)
     if position is None or not _commands_something(position, velocity, acceleration):
         return False  # PX4 says nothing
@@ -111,7 +115,9 @@ def _offer(
     mask: int = message.type_mask
     forced = mask & dialect.POSITION_TARGET_TYPEMASK_FORCE_SET
     if forced and np.isfinite(acceleration).any():
-        return _reject(context, f"{message.get_type()} force not supported")
+        event = events.LOCAL_FORCE if _is_local(message) else events.GLOBAL_FORCE
+        text = f"{message.get_type()} force not supported"
+        return _reject(context, Message.of(_CRITICAL, event, text=text))
     yaw = math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_IGNORE else message.yaw
     yaw_rate = (
         math.nan if mask & dialect.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE else message.yaw_rate
@@ -180,9 +186,13 @@ def _or_zero(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-def _reject(context: Context, text: str) -> bool:
-    context.port.refuse_setpoint(text, context.now_us)
-    if text not in context.refusals:
-        context.refusals.add(text)
-        context.announce(Message(Severity.CRITICAL, text))
+def _is_local(message: WireMessage) -> bool:
+    return bool(message.get_msgId() == dialect.MAVLINK_MSG_ID_SET_POSITION_TARGET_LOCAL_NED)
+
+
+def _reject(context: Context, why: Message) -> bool:
+    context.port.refuse_setpoint(why.text, context.now_us)
+    if why.text not in context.refusals:
+        context.refusals.add(why.text)
+        context.announce(why)
     return False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
+from firmware_sim.autopilot.autopilot_state import Message, Result
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.services.command import Action, Command
@@ -15,8 +15,8 @@ _CUSTOM: int = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 def change_mode(base: int, main: int, sub: int, context: Context) -> Result:
     """Change the mode as DO_SET_MODE asks: MAV_MODE_FLAG bits, main and sub mode."""
     request = requested_mode(base, main, sub)
-    if isinstance(request, str):
-        context.announce(Message(Severity.CRITICAL, request))
+    if isinstance(request, Message):
+        context.announce(request)
         return Result.TEMPORARILY_REJECTED
     return Result.ACCEPTED if request is None else context.port.set_mode(request)
 

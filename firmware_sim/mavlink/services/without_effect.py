@@ -7,6 +7,7 @@ of the vehicle that is not there, and so nobody acknowledges them.
 from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
+from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import Context
@@ -65,8 +66,7 @@ def _reject_for_now(_command: Command, _context: Context) -> Result:
 
 
 def _high_latency(_command: Command, context: Context) -> Result:
-    text = "Control high latency failed! Telemetry unavailable"
-    context.announce(Message(Severity.CRITICAL, text))
+    context.announce(Message.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
     return Result.FAILED
 
 

@@ -1,0 +1,78 @@
+"""Events of commands and setpoints that are refused, and of calibrations.
+
+Names, words, arguments and levels: PX4 1.16, commander/Commander.cpp, commander/rc_calibration.cpp,
+mavlink/mavlink_receiver.cpp, flight_mode_manager/tasks/Orbit.
+"""
+
+from __future__ import annotations
+
+from firmware_sim.autopilot.events.definition import Definition, Level, arguments
+
+# --- commands
+
+ARM_PARAMETER = Definition(
+    "commander_unsupported_arm_disarm_param",
+    "Unsupported ARM_DISARM param: {1:.3}",
+    arguments("float param1"),
+    Level.ERROR,
+)
+ARM_WHILE_CALIBRATING = Definition(
+    "commander_arm_denied_calibrating",
+    "Arming denied: calibrating",
+    level=Level.CRITICAL,
+    internal=Level.INFO,
+)
+AUTO_MODE_UNSUPPORTED = Definition(
+    "commander_unsupported_auto_mode", "Unsupported auto mode", level=Level.ERROR
+)
+NO_HIGH_LATENCY = Definition(
+    "commander_ctrl_high_latency_failed",
+    "Control high latency failed! Telemetry unavailable",
+    level=Level.CRITICAL,
+    internal=Level.INFO,
+)
+ORBIT_TOO_WIDE = Definition(
+    "orbit_radius_exceeded", "Orbit radius limit exceeded", level=Level.ALERT
+)
+
+# --- setpoints and targets
+
+LOCAL_FRAME = Definition(
+    "mavlink_rcv_sp_target_unsup_coord",
+    "SET_POSITION_TARGET_LOCAL_NED: coordinate frame {1} unsupported",
+    arguments("uint8_t coordinate_frame"),
+    Level.ERROR,
+)
+LOCAL_FORCE = Definition(
+    "mavlink_rcv_sp_target_unsup_force",
+    "SET_POSITION_TARGET_LOCAL_NED: FORCE is not supported",
+    level=Level.ERROR,
+)
+LOCAL_INVALID = Definition(
+    "mavlink_rcv_sp_target_invalid",
+    "SET_POSITION_TARGET_LOCAL_NED: invalid, missing position, velocity or acceleration",
+    level=Level.ERROR,
+)
+GLOBAL_FRAME = Definition(
+    "mavlink_rcv_sp_target_gl_invalid_coord",
+    "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {1}",
+    arguments("uint8_t coordinate_frame"),
+    Level.ERROR,
+)
+GLOBAL_FORCE = Definition(
+    "mavlink_rcv_sp_target_gl_unsup_force",
+    "SET_POSITION_TARGET_GLOBAL_INT: FORCE is not supported",
+    level=Level.ERROR,
+)
+LANDING_TARGET_FRAME = Definition(
+    "mavlink_rcv_lnd_target_unsup_coord",
+    "Landing target: unsupported coordinate frame {1}",
+    arguments("uint8_t frame"),
+    Level.ERROR,
+)
+
+# --- calibrations
+
+RC_CALIBRATION = Definition("commander_calib_rc_off", "Calibration: Disabling RC input")
+RC_CALIBRATED = Definition("commander_calib_rc_on", "Calibration: Restoring RC input")
+TRIMMED = Definition("commander_cal_trim_done", "RC trim calibration completed")
