@@ -34,6 +34,15 @@ class VehicleStatus(NamedTuple):
     """What it flies, in words."""
 
 
+class BatteryState(NamedTuple):
+    """The battery, as the flight controller tells it; None: it does not."""
+
+    voltage_v: float | None
+    current_a: float | None
+    remaining: float | None
+    """1 to 0."""
+
+
 class BodyVelocity(NamedTuple):
     """A velocity setpoint in the heading frame, with a yaw rate, in the order on the wire."""
 

@@ -24,7 +24,7 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import PX4, Dialect, dialect_of
-from companion.interfaces import STOP, BodyVelocity, LinkError, VehicleStatus
+from companion.interfaces import STOP, BatteryState, BodyVelocity, LinkError, VehicleStatus
 from companion.mavsdk_connection import first_autopilot, open_connection
 
 POLL_S = 0.1
@@ -203,7 +203,7 @@ class MavsdkLink:
             What sends a text of at most 50 characters, behind all that was sent before.
         """
         self._texts = texts = ServerUtility(self._system)
-        self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
+        self.hear_texts(heard)
 
         def send(text: str) -> None:
             texts.send_status_text(StatusTextType.DEBUG, text)
@@ -260,6 +260,24 @@ class MavsdkLink:
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
         return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words)
+
+    def battery(self) -> BatteryState:
+        """Return the newest state of the battery."""
+        told = self._telemetry.battery()
+        percent = _known(told.remaining_percent)
+        return BatteryState(
+            # No battery that flies has 0 V: nothing was heard of it yet.
+            _known(told.voltage_v) or None,
+            _known(told.current_battery_a),
+            None if percent is None else percent / 100.0,
+        )
+
+    def hear_texts(self, heard: Callable[[str], None]) -> None:
+        """Have a function called with the texts of the flight controller, after `connect`.
+
+        It is called from a thread of MAVSDK's, and must return at once.
+        """
+        self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
 
     def arm(self, timeout_s: float, stop: threading.Event) -> None:
         """Wait until the flight controller reports good health, then arm.
@@ -383,6 +401,11 @@ class MavsdkLink:
 
     def _pause(self, seconds: float = POLL_S) -> None:
         self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))
+
+
+def _known(value: float) -> float | None:
+    """Return what MAVSDK tells, or None for its NaN."""
+    return float(value) if math.isfinite(value) else None
 
 
 def _reason(error: Exception) -> str:

@@ -22,7 +22,7 @@ from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
-from companion.pilot import FRAME_WAIT_S, WAITING, Pilot
+from companion.pilot import FRAME_WAIT_S, WAITING, Decided, Pilot
 from companion.watchdog import Watchdog
 
 PREPARE_TIMEOUT_S = 10.0
@@ -65,6 +65,7 @@ def fly_mission(
     compensator: Compensator | None = None,
     mount_pitch_up_rad: float = 0.0,
     start: Start = "arm",
+    decided: Callable[[Decided], None] | None = None,
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
 
@@ -87,6 +88,7 @@ def fly_mission(
         mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
         start: Whether this program arms, takes off and lands, or a pilot who hands the vehicle over
             in flight and gets it back in Hold.
+        decided: Told every decision when it is sent; it must return at once.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
@@ -96,6 +98,7 @@ def fly_mission(
         latency=latency,
         compensator=compensator,
         limits=limits,
+        decided=decided,
     )
     try:
         _begin(link, start, pilot_settings.altitude_m, stop, progress)

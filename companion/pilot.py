@@ -8,8 +8,10 @@ that is compensated, the policy sees what will be when its action is sent.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Event
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from numpy.typing import NDArray
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
-from airl_mav.latency.stamps import DecisionLog
+from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
 from airl_mav.policy.layouts import MOST_FRAMES
 from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
@@ -42,6 +44,22 @@ WAITING = "waiting for a frame"
 """What the pilot tells the watchdog that it is at."""
 
 
+class Decided(NamedTuple):
+    """A decision, as soon as its command is sent; times in simulated µs."""
+
+    seen: ReceivedFrame
+    state: Kinematics
+    """What telemetry said when it began."""
+    setpoint: BodyVelocity
+    started_us: int
+    ready_us: int
+    sent_us: int
+    held_until_us: int
+    """When its hold is to end."""
+    held_before_us: int
+    """When that of the decision before ended; `NO_STAMP` for the first."""
+
+
 @dataclass
 class Pilot:
     """Flies a policy to a goal."""
@@ -59,6 +77,8 @@ class Pilot:
     """Carries forward what is seen, of one companion; None = as it is."""
     limits: Limits | None = None
     """What is believed, and how far is flown; None = everything, and anywhere."""
+    decided: Callable[[Decided], None] | None = None
+    """Told every decision when it is sent; it must return at once."""
     memory: DecisionMemory = field(init=False)
     """The setpoints and latencies so far."""
     earlier_mm: deque[NDArray[np.uint16]] = field(
@@ -66,6 +86,8 @@ class Pilot:
     )
     """What the decisions before saw, the newest first."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
+    held_us: int = field(default=NO_STAMP, init=False)
+    """When the last hold ended."""
 
     def __post_init__(self) -> None:
         """Keep account of the decisions: the compensator's, where there is one."""
@@ -145,6 +167,10 @@ class Pilot:
             return ending.reason
         if not self.watchdog.command(setpoint, hold_us):
             return "watchdog"
+        if self.decided is not None:
+            held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
+            times = started_us, ready_us, sent_us, held_us, self.held_us
+            self.decided(Decided(seen, state, setpoint, *times))
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)
@@ -160,13 +186,14 @@ class Pilot:
         if settings.decisions == "sequential":
             self.watchdog.doing("holding an action")
             clock.sleep_until(sent_us + hold_us, stop)
+        self.held_us = clock.time_us()
         self.log.record(
             seen.frame.capture_time_us,
             seen.received_us,
             started_us,
             ready_us,
             sent_us,
-            clock.time_us(),
+            self.held_us,
             setpoint,
         )
         return None

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
-from contextlib import closing
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.provenance import describe_machine
+from airl_mav.flight.setup import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
+from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
+    between_commands,
     check_quota,
     decide_piloting,
     load_asked_policy,
@@ -29,6 +34,9 @@ from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.signing_proxy import signed
+
+if TYPE_CHECKING:
+    from companion.black_box import BlackBoxRecorder
 
 FLIGHT_S = 600.0
 """Longest navigation where nothing else is asked for [s]."""
@@ -50,6 +58,8 @@ class Mission:
     """Carries forward what is seen; None: the policy sees what is."""
     vehicle: VehicleProfile
     """The aircraft: what its camera is, and how it is mounted."""
+    setup: Setup
+    """What flies on what, in words."""
 
     @property
     def mount_pitch_up_rad(self) -> float:
@@ -77,6 +87,22 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     limits = asked.limits
     if limits.flight_s is None:
         limits = limits.model_copy(update={"flight_s": FLIGHT_S})
+    computer = Part(asked.computer, load_computer(asked.computer).description)
+    if injection.latency is None:
+        computer = Part("this computer", f"{describe_machine()['cpu']}")
+    setup = Setup(
+        level="flight",
+        vehicle=Part(asked.vehicle, vehicle.description),
+        arena=Part("an unknown place"),
+        policy=Part(policy.name, policy.description),
+        computer=computer,
+        # Whatever it draws is in the current that the flight controller measures.
+        computer_watts=0.0,
+        injection=injection,
+        speed=asked.speed,
+        between_commands=between_commands(pilot, watchdog.hover_after_s),
+        firmware="not known",
+    )
     return Mission(
         asked.goal,
         loaded,
@@ -86,6 +112,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         sampler,
         compensator,
         vehicle,
+        setup,
     )
 
 
@@ -93,6 +120,30 @@ def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -
     """Open the camera that is asked for. Raises FieldError when it cannot be used."""
     wanted = Intrinsics.of(mission.vehicle.camera)
     return open_named_camera(asked.camera, clock, wanted, f"vehicle {asked.vehicle}")
+
+
+@contextmanager
+def recorded(
+    asked: StandAloneCompanion, mission: Mission, link: MavsdkLink, clock: Clock
+) -> Iterator[BlackBoxRecorder | None]:
+    """Record a mission, where that is asked for. Raises FieldError when no file can be written."""
+    if asked.black_box is None:
+        yield None
+        return
+    # Imported here: MCAP is an extra.
+    from companion.black_box import open_recorder, recording
+
+    run = run_of(asked, mission)
+    with recording(open_recorder(asked.black_box, run, link, clock, mission.goal)) as recorder:
+        link.hear_texts(recorder.heard)
+        yield recorder
+
+
+def run_of(asked: StandAloneCompanion, mission: Mission) -> dict[str, Any]:
+    """Return what flies, as `run.json` has it."""
+    config = asked.model_dump(mode="json")
+    config |= {"pilot": asdict(mission.pilot), "limits": mission.limits.model_dump(mode="json")}
+    return {"setup": asdict(mission.setup), "config": config}
 
 
 def fly_alone(
@@ -121,6 +172,8 @@ def fly_alone(
 
     def begin(phase: str) -> None:
         progress(phase, clock.time_us())
+        if box is not None:
+            box.phase(phase)
         if phase != "done":
             link.tell(f"airl: {phase}")
 
@@ -133,25 +186,24 @@ def fly_alone(
         waiting()
         link.connect(asked.connect_timeout, stop)
         check_camera(mission.policy, frames, stop, mission.compensator)
-        result = fly_mission(
-            link,
-            frames,
-            mission.policy,
-            mission.goal,
-            clock,
-            stop,
-            abandon,
-            begin,
-            pilot_settings=mission.pilot,
-            watchdog_settings=mission.watchdog,
-            limit_settings=mission.limits,
-            guard=ThreadGuard(clock),
-            latency=mission.latency,
-            compensator=mission.compensator,
-            mount_pitch_up_rad=mission.mount_pitch_up_rad,
-            start=asked.start,
-        )
-        link.tell(f"airl: {result.reason}")
-        if frames.failure is not None:
-            return replace(result, notes=(*result.notes, frames.failure))
-        return result
+        with recorded(asked, mission, link, clock) as box:
+            result = fly_mission(
+                *(link, frames, mission.policy, mission.goal, clock, stop, abandon, begin),
+                pilot_settings=mission.pilot,
+                watchdog_settings=mission.watchdog,
+                limit_settings=mission.limits,
+                guard=ThreadGuard(clock),
+                latency=mission.latency,
+                compensator=mission.compensator,
+                mount_pitch_up_rad=mission.mount_pitch_up_rad,
+                start=asked.start,
+                decided=None if box is None else box.decided,
+            )
+            link.tell(f"airl: {result.reason}")
+            if frames.failure is not None:
+                result = replace(result, notes=(*result.notes, frames.failure))
+            if box is not None:
+                box.end(result.reason, result.notes)
+                if box.failure is not None:
+                    result = replace(result, notes=(*result.notes, box.failure))
+            return result

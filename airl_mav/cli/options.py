@@ -343,6 +343,7 @@ def _fail(message: str) -> None:
 
 
 EXTRAS = {
+    "black-box": ("mcap",),
     "profile": ("onnx",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),

@@ -8,7 +8,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL
+from airl_mav.black_box.messages import SUFFIX
+from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
@@ -29,11 +30,13 @@ class ReportOptions(ProfileModel):
     Examples:
         airl report runs/20261122T101530Z-sitl-static-obstacles
         airl report runs/A runs/B --names before after --out runs/before-after
+        airl report flights/20261123T101530.123456Z.mcap
     """
 
     runs: Annotated[tuple[Path, ...], POSITIONAL] = Field(
         default=(),
-        description="run folders, or the folder of a gap, a ladder, a curve or a table",
+        description="run folders, black boxes of flights (.mcap), or the folder of a gap, a ladder,"
+        " a curve or a table",
     )
     names: tuple[str, ...] = Field(
         default=(),
@@ -63,6 +66,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     console = console or Console()
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")
+    options = options.model_copy(update={"runs": tuple(map(_folder_of, options.runs))})
     first = options.runs[0]
     if options.trust:
         for folder in options.runs:
@@ -79,6 +83,17 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     else:
         show_comparison(*rebuild_comparison(first), first, console)
     return 0
+
+
+def _folder_of(path: Path) -> Path:
+    """Return the folder of a run; a black box becomes one."""
+    if path.suffix != SUFFIX or path.is_dir():
+        return path
+    check_installed("black-box")
+    # Imported here: MCAP is an extra.
+    from airl_mav.report.recorded_flight import take_in
+
+    return take_in(path)
 
 
 def _compare(options: ReportOptions, console: Console) -> int:

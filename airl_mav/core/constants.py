@@ -52,5 +52,5 @@ DEG: Final = math.pi / 180.0
 
 MAX_ATTEMPTS: Final = 3
 """A job or a flight whose processes are lost is begun so many times, the first included."""
-Level = Literal["gym", "lockstep", "sitl", "hil", "firmware"]
+Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
 """What flew, as a report calls it: a rung of the fidelity ladder."""

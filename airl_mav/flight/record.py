@@ -17,6 +17,9 @@ from airl_mav.flight.quality import Quality
 SCHEMA = 1
 """Version of the line's schema; docs/run-folder.md describes it."""
 
+NO_ARENA = ""
+"""The arena of a flight outside of all arenas."""
+
 
 @dataclass(frozen=True)
 class FaultActed:
@@ -39,6 +42,7 @@ class EpisodeRecord:
     seed: int
     """Seed of the episode: sensors, wind, latencies."""
     arena: str
+    """`NO_ARENA`: what stood where it flew is not known."""
     arena_seed: int
     outcome: Outcome
     reason: str

@@ -29,6 +29,7 @@ from airl_mav.core.files import (
     read_lines,
     read_typed,
     replace_file,
+    typed,
     write_json,
 )
 from airl_mav.core.log_file import PARTIAL_SUFFIX
@@ -169,6 +170,20 @@ class RunFolder:
         return cls(path)
 
     @classmethod
+    def adopt(cls, path: Path, info: RunInfo) -> RunFolder:
+        """Make the folder of a run that was flown elsewhere.
+
+        Raises:
+            UsageError: It cannot be made.
+        """
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{path}: {error.strerror}") from None
+        _write_info(path / RUN_FILE, info)
+        return cls(path)
+
+    @classmethod
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
         """Open a run that was killed, cut off a half-written line, and say what is there."""
         run = load(path)
@@ -302,6 +317,11 @@ def another_config(
 def load_info(path: Path) -> RunInfo:
     """Read `run.json` alone. Raises UsageError."""
     return read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+
+
+def run_info(data: Mapping[str, Any], source: object) -> RunInfo:
+    """Return what an object says, as `run.json` holds it. Raises UsageError, with the source."""
+    return typed(_INFO, data, source)
 
 
 def load(path: Path) -> LoadedRun:

@@ -9,7 +9,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.arena.tours import set_out_later
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -44,17 +44,19 @@ def check_trust(arena: str, spec: ArenaSpec) -> None:
 
 def trust_arenas(run: LoadedRun) -> None:
     """Load the generators that a run's arenas name. Raises UsageError."""
-    for arena in {record.arena for record in run.episodes}:
+    for arena in {record.arena for record in run.episodes} - {NO_ARENA}:
         spec = load_profile("arenas", arena, ArenaSpec)
         if spec.generator != OBSTACLES:
             load_part(GENERATORS, spec.generator)
 
 
 def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:
-    """Make the arenas of some flights, by episode index. Raises UsageError."""
+    """Make the arenas of those flights that have one, by episode index. Raises UsageError."""
     specs: dict[str, ArenaSpec] = {}
     arenas: dict[int, Arena] = {}
     for record in records:
+        if record.arena == NO_ARENA:
+            continue
         if record.arena not in specs:
             spec = specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
             check_trust(record.arena, spec)
@@ -73,6 +75,6 @@ def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict
 def arena_of(run: LoadedRun, episode: EpisodeRecord) -> Arena | None:
     """Make the arena of one flight; None where a profile cannot be found any more."""
     try:
-        return arenas_of([episode], vehicle_of(run.info))[episode.index]
+        return arenas_of([episode], vehicle_of(run.info)).get(episode.index)
     except UsageError:
         return None

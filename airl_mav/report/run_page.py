@@ -121,7 +121,7 @@ def build_page(
         environment()
         .get_template("report.html.j2")
         .render(
-            kind="Evaluation" if summary.modelled or "command" in run.info.config else "Rehearsal",
+            kind=_kind(run, summary),
             run=run.info,
             folder=run.path.name,
             badges=[
@@ -164,6 +164,12 @@ def build_page(
     path = folder / REPORT_FILE
     replace_file(path, page.encode())
     return path
+
+
+def _kind(run: LoadedRun, summary: RunSummary) -> str:
+    if run.info.setup.level == "flight":
+        return "Flight"
+    return "Evaluation" if summary.modelled or "command" in run.info.config else "Rehearsal"
 
 
 def pictured(run: LoadedRun) -> list[EpisodeRecord]:

@@ -204,7 +204,10 @@ def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[s
 
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
-    """Return how the run kept pace with the wall clock."""
+    """Return how the run kept pace with the wall clock, and what the companion took.
+
+    A recorded flight kept pace by itself.
+    """
     columns = (Column("measure", number=False), Column("value"), Column("n"))
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
@@ -212,13 +215,16 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
     unmatched = sum(int(np.count_nonzero(stamps == NO_STAMP)) for stamps in accepted)
     flights = f"{len(run.episodes)}"
     slipped_us = sum(episode.slipped_us for episode in run.episodes)
+    uses = [e.companion_use for e in run.episodes if e.companion_use]
+    if run.info.setup.level == "flight":
+        return TableView("real-time", "Companion", columns, tuple(_use_rows(uses)))
     rows = [
         *_tail_rows("tick lateness", summarize(np.concatenate([nothing, *lateness]))),
         ("real-time factor", _real_time_factor(run), flights),
         ("simulated time given up", f"{ms(slipped_us)} ms", flights),
         *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
         ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
-        *_use_rows([e.companion_use for e in run.episodes if e.companion_use]),
+        *_use_rows(uses),
     ]
     return TableView("real-time", "Real time", columns, tuple(rows))
 

@@ -134,3 +134,13 @@ def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed:
 def action_generator(seed: int) -> np.random.Generator:
     """Return the source of a policy's random actions in the flight of a seed."""
     return np.random.default_rng((seed, ACTION_STREAM))
+
+
+def between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
+    """Return what happens from one command to the next, in words."""
+    words = ["persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms"]
+    if pilot.decisions != PilotSettings.decisions:
+        words.append(f"{pilot.decisions} decisions")
+    if pilot.compensate:
+        words.append("latency compensated")
+    return ", ".join(words)

@@ -30,7 +30,12 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName
 from airl_mav.scenario.file import anchored
 from airl_mav.scenario.model import PilotSettings, Scenario, WatchdogSettings
-from airl_mav.scenario.piloting import NATIVE_T2_US, action_generator, load_asked_policy
+from airl_mav.scenario.piloting import (
+    NATIVE_T2_US,
+    action_generator,
+    between_commands,
+    load_asked_policy,
+)
 
 BEFORE_CLIMB_S = 9.2
 """What a take-off of the built-in autopilot takes besides its climb [s]: booting, arming, spinning
@@ -189,7 +194,7 @@ class ResolvedScenario:
             computer_on_ground=self.computer.ground_equipment,
             injection=self.injection,
             speed=self.speed,
-            between_commands=_between_commands(self.pilot, hover_s),
+            between_commands=between_commands(self.pilot, hover_s),
             conditions=", ".join([*_conditions(scenario), *self._plant(), *self._zone()]),
         )
 
@@ -256,16 +261,6 @@ class ResolvedScenario:
     def __getstate__(self) -> dict[str, Any]:
         """Leave the loaded network behind: each process opens its own."""
         return {key: value for key, value in self.__dict__.items() if key != "_loaded_policy"}
-
-
-def _between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
-    """Return what happens from one command to the next, in words."""
-    words = ["persist" if hover_s is None else f"hover-after {1e3 * hover_s:g} ms"]
-    if pilot.decisions != PilotSettings.decisions:
-        words.append(f"{pilot.decisions} decisions")
-    if pilot.compensate:
-        words.append("latency compensated")
-    return ", ".join(words)
 
 
 def _conditions(scenario: Aircraft) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -215,6 +216,19 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     log: Path | None = Field(
         default=None, description="write the stamps of every decision to this .npz file"
     )
+    black_box: Path | None = Field(
+        default=None,
+        description="record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
+        " telemetry, images, status and resources; it survives a crash up to its last second, and"
+        " airl report shows it",
+    )
+    black_box_images_hz: float = quantity(
+        "most images that the black box keeps, each one that a decision saw",
+        "Hz",
+        ge=0,
+        le=1000,
+        default=10.0,
+    )
 
 
 def check_vehicle(asked: StandAloneVehicle) -> None:
@@ -267,6 +281,11 @@ def check_companion(asked: StandAloneCompanion) -> None:
     if asked.lockstep and "://" not in asked.camera:
         accepted = "in lockstep the address of the simulator's camera: tcp://HOST:PORT, ipc://PATH"
         raise FieldError("camera", asked.camera, accepted)
+    if asked.lockstep and asked.black_box is not None:
+        raise FieldError("black_box", f"{asked.black_box}", "without lockstep, which paces nothing")
+    if asked.black_box is not None and find_spec("mcap") is None:
+        accepted = "with MCAP installed: pip install 'airl-mav[black-box]'"
+        raise FieldError("black_box", f"{asked.black_box}", accepted)
     if asked.lockstep and asked.check:
         raise FieldError("check", asked.check, "without lockstep")
     if asked.lockstep and asked.start != "arm":

@@ -18,6 +18,7 @@ from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.scenario.stand_alone import Start
 from companion.mission import MissionResult, fly_mission
+from companion.pilot import Decided
 
 SEED = 11
 """A short flight: two seconds to the goal."""
@@ -46,10 +47,11 @@ def fly_as_companion(
     stop: threading.Event | None = None,
     phase: Callable[[str], None] = lambda _: None,
     start: Start = "arm",
+    decided: Callable[[Decided], None] | None = None,
 ) -> MissionResult:
     """Fly a mission on a stage with default settings; it is what `Stage.run` calls.
 
-    `stop` ends it early, `phase` is told its phases; by default nobody does and nobody is.
+    `stop` ends it early; `phase` is told its phases, and `decided` its decisions.
     """
     return fly_mission(
         *(stage.link, stage.camera, policy, goal, stage.clock),
@@ -60,6 +62,7 @@ def fly_as_companion(
         guard=stage.clock,
         latency=FixedSampler(NATIVE_T2_US),
         start=start,
+        decided=decided,
     )
 
 

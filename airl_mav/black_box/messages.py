@@ -1,0 +1,206 @@
+"""What a black box holds: its topics, and the message of each.
+
+Messages are JSON with a JSON Schema, made of the classes here, so that any reader of MCAP
+(Foxglove, `mcap cat`, pandas) shows them. Images and texts have the schemas of Foxglove's that
+its panels know (https://docs.foxglove.dev/docs/visualization/message-schemas/introduction).
+
+Times `*_us` are those of the companion's clock, from its start [µs]; world frames are NED with the
+start of the flight as origin, bodies FRD.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.clock import NS_PER_US
+from airl_mav.core.constants import US_PER_S
+
+SUFFIX = ".mcap"
+"""Of the files."""
+
+Number: TypeAlias = float | None
+"""None: not a number, or infinite, which JSON cannot say."""
+
+Vector3: TypeAlias = tuple[Number, Number, Number]
+Vector4: TypeAlias = tuple[Number, Number, Number, Number]
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A decision, as soon as its command is sent."""
+
+    capture_us: int
+    """Exposure of the frame that it saw; -1: stamped by another clock than the companion's."""
+    decoded_us: int
+    infer_start_us: int
+    action_ready_us: int
+    sent_us: int
+    held_until_us: int
+    """Until when the action is to be held; `held_before_us` of the next says when it ended."""
+    held_before_us: int
+    """When the hold of the decision before had ended; -1: this is the first."""
+    position: Vector3
+    """Of the vehicle, as the decision saw it [m]."""
+    velocity: Vector3
+    """[m/s]."""
+    quaternion: Vector4
+    """w, x, y, z, body to world."""
+    goal_away_m: Number
+    """Distance to the goal, seen from above [m]."""
+    setpoint: Vector4
+    """Forward, right, down [m/s] and yaw rate [rad/s], in the heading frame."""
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What the flight controller says of the vehicle."""
+
+    time_us: int
+    position: Vector3
+    """[m]."""
+    velocity: Vector3
+    """[m/s]."""
+    quaternion: Vector4
+    """w, x, y, z, body to world."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Who flies, and the battery."""
+
+    time_us: int
+    armed: bool
+    offboard: bool
+    mode: str
+    voltage_v: float | None
+    """None of this and the following: the flight controller does not tell."""
+    current_a: float | None
+    battery_remaining: float | None
+    """1 to 0."""
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What the companion takes of its computer, and how warm that is."""
+
+    time_us: int
+    process_cores: float
+    """Cores that the companion kept busy since the message before."""
+    machine_percent: float
+    """Share of all cores that everything kept busy since then."""
+    memory_bytes: int
+    """Resident set of the companion."""
+    temperature_c: float | None
+    """Of the warmest sensor; None: the machine has none."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A phase of the mission begins."""
+
+    time_us: int
+    phase: str
+
+
+@dataclass(frozen=True)
+class End:
+    """The mission has ended."""
+
+    time_us: int
+    reason: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Time:
+    """Calendar time, as Foxglove's schemas have it."""
+
+    sec: int
+    nsec: int
+
+
+@dataclass(frozen=True)
+class RawImage:
+    """foxglove.RawImage: a depth image that a decision saw, before any compensation."""
+
+    timestamp: Time
+    frame_id: str
+    width: int
+    height: int
+    encoding: str
+    """`mono16`: depth in millimetres, 0 = no return."""
+    step: int
+    """Bytes of a row."""
+    data: str
+    """Base64 of the rows, little endian."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """foxglove.Log: a text."""
+
+    timestamp: Time
+    level: int
+    message: str
+    name: str
+    """Who says it."""
+    file: str = ""
+    line: int = 0
+
+
+Message: TypeAlias = Decision | Telemetry | Status | Resources | Phase | End | RawImage | Log
+
+TOPICS: dict[type[Message], str] = {
+    Decision: "/decision",
+    Telemetry: "/telemetry",
+    Status: "/status",
+    Resources: "/resources",
+    Phase: "/phase",
+    End: "/end",
+    RawImage: "/depth",
+    Log: "/log",
+}
+
+SCHEMAS: dict[type[Message], str] = {
+    **{kind: f"airl.{kind.__name__}" for kind in TOPICS},
+    RawImage: "foxglove.RawImage",
+    Log: "foxglove.Log",
+}
+"""Names of the schemas."""
+
+INFO, WARNING = 2, 3
+"""Levels of foxglove.Log."""
+
+
+def depth_image(depth_mm: NDArray[np.uint16], unix_us: int) -> RawImage:
+    """Return the message of a depth image (height, width) [mm], taken at a calendar time [µs]."""
+    height, width = depth_mm.shape
+    rows = np.ascontiguousarray(depth_mm, "<u2")
+    data = base64.b64encode(rows.tobytes()).decode("ascii")
+    return RawImage(time_of(unix_us), "camera", width, height, "mono16", 2 * width, data)
+
+
+def depth_of(image: RawImage) -> NDArray[np.uint16]:
+    """Return the depth image (height, width) [mm] of a message.
+
+    Raises:
+        ValueError: Its data does not have its size.
+    """
+    rows = np.frombuffer(base64.b64decode(image.data), "<u2")
+    return rows.reshape(image.height, image.width).astype(np.uint16)
+
+
+def text(message: str, name: str, unix_us: int, level: int = INFO) -> Log:
+    """Return the message of a text that somebody said at a calendar time [µs]."""
+    return Log(time_of(unix_us), level, message, name)
+
+
+def time_of(unix_us: int) -> Time:
+    """Return a calendar time [µs since 1970] as Foxglove's schemas have it."""
+    seconds, rest_us = divmod(unix_us, US_PER_S)
+    return Time(seconds, rest_us * NS_PER_US)

@@ -1,0 +1,106 @@
+"""Reading a black box, also one that a crash has cut short."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.records import Channel, DataEnd, Metadata
+from mcap.records import Message as Record
+from mcap.stream_reader import StreamReader
+from pydantic import TypeAdapter, ValidationError
+
+from airl_mav.black_box.messages import (
+    TOPICS,
+    Decision,
+    End,
+    Log,
+    Message,
+    Phase,
+    RawImage,
+    Resources,
+    Status,
+    Telemetry,
+)
+from airl_mav.black_box.writing import METADATA, RUN
+from airl_mav.core.errors import UsageError
+
+_RECORD_BYTES = 64 * 2**20
+"""No record is longer: a damaged length must not ask for gigabytes."""
+
+_TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
+"""What a file that ends in the midst of a record, or is damaged there, leads to."""
+
+M = TypeVar("M", Decision, Telemetry, Status, Resources, Phase, End, RawImage, Log)
+
+
+@dataclass
+class BlackBox:
+    """What a black box holds."""
+
+    path: Path
+    run: dict[str, Any]
+    """What flew, as `run.json` has it."""
+    messages: dict[type[Message], list[Any]] = field(default_factory=dict)
+    whole: bool = False
+    """Whether it was closed, or ends somewhere: the program, the computer or the power failed."""
+
+    def all_of(self, kind: type[M]) -> list[M]:
+        """Return the messages of a kind, in their order."""
+        return self.messages.get(kind, [])
+
+
+def read_black_box(path: Path) -> BlackBox:
+    """Read a black box, up to where it ends or is damaged.
+
+    Raises:
+        UsageError: It cannot be read, or is none of ours.
+    """
+    box = None
+    try:
+        with path.open("rb") as file:
+            reader = StreamReader(file, record_size_limit=_RECORD_BYTES)
+            for record in _whole_records(reader):
+                if isinstance(record, Metadata) and record.name == METADATA and box is None:
+                    box = BlackBox(path, json.loads(record.metadata[RUN]))
+                elif isinstance(record, DataEnd) and box is not None:
+                    box.whole = True
+                elif isinstance(record, tuple) and box is not None:
+                    kind, message = record
+                    box.messages.setdefault(kind, []).append(message)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except (InvalidMagic, KeyError, json.JSONDecodeError):
+        box = None
+    if box is None:
+        raise UsageError(f"{path}: accepted: a black box of airl-companion (MCAP)")
+    return box
+
+
+def _whole_records(reader: StreamReader) -> Iterator[Any]:
+    """Give metadata, the end, and messages with their kinds, up to the first torn record."""
+    kinds = {topic: kind for kind, topic in TOPICS.items()}
+    adapters: dict[int, tuple[type[Message], TypeAdapter[Any]]] = {}
+    records = reader.records
+    while True:
+        try:
+            record = next(records)
+            if isinstance(record, Channel) and record.topic in kinds:
+                kind = kinds[record.topic]
+                adapters[record.id] = kind, TypeAdapter(kind)
+            elif isinstance(record, Record) and record.channel_id in adapters:
+                kind, adapter = adapters[record.channel_id]
+                yield kind, adapter.validate_json(record.data)
+            elif isinstance(record, (Metadata, DataEnd)):
+                yield record
+        except InvalidMagic:
+            if adapters:
+                return  # At the end of the file: torn there.
+            raise
+        except (StopIteration, *_TORN):
+            return

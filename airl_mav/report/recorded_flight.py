@@ -1,0 +1,194 @@
+"""A black box as a run of one flight, which every report and comparison reads."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
+from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.process_use import ProcessUse
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.quality import measure_quality
+from airl_mav.flight.record import NO_ARENA, EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP, STAMPS
+from airl_mav.rehearsal.run_folder import (
+    RUN_FILE,
+    FlownEpisode,
+    RunFolder,
+    RunInfo,
+    load_info,
+    run_info,
+)
+from companion.limits import OUT_OF_TIME
+
+NAVIGATING = "navigating"
+"""The phase in which the policy flies (`companion.mission`)."""
+
+GOAL_REACHED = "goal reached"
+
+LEAST_NORM = 0.5
+"""A quaternion shorter than this says nothing."""
+
+DIGEST = "recording_sha256"
+"""Setting of the run that tells which file it was made of."""
+
+
+def take_in(path: Path) -> Path:
+    """Make the run folder of a black box, beside it, and return it; it may be there already.
+
+    Raises:
+        UsageError: The file is no black box, or the folder holds something else.
+    """
+    box = read_black_box(path)
+    folder = path.with_suffix("")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if (folder / RUN_FILE).exists():
+        if load_info(folder).config.get(DIGEST) != digest:
+            raise UsageError(
+                f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
+            )
+        return folder
+    info = info_of(box, digest)
+    RunFolder.adopt(folder, info).save_episodes([episode_of(box)])
+    return folder
+
+
+def info_of(box: BlackBox, digest: str = "") -> RunInfo:
+    """Return what flew. Raises UsageError where the black box does not hold it."""
+    run = box.run
+    return run_info({**run, "config": {**run.get("config", {}), DIGEST: digest}}, box.path)
+
+
+def episode_of(box: BlackBox) -> FlownEpisode:
+    """Return the flight: its path is the one that the flight controller told."""
+    config = box.run["config"]
+    path = path_of(box)
+    stamps = stamps_of(box.all_of(Decision))
+    started_us = int(path.time_us[0]) if len(path) else 0
+    phases = box.all_of(Phase)
+    begun = [phase.time_us for phase in phases if phase.phase == NAVIGATING]
+    navigation_us = begun[0] if begun else None
+    ended_us = _ended_us(box, path, navigation_us)
+    ends = box.all_of(End)
+    reason, notes = (ends[-1].reason, ends[-1].notes) if ends else _cut(box, ended_us)
+    quality = None
+    if navigation_us is not None and len(path):
+        quality = measure_quality(
+            *(path, navigation_us, ended_us, 0.0),
+            decisions=stamps,
+            hold_s=config["pilot"]["hold_s"],
+        )
+    batteries = [status.battery_remaining for status in box.all_of(Status)]
+    record = EpisodeRecord(
+        index=0,
+        seed=config["seed"],
+        arena=NO_ARENA,
+        arena_seed=0,
+        outcome=_outcome(reason),
+        reason=reason,
+        goal=(config["goal"][0], config["goal"][1]),
+        goal_radius_m=config["pilot"]["goal_radius_m"],
+        time_limit_s=config["limits"]["flight_s"],
+        started_us=started_us,
+        navigation_us=navigation_us,
+        ended_us=ended_us,
+        wall_s=(ended_us - started_us) / US_PER_S / config["speed"],
+        slipped_us=0,
+        battery_remaining=next((b for b in reversed(batteries) if b is not None), None),
+        quality=quality,
+        notes=notes,
+        companion_use=_use(box.all_of(Resources)),
+    )
+    return FlownEpisode(record, path, stamps)
+
+
+def path_of(box: BlackBox) -> Trajectory:
+    """Return the path as the flight controller told it, where it told one.
+
+    With the power that the pack gave; 0 W where none is told.
+    """
+    told = box.all_of(Telemetry)
+    rows = [(*each.position, *each.velocity, *each.quaternion) for each in told]
+    states = np.array(rows, np.float64).reshape(len(rows), 10)  # None becomes NaN
+    times = np.array([each.time_us for each in told], np.int64)
+    # Before the first telemetry all is NaN or 0, and a quaternion of 0 is no attitude.
+    known = np.isfinite(states).all(axis=1) & (np.linalg.norm(states[:, 6:], axis=1) > LEAST_NORM)
+    times, states = times[known], states[known]
+    later = np.diff(times, prepend=NO_STAMP) > 0
+    times, states = times[later], states[later]
+    power_w = _power_w(box.all_of(Status), times)
+    return Trajectory(times, states[:, :3], states[:, 3:6], states[:, 6:], power_w)
+
+
+def stamps_of(decisions: list[Decision]) -> dict[str, NDArray[Any]]:
+    """Return the stamps of decisions by column, as `latency.stamps.DecisionLog.columns`."""
+    columns: dict[str, NDArray[Any]] = {
+        name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
+    }
+    # Of all but the last it is known when the hold ended, not only when it was to end.
+    columns["held_until_us"][:-1] = [each.held_before_us for each in decisions[1:]]
+    rows = [each.setpoint for each in decisions]
+    columns["setpoint"] = np.array(rows, np.float32).reshape(len(rows), 4)
+    return columns
+
+
+def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the power (n,) at times (n,): the newest that was told, the first one before it."""
+    told = [
+        (status.time_us, status.voltage_v * status.current_a)
+        for status in statuses
+        if status.voltage_v is not None and status.current_a is not None
+    ]
+    if not told:
+        return np.zeros(len(times_us))
+    at_us, power_w = np.array(told).T
+    newest = np.searchsorted(at_us, times_us, side="right") - 1
+    return np.asarray(power_w[np.maximum(newest, 0)], np.float64)
+
+
+def _ended_us(box: BlackBox, path: Trajectory, navigation_us: int | None) -> int:
+    """Return when navigation ended, or else the recording [µs]."""
+    if navigation_us is not None:
+        for phase in box.all_of(Phase):
+            if phase.time_us >= navigation_us and phase.phase != NAVIGATING:
+                return phase.time_us
+    sent_us = [decision.sent_us for decision in box.all_of(Decision)]
+    return max([navigation_us or 0, *sent_us, *map(int, path.time_us[-1:])])
+
+
+def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
+    """Return the reason and the notes of a flight whose recording was cut off."""
+    phases = box.all_of(Phase)
+    where = f" while {phases[-1].phase}" if phases else ""
+    note = "the companion, its computer or the power failed, or the file was damaged there"
+    return f"the recording ends{where}", (f"the recording ends at {ended_us / 1e6:.2f} s: {note}",)
+
+
+def _outcome(reason: str) -> Outcome:
+    if reason == GOAL_REACHED:
+        return Outcome.SUCCESS
+    return Outcome.TIMEOUT if reason == OUT_OF_TIME else Outcome.ABORTED
+
+
+def _use(resources: list[Resources]) -> ProcessUse | None:
+    """Return what the companion took of its computer."""
+    if len(resources) < 2:
+        return None
+    times_s = np.array([each.time_us for each in resources]) / US_PER_S
+    cores = np.array([each.process_cores for each in resources[1:]])
+    return ProcessUse(
+        wall_s=float(times_s[-1] - times_s[0]),
+        cpu_s=float(np.sum(cores * np.diff(times_s))),
+        peak_memory_bytes=max(each.memory_bytes for each in resources),
+        peak_since="begin",
+        power_w=None,
+        power_source="not measured by the black box",
+    )

@@ -1,0 +1,284 @@
+"""The black box: what the companion saw, decided and sent, in a file that survives a crash.
+
+Telemetry, status and resources are sampled by a thread of the black box's own; the pilot hands its
+decisions over without waiting. Four times a second everything is put onto the disk.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import psutil
+
+from airl_mav.black_box.messages import (
+    SUFFIX,
+    WARNING,
+    Decision,
+    End,
+    Message,
+    Phase,
+    Resources,
+    Status,
+    Telemetry,
+    depth_image,
+    text,
+)
+from airl_mav.black_box.writing import BlackBoxFile
+from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import FieldError
+from airl_mav.core.machine import temperature_c
+from airl_mav.core.provenance import describe_machine, git_state, package_versions
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.policy.observation import Kinematics
+from companion.interfaces import BatteryState, VehicleStatus
+from companion.pilot import OLDEST_FRAME_US, Decided
+
+SAMPLE_US = US_PER_S // 25
+"""Time between two samples of the telemetry [µs]; the flight controller sends 50 a second."""
+
+STATUS_US = US_PER_S // 2
+"""Time between two of status, battery and resources [µs]."""
+
+SYNC_US = US_PER_S // 4
+"""Time between two writes onto the disk [µs]: what a crash loses at most, and a sample."""
+
+
+class RecordedLink(Protocol):
+    """What the black box asks of the link."""
+
+    def kinematics(self) -> Kinematics:
+        """Return the newest telemetry."""
+        ...
+
+    def status(self) -> VehicleStatus:
+        """Return who flies."""
+        ...
+
+    def battery(self) -> BatteryState:
+        """Return the newest state of the battery."""
+        ...
+
+
+class BlackBoxRecorder:
+    """Writes a black box while a mission is flown.
+
+    A file that cannot be written any more, on a full or failing disk, ends there, and the flight
+    goes on: `failure` then says why.
+    """
+
+    def __init__(
+        self,
+        file: BlackBoxFile,
+        link: RecordedLink,
+        clock: Clock,
+        goal: tuple[float, float],
+        images_hz: float,
+    ) -> None:
+        """Take what to record.
+
+        Args:
+            file: New.
+            link: Connected.
+            clock: The companion's.
+            goal: North, east of the start [m].
+            images_hz: Most images to keep, each one that a decision saw [Hz].
+        """
+        self.failure: str | None = None
+        """Why the file ends early."""
+        self._file, self._link, self._clock, self._goal = file, link, clock, goal
+        self._image_us = math.inf if images_hz == 0.0 else US_PER_S / images_hz
+        self._next_image_us = -math.inf
+        self._unix_us = utc_us() - clock.time_us()
+        """Calendar time of the clock's zero, kept for the whole flight: it never jumps."""
+        self._told: deque[Decided | tuple[Message, int]] = deque()
+        self._next_status_us = self._next_sync_us = 0
+        self._process = psutil.Process()
+        self._used_us, self._used_at_us = processor_time_us(), clock.time_us()
+        psutil.cpu_percent()  # The first call only begins to measure.
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="black box", daemon=True)
+
+    def start(self) -> None:
+        """Call `record` from a thread from now on, as often as it wants to be called."""
+        self._thread.start()
+
+    def decided(self, decided: Decided) -> None:
+        """Take a decision; returns at once."""
+        self._told.append(decided)
+
+    def phase(self, phase: str) -> None:
+        """Take a phase that begins now."""
+        now_us = self._clock.time_us()
+        self._told.append((Phase(now_us, phase), now_us))
+
+    def heard(self, message: str) -> None:
+        """Take a text of the flight controller's."""
+        now_us = self._clock.time_us()
+        said = text(message, "flight controller", self._unix_us + now_us)
+        self._told.append((said, now_us))
+
+    def end(self, reason: str, notes: Sequence[str]) -> None:
+        """Write how the mission ended, and close the file."""
+        self._stop()
+        now_us = self._clock.time_us()
+        for note in notes:
+            said = text(note, "companion", self._unix_us + now_us, WARNING)
+            self._told.append((said, now_us))
+        self._told.append((End(now_us, reason, tuple(notes)), now_us))
+        self.record(now_us, last=True)
+
+    def break_off(self) -> None:
+        """Close the file without an end, if it is still open."""
+        self._stop()
+        self._file.abandon()
+
+    def _stop(self) -> None:
+        self._ended.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        next_us = self._clock.time_us()
+        while not self._ended.is_set() and self.failure is None:
+            self.record(self._clock.time_us())
+            next_us = max(next_us + SAMPLE_US, self._clock.time_us())
+            self._clock.sleep_until(next_us, self._ended)
+
+    def record(self, now_us: int, *, last: bool = False) -> None:
+        """Write what was told since, and a sample of now; `last` closes the file.
+
+        Nothing happens after a file that could not be written.
+        """
+        if self.failure is not None:
+            return
+        try:
+            self._write_news(now_us)
+            if last:
+                self._file.finish()
+        except OSError as error:
+            self.failure = f"the black box ends early: {self._file.path}: {error.strerror}"
+            self._file.abandon()
+
+    def _write_news(self, now_us: int) -> None:
+        while self._told:
+            told = self._told.popleft()
+            if isinstance(told, Decided):
+                self._write_decision(told)
+            else:
+                self._write(*told)
+        position, velocity, quaternion = _numbers(self._link.kinematics())
+        self._write(Telemetry(now_us, position, velocity, quaternion), now_us)
+        if now_us >= self._next_status_us:
+            self._next_status_us = now_us + STATUS_US
+            self._write(self._status(now_us), now_us)
+            self._write(self._resources(now_us), now_us)
+        if now_us >= self._next_sync_us:
+            self._next_sync_us = now_us + SYNC_US
+            self._file.sync()
+
+    def _write(self, message: Message, now_us: int) -> None:
+        self._file.write(message, self._unix_us + now_us)
+
+    def _write_decision(self, told: Decided) -> None:
+        frame = told.seen.frame
+        age_us = told.started_us - frame.capture_time_us
+        position, velocity, quaternion = _numbers(told.state)
+        (away_m,) = _finite([np.hypot(*(np.array(self._goal) - told.state.position[:2]))])
+        decision = Decision(
+            # A camera that stamps by another clock says nothing of its images' age.
+            frame.capture_time_us if 0 <= age_us <= OLDEST_FRAME_US else NO_STAMP,
+            told.seen.received_us,
+            told.started_us,
+            told.ready_us,
+            told.sent_us,
+            told.held_until_us,
+            told.held_before_us,
+            *(position, velocity, quaternion),
+            away_m,
+            _finite(told.setpoint),
+        )
+        self._write(decision, told.sent_us)
+        if told.started_us >= self._next_image_us:
+            self._next_image_us = told.started_us + self._image_us
+            seen_us = told.seen.received_us
+            self._write(depth_image(frame.depth_mm, self._unix_us + seen_us), told.sent_us)
+
+    def _status(self, now_us: int) -> Status:
+        status, battery = self._link.status(), self._link.battery()
+        return Status(now_us, status.armed, status.offboard, status.mode, *battery)
+
+    def _resources(self, now_us: int) -> Resources:
+        used_us, passed_us = processor_time_us() - self._used_us, now_us - self._used_at_us
+        self._used_us, self._used_at_us = self._used_us + used_us, now_us
+        return Resources(
+            now_us,
+            used_us / passed_us if passed_us > 0 else 0.0,
+            psutil.cpu_percent(),
+            self._process.memory_info().rss,
+            temperature_c(),
+        )
+
+
+def _numbers(state: Kinematics) -> Any:
+    """Return position, velocity and quaternion as plain numbers."""
+    return tuple(map(_finite, (state.position, state.velocity, state.quaternion)))
+
+
+def _finite(values: Iterable[float]) -> Any:
+    """Return numbers as messages have them."""
+    return tuple(float(value) if math.isfinite(value) else None for value in values)
+
+
+def open_recorder(
+    folder: Path,
+    run: Mapping[str, Any],
+    link: RecordedLink,
+    clock: Clock,
+    goal: tuple[float, float],
+) -> BlackBoxRecorder:
+    """Return what records a mission into a new file of a folder.
+
+    Args:
+        folder: Made, if it is not there.
+        run: What flies: `setup` and `config`, as `run.json` has them.
+        link: Connected.
+        clock: The companion's.
+        goal: North, east of the start [m].
+
+    Raises:
+        FieldError: No file can be written there.
+    """
+    now = utc_now()
+    made = {
+        "name": "flight",
+        "created_utc": now.isoformat(timespec="seconds"),
+        "seeds": [run["config"]["seed"]],
+        "versions": package_versions(),
+        "machine": describe_machine(),
+        "git": git_state(),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = BlackBoxFile(folder / f"{now:%Y%m%dT%H%M%S.%fZ}{SUFFIX}", {**run, **made})
+        file.sync()
+    except OSError as error:
+        raise FieldError("black_box", f"{folder}", problem=f"{error.strerror}") from None
+    return BlackBoxRecorder(file, link, clock, goal, run["config"]["black_box_images_hz"])
+
+
+@contextmanager
+def recording(recorder: BlackBoxRecorder) -> Iterator[BlackBoxRecorder]:
+    """Record for a while, from a thread of the recorder's own."""
+    recorder.start()
+    try:
+        yield recorder
+    finally:
+        recorder.break_off()

@@ -1,0 +1,159 @@
+"""A flight with the real MAVSDK is recorded, and becomes a run that says what was flown."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from airl_mav.black_box.messages import Decision, End, Log, Phase, RawImage, Resources
+from airl_mav.black_box.reading import read_black_box
+from airl_mav.cli.report import ReportOptions
+from airl_mav.cli.report import run as report
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.experiments.run import Run, load_run
+from airl_mav.flight.judge import Outcome
+from airl_mav.latency.stamps import STAMPS
+from airl_mav.lockstep.stage import Stage
+from airl_mav.report.recorded_flight import take_in
+from airl_mav.scenario.piloting import TRANSPORT_US
+from airl_mav.scenario.stand_alone import StandAloneCompanion
+from companion.black_box import SAMPLE_US, open_recorder
+from companion.mission import MissionResult
+from companion.program import prepare, run_of
+from firmware_sim.simulation import EpisodeSetup, Simulation
+from tests.support.lockstep_kit import demo_scenario, fly_as_companion
+
+SEED = 3
+
+
+@dataclass
+class Recorded:
+    """A flight, and its recording."""
+
+    path: Path
+    result: MissionResult
+    simulation: Simulation
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder = tmp_path_factory.mktemp("flights")
+    scenario = demo_scenario(policy="greedy")
+    arena = scenario.arena_of(SEED)
+    goal = (float(arena.goal[0]), float(arena.goal[1]))
+    asked = StandAloneCompanion(policy="greedy", goal=goal, seed=SEED, black_box=folder)
+    run = run_of(asked, prepare(asked))
+    setup = EpisodeSetup(scenario.vehicle, arena, SEED)
+    results: list[MissionResult] = []
+    with Stage(transport_us=TRANSPORT_US) as stage:
+        # Its thread would live by the wall clock, which this flight does not.
+        recorder = open_recorder(folder, run, stage.link, stage.clock, goal)
+
+        def look_on(simulation: Simulation) -> None:
+            if simulation.time_us % SAMPLE_US == 0 and results == [] and heard:
+                recorder.record(simulation.time_us)
+
+        stage.firmware.on_tick = look_on
+        heard: list[str] = []
+
+        def phase(name: str) -> None:
+            heard.append(name)
+            recorder.phase(name)
+
+        def program() -> None:
+            stage.link.hear_texts(recorder.heard)
+            result = fly_as_companion(
+                *(stage, scenario.fresh_policy(SEED), goal),
+                phase=phase,
+                decided=recorder.decided,
+            )
+            results.append(result)
+
+        simulation = stage.run(setup, program)
+        recorder.end(results[0].reason, results[0].notes)
+    (path,) = folder.glob("*.mcap")
+    return Recorded(path, results[0], simulation)
+
+
+@pytest.fixture(scope="module")
+def run(recorded: Recorded) -> Run:
+    return load_run(take_in(recorded.path))
+
+
+def test_every_decision_is_there_with_its_stamps(recorded: Recorded, run: Run) -> None:
+    box = read_black_box(recorded.path)
+    assert box.whole
+    wanted, found = recorded.result.log.columns(), run.stamps[0]
+    assert len(box.all_of(Decision)) == len(recorded.result.log) > 5
+    for name in STAMPS:
+        np.testing.assert_array_equal(found[name], wanted[name], err_msg=name)
+    np.testing.assert_array_equal(found["setpoint"], wanted["setpoint"])
+    assert [phase.phase for phase in box.all_of(Phase)] == [
+        *("arming", "taking off", "navigating", "landing", "done")
+    ]
+    (end,) = box.all_of(End)
+    assert end.reason == "goal reached"
+    assert "Takeoff detected" in {log.message.strip() for log in box.all_of(Log)}
+    assert box.all_of(Resources)[-1].memory_bytes > 10**7
+    sent_us = np.array([decision.sent_us for decision in box.all_of(Decision)])
+    assert len(box.all_of(RawImage)) == len(sent_us), "at 10 Hz, every image of a policy of 2 Hz"
+
+
+def test_the_path_is_the_one_that_was_flown(recorded: Recorded, run: Run) -> None:
+    path = run.trajectories[0]
+    assert recorded.simulation.recorder is not None
+    truth = recorded.simulation.recorder.arrays()
+    true_us, true = truth["trajectory/time_us"], truth["trajectory/position"]
+    told = read_black_box(recorded.path).all_of(Decision)
+    begun_us = [decision.infer_start_us for decision in told]
+    there = np.stack([np.interp(begun_us, true_us, column) for column in true.T], axis=1)
+    seen = np.array([decision.position for decision in told], np.float64)
+    # The estimate's error, and the age of the newest telemetry at a few metres a second.
+    assert np.linalg.norm(seen - there, axis=1).max() < 0.6
+    # Between its turns a companion in lockstep hears nothing: right places, at later times.
+    flown = path.position[path.position[:, 2] < -1.0]
+    away = np.linalg.norm(flown[:, None] - true[None], axis=2).min(axis=1)
+    assert len(flown) > 50 and away.max() < 0.4
+    assert np.diff(path.time_us).max() == SAMPLE_US
+
+
+def test_it_is_judged_as_a_rehearsal_is(recorded: Recorded, run: Run) -> None:
+    (record,) = run.episodes
+    assert run.info.setup.level == "flight"
+    assert record.outcome is Outcome.SUCCESS
+    assert record.quality is not None and record.navigation_us is not None
+    arrays = recorded.simulation.recorder.arrays() if recorded.simulation.recorder else {}
+    times, power = arrays["trajectory/time_us"], arrays["trajectory/power_w"]
+    flown = (times > record.navigation_us) & (times <= record.ended_us)
+    true_j = float(np.sum(power[flown] * np.diff(times, prepend=times[0])[flown])) / US_PER_S
+    assert record.quality.energy_j == pytest.approx(true_j, rel=0.1)
+    straight_m = np.hypot(*record.goal) - record.goal_radius_m
+    assert straight_m - 0.5 < record.quality.distance_m < 1.5 * straight_m
+
+
+def test_airl_report_shows_it_and_what_a_crash_left_of_it(
+    recorded: Recorded, run: Run, tmp_path: Path
+) -> None:
+    console = Console(record=True, width=100, quiet=True)
+    assert report(ReportOptions(runs=(recorded.path,)), console) == 0
+    page = (run.path / "report.html").read_text(encoding="utf-8")
+    assert "in an unknown place, level flight: 1 of 1 goals reached" in page
+    data = recorded.path.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) // 2])
+    assert report(ReportOptions(runs=(cut,)), console) == 0
+    (left,) = load_run(tmp_path / "cut").episodes
+    assert left.outcome is Outcome.ABORTED
+    assert left.reason.startswith("the recording ends while")
+    assert "the companion, its computer or the power failed" in left.notes[0]
+    # Taken in once, it is not made again; another file of that name is told apart.
+    assert take_in(cut) == tmp_path / "cut"
+    shutil.copy(recorded.path, cut)
+    with pytest.raises(UsageError, match="holds another run"):
+        take_in(cut)

@@ -1,0 +1,68 @@
+"""A process that records a flight until it is killed, and tells what it has decided.
+
+    python -m tests.support.recording_child FILE
+
+What flies is a made-up path: the black box is what is tested, and how much of it a kill leaves.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from airl_mav.black_box.writing import BlackBoxFile
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.policy.observation import Kinematics
+from companion.black_box import BlackBoxRecorder
+from companion.camera import ReceivedFrame
+from companion.interfaces import BatteryState, BodyVelocity, VehicleStatus
+from companion.pilot import Decided
+
+LENS = Intrinsics.from_fov(64, 48, 1.0)
+PERIOD_US = 20 * US_PER_MS
+
+
+class Straight:
+    """Flies north at 1 m/s."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+
+    def kinematics(self) -> Kinematics:
+        north = self._clock.time_us() / 1e6
+        return Kinematics(
+            np.array([north, 0.0, -2.5]), np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0])
+        )
+
+    def status(self) -> VehicleStatus:
+        return VehicleStatus(True, True, "offboard")
+
+    def battery(self) -> BatteryState:
+        return BatteryState(16.0, 10.0, 0.8)
+
+
+def main(path: Path) -> None:
+    clock = WallClock()
+    link = Straight(clock)
+    recorder = BlackBoxRecorder(BlackBoxFile(path, {}), link, clock, (1000.0, 0.0), 10.0)
+    recorder.start()
+    number = 0
+    while True:
+        number += 1
+        now_us = clock.time_us()
+        depth = np.full((48, 64), number % 20_000, np.uint16)
+        seen = ReceivedFrame(Frame(number, now_us, depth, LENS), now_us)
+        times = now_us, now_us, now_us, now_us + PERIOD_US, now_us
+        recorder.decided(Decided(seen, link.kinematics(), BodyVelocity(1.0, 0.0, 0.0, 0.0), *times))
+        sys.stdout.write(f"{now_us}\n")
+        sys.stdout.flush()
+        clock.sleep_until(now_us + PERIOD_US)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

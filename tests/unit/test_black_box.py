@@ -1,0 +1,192 @@
+"""The black box: its file, what a crash leaves of it, and what a full disk does."""
+
+from __future__ import annotations
+
+import base64
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from airl_mav.black_box.messages import (
+    SCHEMAS,
+    TOPICS,
+    Decision,
+    End,
+    Log,
+    Phase,
+    RawImage,
+    Resources,
+    Status,
+    Telemetry,
+    depth_image,
+    depth_of,
+    text,
+)
+from airl_mav.black_box.reading import read_black_box
+from airl_mav.black_box.writing import BlackBoxFile
+from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.errors import UsageError
+from companion.black_box import BlackBoxRecorder
+from tests.support.full_disk import largest_file
+from tests.support.processes import running, wait_until
+from tests.support.recording_child import PERIOD_US, Straight
+
+NOW_US = 1_800_000_000_000_000
+RUN = {"name": "flight", "config": {"seed": 1}}
+QUATERNION = (1.0, 0.0, 0.0, 0.0)
+MESSAGES: list[Any] = [
+    Phase(5, "navigating"),
+    Telemetry(10, (1.0, 2.0, -3.0), (0.1, 0.2, 0.3), QUATERNION),
+    Decision(
+        1,
+        2,
+        3,
+        4,
+        5,
+        6,
+        -1,
+        (0.0, 0.0, None),
+        (0.0, 0.0, 0.0),
+        QUATERNION,
+        20.0,
+        (1.0, 0.0, 0.0, 0.5),
+    ),
+    depth_image(np.arange(48 * 64, dtype=np.uint16).reshape(48, 64), NOW_US),
+    Status(20, True, True, "offboard", 16.2, None, 0.5),
+    Resources(20, 0.25, 40.0, 100_000_000, None),
+    text("Landing detected", "flight controller", NOW_US),
+    End(30, "goal reached", ("a note",)),
+]
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    path = tmp_path / "whole.mcap"
+    file = BlackBoxFile(path, RUN)
+    for k, message in enumerate(MESSAGES):
+        file.write(message, NOW_US + k)
+    file.finish()
+    return path
+
+
+def test_what_was_written_is_read(whole: Path) -> None:
+    box = read_black_box(whole)
+    assert box.whole
+    assert box.run == RUN
+    read = [message for kind in TOPICS for message in box.messages[kind]]
+    assert sorted(map(repr, read)) == sorted(map(repr, MESSAGES))
+    (image,) = box.all_of(RawImage)
+    np.testing.assert_array_equal(depth_of(image), np.arange(48 * 64).reshape(48, 64))
+
+
+def test_any_reader_of_mcap_reads_it_and_finds_its_schemas(whole: Path) -> None:
+    with whole.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = {
+            channel.topic: (schema, channel, message)
+            for schema, channel, message in reader.iter_messages()
+        }
+        assert set(found) == set(TOPICS.values())
+        for kind, topic in TOPICS.items():
+            schema, channel, message = found[topic]
+            assert schema is not None
+            assert (schema.name, schema.encoding) == (SCHEMAS[kind], "jsonschema")
+            assert channel.message_encoding == "json"
+            properties = json.loads(schema.data)["properties"]
+            assert properties.keys() == json.loads(message.data).keys()
+            assert 0 <= message.log_time - 1000 * NOW_US < 10_000
+    # Foxglove's own schemas: https://github.com/foxglove/foxglove-sdk/tree/main/schemas/jsonschema
+    image = json.loads(found[TOPICS[RawImage]][2].data)
+    assert image["timestamp"] == {"sec": NOW_US // US_PER_S, "nsec": 0}
+    assert (image["encoding"], image["step"], image["width"], image["height"]) == (
+        *("mono16", 128, 64, 48),
+    )
+    assert len(base64.b64decode(image["data"])) == 128 * 48
+    log = json.loads(found[TOPICS[Log]][2].data)
+    assert log.keys() == {"timestamp", "level", "message", "name", "file", "line"}
+
+
+def test_cut_anywhere_all_whole_messages_before_are_read(whole: Path, tmp_path: Path) -> None:
+    data, cut = whole.read_bytes(), tmp_path / "cut.mcap"
+    counts = []
+    for size in [*range(0, len(data), 97), len(data) - 1]:
+        cut.write_bytes(data[:size])
+        try:
+            box = read_black_box(cut)
+        except UsageError as error:
+            assert "cut.mcap: accepted: a black box of airl-companion" in str(error)
+            counts.append(-1)
+            continue
+        counts.append(sum(map(len, box.messages.values())))
+        assert all(message in MESSAGES for kind in box.messages.values() for message in kind)
+    assert counts == sorted(counts), "the longer the file, the more is read"
+    assert {-1, 0, 1, len(MESSAGES)} <= set(counts)
+
+
+def test_flipped_bytes_end_it_and_raise_nothing_else(whole: Path, tmp_path: Path) -> None:
+    data, draw = whole.read_bytes(), random.Random(1)
+    broken = tmp_path / "broken.mcap"
+    for _ in range(300):
+        changed = bytearray(data)
+        changed[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
+        broken.write_bytes(changed)
+        try:
+            read_black_box(broken)
+        except UsageError:
+            continue
+
+
+@pytest.mark.parametrize("data", [b"", b"no black box", b"\x89MCAP0\r\n"])
+def test_another_file_is_refused(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "other.mcap"
+    path.write_bytes(data)
+    with pytest.raises(UsageError, match="accepted: a black box of airl-companion"):
+        read_black_box(path)
+
+
+def test_a_file_that_is_there_is_never_written_over(whole: Path) -> None:
+    before = whole.read_bytes()
+    with pytest.raises(FileExistsError):
+        BlackBoxFile(whole, RUN)
+    assert whole.read_bytes() == before
+
+
+def test_on_a_full_disk_the_flight_goes_on(tmp_path: Path) -> None:
+    clock = SimClock()
+    path = tmp_path / "flight.mcap"
+    recorder = BlackBoxRecorder(BlackBoxFile(path, RUN), Straight(clock), clock, (9.0, 0.0), 0.0)
+    with largest_file(40_000):
+        for _ in range(500):
+            clock.advance(40 * US_PER_MS)
+            recorder.record(clock.time_us())
+        recorder.end("goal reached", ())
+    assert recorder.failure == f"the black box ends early: {path}: File too large"
+    box = read_black_box(path)
+    assert not box.whole
+    assert 10 < len(box.all_of(Telemetry)) < 500
+
+
+@pytest.mark.parametrize(
+    "k", [0, 1, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(2, 50))]
+)
+def test_killed_at_any_moment_at_most_a_second_is_lost(k: int, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    moment_s = random.Random(k).uniform(0.6, 2.0)
+    with running(["-m", "tests.support.recording_child", str(path)], tmp_path) as child:
+        wait_until(lambda: len(child.text().split()) > moment_s * US_PER_S / PERIOD_US, "decisions")
+        child.process.kill()
+        child.process.wait()
+        told = [int(word) for word in child.text().split()]
+    box = read_black_box(path)
+    assert not box.whole
+    decisions = [decision.sent_us for decision in box.all_of(Decision)]
+    assert decisions == told[: len(decisions)], "in order, none missing, none made up"
+    assert told[-1] - decisions[-1] < US_PER_S
+    images = box.all_of(RawImage)
+    assert images and depth_of(images[0])[0, 0] == 1
