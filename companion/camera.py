@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
 import zmq
 
-from airl_mav.camera.frame import Frame, FrameError
+from airl_mav.camera.frame import MOST_BYTES, Frame, FrameError
 from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.scenario.aircraft import GREATEST_PORT
+
+MESSAGES_PER_LOOK = 8
+"""Messages that are read at a time, of a publisher that sends faster than they can be read."""
+
+REDIAL_S = 2.0
+"""Silence after which the connection is made anew [wall s]."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +49,9 @@ class FrameSource(Protocol):
 class ZmqFrameSource:
     """Frames published by a simulator or a camera driver over ZeroMQ (tcp, ipc).
 
-    ZeroMQ keeps only the newest message, also while nobody asks, and reconnects by itself. To be
+    ZeroMQ keeps only the newest message, also while nobody asks, and reconnects by itself where it
+    sees that the publisher is gone. It does not see one whose computer has lost its power, and ends
+    for good what sends more than a frame can be: after a silence the connection is made anew. To be
     used from one thread at a time.
     """
 
@@ -64,7 +74,11 @@ class ZmqFrameSource:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.CONFLATE, 1)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
         self._socket.subscribe(b"")
+        self._endpoint = endpoint
+        self._silent = WallClock()
+        """Since the last message, or the last attempt to connect."""
         try:
             self._socket.connect(endpoint)
         except zmq.ZMQError as error:
@@ -74,7 +88,12 @@ class ZmqFrameSource:
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame so far, without waiting; None before the first."""
-        while self._socket.poll(0):
+        for _ in range(MESSAGES_PER_LOOK):
+            if not self._socket.poll(0):
+                if self._silent.time_us() >= REDIAL_S * US_PER_S:
+                    self._redial()
+                break
+            self._silent = WallClock()
             # Parts of a message are messages: nobody who speaks this format sends any.
             data = self._socket.recv()
             try:
@@ -84,6 +103,13 @@ class ZmqFrameSource:
             else:
                 self._newest = ReceivedFrame(frame, self._clock.time_us())
         return self._newest
+
+    def _redial(self) -> None:
+        """Make the connection anew."""
+        self._silent = WallClock()
+        with suppress(zmq.ZMQError):  # it has ended already
+            self._socket.disconnect(self._endpoint)
+        self._socket.connect(self._endpoint)
 
     def _known(self, frame: Frame) -> Frame:
         """Return a frame of this camera.
@@ -108,7 +134,7 @@ class ZmqFrameSource:
             left_ms = 1e3 * timeout_s - 1e-3 * stopwatch.time_us()
             if left_ms <= 0.0:
                 return None
-            self._socket.poll(math.ceil(left_ms))
+            self._socket.poll(math.ceil(min(left_ms, 1e3 * REDIAL_S)))
 
     def close(self) -> None:
         """Disconnect."""

@@ -94,18 +94,19 @@ def look_at_camera(
     except UsageError as error:
         yield Finding("camera", False, str(error))
         return
-    watch, frames, ages_us = WallClock(), [first], []
+    # Frames are not kept: a driver may send thousands of large ones.
+    watch, last, frozen, ages_us = WallClock(), first, True, []
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
-        newer = camera.wait(frames[-1].frame.sequence, 0.5)
+        newer = camera.wait(last.frame.sequence, 0.5)
         if newer is not None:
-            frames.append(newer)
+            frozen = frozen and np.array_equal(first.frame.depth_mm, newer.frame.depth_mm)
+            last = newer
             ages_us.append(age_of(newer, clock.time_us()))
-    lens, rate_hz = first.frame.intrinsics, (len(frames) - 1) / LOOK_S
+    lens, rate_hz = first.frame.intrinsics, len(ages_us) / LOOK_S
     if not ages_us:
         yield Finding("camera", False, f"one frame in {LOOK_S:g} s")
         return
     told = f"{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
-    frozen = all(np.array_equal(first.frame.depth_mm, each.frame.depth_mm) for each in frames)
     if frozen:
         # A simulator's image of a vehicle at rest has no noise, so this is no fault by itself.
         told += "; every image is the same (a real camera has noise)"

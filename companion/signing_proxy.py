@@ -103,7 +103,8 @@ class SigningProxy:
                     data, address = end.recvfrom(MAX_DATAGRAM)
                     if end is self._outer:
                         self._from_vehicle(data, address)
-                    else:
+                    elif address == self._mavsdk:
+                        # Anybody else on this machine would have its frames signed.
                         self._from_mavsdk(data)
                 except OSError:
                     continue  # nobody listens there yet

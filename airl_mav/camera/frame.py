@@ -16,6 +16,10 @@ MAGIC = b"ADF1"
 # magic, sequence, capture time [µs], width, height, focal, cx, cy; little endian
 _HEADER = struct.Struct("<4sQqHHddd")
 
+MOST_PIXELS = 4096 * 4096
+MOST_BYTES = _HEADER.size + 2 * MOST_PIXELS
+"""Size of the largest frame, 34 MB: whoever receives them need not take in more."""
+
 MM_PER_M = 1000.0
 MAX_MM = 65_535
 
@@ -54,8 +58,8 @@ class Frame:
     def from_bytes(cls, data: bytes) -> Frame:
         """Read the wire form.
 
-        Raises FrameError for anything else, also for what no camera takes: an image without pixels,
-        a focal length or a centre out of bounds, or not a number.
+        Raises FrameError for anything else, also for what no camera takes: an image without pixels
+        or with too many, a focal length or a centre out of bounds, or not a number.
         """
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
@@ -64,8 +68,8 @@ class Frame:
             raise FrameError(f"magic {magic!r}, expected {MAGIC!r}")
         if len(data) != _HEADER.size + 2 * width * height:
             raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels")
-        if not (width and height):
-            raise FrameError(f"{width}x{height} pixels are no image")
+        if not 0 < width * height <= MOST_PIXELS:
+            raise FrameError(f"{width}x{height} pixels: accepted: 1..{MOST_PIXELS}")
         # Written so that NaN fails.
         if not (LEAST_PX <= focal <= MOST_PX and abs(cx) <= MOST_PX and abs(cy) <= MOST_PX):
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no pinhole camera")

@@ -12,6 +12,7 @@ from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.interfaces import Truth
+from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
 from firmware_sim.mavlink.complaints import Complaints
@@ -46,6 +47,10 @@ sends by default. Who asks for more gets it later: all clients have equal shares
 
 TEXTS_PER_TICK = 8
 """Texts of services that go to all operators per tick."""
+
+TEXTS_PER_S, TEXTS_BURST = 20, 50
+"""The same per second, for long and at once: each is told to all clients of all links, and as an
+event takes the place of one that somebody may still ask for."""
 
 FORGET_EVERY_US = US_PER_S
 """Silent clients are looked for so often [µs]."""
@@ -96,6 +101,7 @@ class MavlinkServer:
         self._system_id = SYSTEM_ID
         self._vibration = VibrationMeter()
         self._texts: list[Message] = []
+        self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._events = EventBuffer()
         self._complaints = Complaints()
         self._first_in_turn = 0
@@ -133,6 +139,7 @@ class MavlinkServer:
         self._system_id = _system_id(port)
         self._senders.forget()
         self._complaints.restart()
+        self._announced.renew()
         self._vibration = VibrationMeter()
         self._calibration = RunningCalibration()
         self._events = EventBuffer()
@@ -336,6 +343,9 @@ class MavlinkServer:
         """Tell the operators once a tick: a client that repeats itself must not flood others."""
         if text in self._texts or len(self._texts) >= TEXTS_PER_TICK:
             return
+        if not self._announced.left(self._now_us):
+            return
+        self._announced.take(1, self._now_us)
         self._texts.append(text)
         if text.event is not None:
             self._events.add(text.event, self._now_us)

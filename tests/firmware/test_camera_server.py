@@ -7,19 +7,20 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import zmq
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import MOST_BYTES, Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
-from companion.camera import ZmqFrameSource
+from companion.camera import MESSAGES_PER_LOOK, ZmqFrameSource
 from firmware_sim.plant.camera_server import CameraServer, DepthCamera
 from tests.support.flight_rig import quad
 
@@ -225,6 +226,43 @@ def test_malformed_messages_are_counted_and_ignored() -> None:
         assert received is not None
         assert received.frame.sequence == 3
         source.close()
+
+
+def test_no_message_larger_than_a_frame_is_taken_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ ends the connection for good; a new one is made, and frames are heard again."""
+    monkeypatch.setattr("companion.camera.REDIAL_S", 0.3)
+    with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+        port = publisher.bind_to_random_port("tcp://127.0.0.1")
+        source = ZmqFrameSource(f"tcp://127.0.0.1:{port}", SimClock())
+        while source.wait(-1, 0.02) is None:
+            publisher.send(frame(1).to_bytes())
+        publisher.send(bytes(MOST_BYTES + 1))
+        for _ in range(500):
+            if source.wait(1, 0.02) is not None:
+                break
+            publisher.send(frame(2).to_bytes())
+        newest = source.latest()
+        assert newest is not None and newest.frame.sequence == 2
+        assert source.malformed == 0  # what was too large has not been handed over
+        source.close()
+
+
+def test_a_flood_of_messages_does_not_hold_the_reader() -> None:
+    class Flood:
+        """A socket on which the next message is always there."""
+
+        def poll(self, _timeout: int) -> int:
+            return 1
+
+        def recv(self) -> bytes:
+            return b"no frame"
+
+    source = ZmqFrameSource("tcp://127.0.0.1:9", SimClock())
+    real, source._socket = source._socket, cast(Any, Flood())
+    assert source.latest() is None
+    assert source.malformed == MESSAGES_PER_LOOK
+    source._socket = real
+    source.close()
 
 
 def test_waiting_without_a_server_times_out() -> None:

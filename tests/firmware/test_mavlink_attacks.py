@@ -174,6 +174,22 @@ def test_nobody_floods_all_others_with_texts() -> None:
     ]
 
 
+def test_nobody_drowns_what_everybody_should_know_in_texts() -> None:
+    """Refusals of one client, each another one, for 10 s: events keep their place among them."""
+    field = Field()
+    client, other = field.hub.client(1, (101, 190)), field.hub.client(2, (102, 190))
+    other.send(HEARTBEAT)
+    for tick in range(2500):
+        client.command(400, 2.0 + tick / 8.0)
+        field.run(1)
+    heard = other.received("STATUSTEXT", "EVENT")
+    said = [m for m in heard if m.get_type() == "STATUSTEXT"]
+    assert len(said) == len(heard) - len(said)
+    assert server.TEXTS_BURST <= len(said) <= server.TEXTS_BURST + 10 * server.TEXTS_PER_S + 1
+    acknowledged = client.received("COMMAND_ACK")
+    assert acknowledged == []  # PX4 acknowledges none of these
+
+
 def test_absurd_rates_leave_everybody_a_share() -> None:
     field = Field()
     modest = field.hub.client(1, (101, 190))

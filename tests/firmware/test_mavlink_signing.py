@@ -206,6 +206,28 @@ def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
         assert (counters.refused, proxy.refused) == (0, 0)
 
 
+def test_the_proxy_signs_for_mavsdk_alone(key: Path) -> None:
+    """Else any program on the companion computer could command the vehicle without the key."""
+    (api,), _ = free_ports(1, 0)
+    with (
+        closing(SigningProxy(f"udpin://{LOOPBACK}:{api}", key)) as proxy,
+        closing(Flying(key, api)) as flying,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as mavsdk,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other,
+    ):
+        mavsdk.bind((LOOPBACK, int(proxy.url.rpartition(":")[2])))
+        mavsdk.settimeout(20.0)
+        _, signer = mavsdk.recvfrom(4096)
+        plain = dialect.MAVLink(None, 245, 190)
+        arm = dialect.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0] * 6)
+        other.sendto(arm.pack(plain), signer)
+        mavsdk.sendto(dialect.MAVLink_ping_message(1, 7, 0, 0).pack(plain), signer)
+        wait_for(lambda: flying.server.counters()["onboard"].rx > 0)
+        time.sleep(0.1)
+        assert flying.server.counters()["onboard"].rx == 1
+        assert flying.autopilot.arming is Arming.STANDBY
+
+
 def test_a_proxy_without_a_host_is_on_this_machine_alone(key: Path) -> None:
     (api,), _ = free_ports(1, 0)
     with (
