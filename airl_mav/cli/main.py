@@ -32,6 +32,7 @@ SUBCOMMANDS: dict[str, str] = {
     "export": "turn a stable-baselines3 model into a policy folder",
     "sweep": "train and evaluate many networks: the architecture search",
     "report": "a run's tables and page again, or a comparison of several runs",
+    "refly": "rehearse a flight that was recorded, and compare the two",
     "arena": "look at an arena, or at what its profile draws",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
     "conformance": "does a flight controller do what the rehearsal assumes?",

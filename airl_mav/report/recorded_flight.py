@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,6 @@ from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
 """The phase in which the policy flies (`companion.mission`)."""
-
-GOAL_REACHED = "goal reached"
 
 LEAST_NORM = 0.5
 """A quaternion shorter than this says nothing."""
@@ -79,6 +78,10 @@ def episode_of(box: BlackBox) -> FlownEpisode:
     ended_us = _ended_us(box, path, navigation_us)
     ends = box.all_of(End)
     reason, notes = (ends[-1].reason, ends[-1].notes) if ends else _cut(box, ended_us)
+    outcome = Outcome.TIMEOUT if reason == OUT_OF_TIME else Outcome.ABORTED
+    arrived_us = _arrived_us(path, navigation_us, ended_us, config)
+    if arrived_us is not None:
+        outcome, ended_us = Outcome.SUCCESS, arrived_us
     quality = None
     if navigation_us is not None and len(path):
         quality = measure_quality(
@@ -92,7 +95,7 @@ def episode_of(box: BlackBox) -> FlownEpisode:
         seed=config["seed"],
         arena=NO_ARENA,
         arena_seed=0,
-        outcome=_outcome(reason),
+        outcome=outcome,
         reason=reason,
         goal=(config["goal"][0], config["goal"][1]),
         goal_radius_m=config["pilot"]["goal_radius_m"],
@@ -172,10 +175,19 @@ def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
     return f"the recording ends{where}", (f"the recording ends at {ended_us / 1e6:.2f} s: {note}",)
 
 
-def _outcome(reason: str) -> Outcome:
-    if reason == GOAL_REACHED:
-        return Outcome.SUCCESS
-    return Outcome.TIMEOUT if reason == OUT_OF_TIME else Outcome.ABORTED
+def _arrived_us(
+    path: Trajectory, navigation_us: int | None, ended_us: int, config: Mapping[str, Any]
+) -> int | None:
+    """Return when the goal was reached [µs], as the referee of a rehearsal sees it; None: never.
+
+    That is before the companion notices, which looks once a decision.
+    """
+    if navigation_us is None:
+        return None
+    flown = path.between(navigation_us, ended_us)
+    away = np.hypot(*(flown.position[:, :2] - config["goal"]).T)
+    there = np.flatnonzero(away < config["pilot"]["goal_radius_m"])
+    return int(flown.time_us[there[0]]) if len(there) else None
 
 
 def _use(resources: list[Resources]) -> ProcessUse | None:

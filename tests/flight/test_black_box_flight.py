@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from airl_mav.black_box.messages import Decision, End, Log, Phase, RawImage, Resources
 from airl_mav.black_box.reading import read_black_box
 from airl_mav.cli.report import ReportOptions
 from airl_mav.cli.report import run as report
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.frames import quat_yaw
+from airl_mav.experiments.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.experiments.run import Run, load_run
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import Stage
-from airl_mav.report.recorded_flight import take_in
+from airl_mav.report.comparison.runs import compare_folders
+from airl_mav.report.recorded_flight import episode_of, take_in
+from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import SAMPLE_US, open_recorder
@@ -157,3 +162,55 @@ def test_airl_report_shows_it_and_what_a_crash_left_of_it(
     shutil.copy(recorded.path, cut)
     with pytest.raises(UsageError, match="holds another run"):
         take_in(cut)
+
+
+# --- rehearsed again
+
+
+def test_rehearsed_where_it_flew_it_is_the_same_flight(
+    recorded: Recorded, run: Run, tmp_path: Path
+) -> None:
+    """As far as a flight in lockstep can tell, which hears nothing while it holds an action."""
+    out = tmp_path / "out"
+    found = refly(recorded.path, out, arena=demo_scenario().arena_name, episodes=2)
+    (flown,) = run.episodes
+    assert flown.quality is not None
+    assert found.flown_s == flown.quality.flight_time_s
+    assert (found.rehearsals, len(found.rehearsed_s)) == (2, 2)
+    assert -0.1 < found.flown_s - found.rehearsed_s[0] < PilotSettings.hold_s + 0.2
+    assert np.median(found.apart_m) < 0.5
+    assert "2 of 2 rehearsals reached the goal, in " in found.sentences[0]
+    # The two are a pair: the same arena, seed and goal.
+    comparison, _ = compare_folders([out / REHEARSED, out / FLOWN])
+    (contrast,) = comparison.contrasts
+    assert contrast.paired.flight_time_s.difference.n == 1
+    with pytest.raises(FieldError, match="a new or empty folder"):
+        refly(recorded.path, out)
+    with pytest.raises(FieldError, match="one with the goal of the flight"):
+        refly(recorded.path, tmp_path / "other", arena="static-obstacles", arena_seed=4)
+
+
+def test_a_flight_is_moved_to_where_its_navigation_began(recorded: Recorded) -> None:
+    episode = episode_of(read_black_box(recorded.path))
+    here = from_its_start(episode)
+    # The same flight elsewhere, with another heading.
+    yaw, offset = 2.0, np.array([30.0, -12.0, 0.0])
+    turn = Rotation.from_euler("z", yaw)
+    path = episode.trajectory
+    xyzw = (turn * Rotation.from_quat(path.quaternion[:, [1, 2, 3, 0]])).as_quat()
+    there = replace(
+        path,
+        position=turn.apply(path.position) + offset,
+        velocity=turn.apply(path.velocity),
+        quaternion=xyzw[:, [3, 0, 1, 2]],
+    )
+    north, east, _ = turn.apply([*episode.record.goal, 0.0]) + offset
+    record = replace(episode.record, goal=(north, east))
+    back = from_its_start(replace(episode, trajectory=there, record=record))
+    np.testing.assert_allclose(back.trajectory.position, here.trajectory.position, atol=1e-9)
+    np.testing.assert_allclose(back.trajectory.velocity, here.trajectory.velocity, atol=1e-9)
+    turned = np.abs(np.sum(back.trajectory.quaternion * here.trajectory.quaternion, axis=1))
+    np.testing.assert_allclose(turned, 1.0, atol=1e-9)
+    assert back.record.goal == pytest.approx(here.record.goal)
+    begun = np.searchsorted(here.trajectory.time_us, record.navigation_us or 0) - 1
+    assert abs(quat_yaw(here.trajectory.quaternion[begun])) < 0.1

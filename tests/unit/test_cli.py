@@ -45,7 +45,8 @@ def test_without_a_word_it_says_what_there_is(capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(
-    ("word", "hint"), [("evalute", "did you mean evaluate?"), ("fly", "accepted: sitl, firmware, ")]
+    ("word", "hint"),
+    [("evalute", "did you mean evaluate?"), ("hover", "accepted: sitl, firmware, ")],
 )
 def test_an_unknown_command_gets_a_hint(
     word: str, hint: str, capsys: pytest.CaptureFixture[str]

@@ -1,0 +1,257 @@
+"""A recorded flight, rehearsed: the same policy, goal and latencies in lockstep, beside it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import validated
+from airl_mav.core.files import replace_file
+from airl_mav.core.frames import quat_yaw
+from airl_mav.experiments.fly import rehearse
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.statistics import successful
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, RunInfo
+from airl_mav.report.recorded_flight import episode_of, info_of
+from airl_mav.scenario.model import Decisions, Scenario
+from airl_mav.scenario.resolve import resolve
+
+FLOWN, REHEARSED = "flown", "rehearsed"
+"""Folders of the two runs, and what they are called."""
+
+ARENA_FILE = "arena.toml"
+LATENCIES_FILE = "latencies.txt"
+
+CLEAR_M = 30.0
+"""Walls of an arena that is made for a flight are this far from its start and its goal [m]: farther
+than any shipped camera sees."""
+
+SAME_GOAL_M = 1.0
+"""The goals of a flight and of its arena may be this far apart [m]."""
+
+
+@dataclass(frozen=True)
+class Reflight:
+    """What a flight did, and what its rehearsals did."""
+
+    outcome: Outcome
+    """Of the flight."""
+    flown_s: float
+    """Its time from the start of navigation [s]."""
+    rehearsals: int
+    rehearsed_s: tuple[float, ...]
+    """The same of those rehearsals that reached the goal."""
+    apart_m: NDArray[np.float64]
+    """(n,) horizontal distance of the points of the flown path from the nearest one of all
+    rehearsed paths [m]."""
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Say it."""
+        times = sorted(self.rehearsed_s)
+        reached = f"{len(times)} of {self.rehearsals} rehearsals reached the goal"
+        if times:
+            reached += f", in {times[0]:.2f} to {times[-1]:.2f} s (median {np.median(times):.2f} s)"
+        apart = (
+            f"Its path is {np.median(self.apart_m):.2f} m from the nearest rehearsed one (median), "
+            f"{self.apart_m.max():.2f} m at most."
+        )
+        if self.outcome is not Outcome.SUCCESS or not times:
+            return f"The flight: {self.outcome.value}; {reached}.", apart
+        slower = sum(time >= self.flown_s for time in times)
+        place = f"{slower} of them took as long or longer"
+        return f"Flown in {self.flown_s:.2f} s; {reached}; {place}.", apart
+
+
+def refly(
+    path: Path,
+    out: Path,
+    *,
+    arena: str | None = None,
+    arena_seed: int | None = None,
+    episodes: int = 20,
+    policy: str | None = None,
+    trust: bool = False,
+    progress: bool = False,
+) -> Reflight:
+    """Rehearse a recorded flight, several times.
+
+    A policy that chooses among actions turns centimetres into another way around a tree: the same
+    flight, flown twice, is not the same. So the rehearsals differ as flights do, by the noise of
+    their sensors, and the flight is held against all of them.
+
+    Without an arena its rehearsal flies over an empty plain, and both paths are given from where
+    navigation began, with the nose north then. In an arena, which the flight was in, nothing is
+    moved.
+
+    Args:
+        path: The black box.
+        out: New folder; the two run folders `flown` and `rehearsed` come into it.
+        arena: Arena profile: a shipped name, or a path.
+        arena_seed: Its seed; None: that of the flight.
+        episodes: Number of rehearsals, each with sensors of its own.
+        policy: Policy to rehearse; None: the one that flew, by the name that it had then.
+        trust: See `Scenario.trust`.
+        progress: Whether to draw a bar on standard error.
+
+    Raises:
+        UsageError: The recording holds no navigation, its settings are none that can be rehearsed,
+            or the folder holds something. `FieldError`s name the field.
+    """
+    box = read_black_box(path)
+    episode, info = episode_of(box), info_of(box)
+    quality = episode.record.quality
+    if quality is None or not len(episode.latency["sent_us"]):
+        raise UsageError(f"{path}: no decision was recorded; accepted: a flight that navigated")
+    if out.exists() and any(out.iterdir()):
+        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+    out.mkdir(parents=True, exist_ok=True)
+    _write_latencies(episode, out / LATENCIES_FILE)
+    if arena is None:
+        episode = from_its_start(episode)
+        arena = _plain(episode, out / ARENA_FILE)
+    given = {
+        "arena": arena,
+        "arena_seed": episode.record.seed if arena_seed is None else arena_seed,
+        "policy": policy or box.run["config"]["policy"],
+        "trust": trust,
+        "episodes": episodes,
+    }
+    scenario = _scenario(box, out / LATENCIES_FILE, given)
+    _check_goal(scenario, episode)
+    record = replace(
+        episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
+    )
+    _save(replace(episode, record=record), info, out / FLOWN)
+    run = rehearse(scenario, out=out / REHEARSED, progress=progress)
+    flown = _navigated(episode.trajectory, record)
+    paths = [
+        distances(flown, _navigated(run.trajectories[each.index], each))
+        for each in run.episodes
+        if each.navigation_us is not None
+    ]
+    if not paths:
+        raise UsageError(f"{run.path}: no rehearsal navigated: {run.episodes[0].reason}")
+    return Reflight(
+        record.outcome,
+        quality.flight_time_s,
+        len(run.episodes),
+        tuple(each.flight_time_s for each in successful(run.episodes)),
+        np.min(paths, axis=0),
+    )
+
+
+def from_its_start(episode: FlownEpisode) -> FlownEpisode:
+    """Return a flight as if navigation had begun over the origin, with the nose north.
+
+    Heights stay.
+    """
+    path, record = episode.trajectory, episode.record
+    before = int(np.searchsorted(path.time_us, record.navigation_us or 0, side="right")) - 1
+    begun = max(before, 0)
+    origin = path.position[begun] * (1.0, 1.0, 0.0)
+    yaw = quat_yaw(path.quaternion[begun])
+    turn = np.array(
+        [[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
+    )
+    goal = turn @ (np.array([*record.goal, 0.0]) - origin)
+    moved = replace(
+        path,
+        position=(path.position - origin) @ turn.T,
+        velocity=path.velocity @ turn.T,
+        quaternion=_turned(path.quaternion, -yaw),
+    )
+    return replace(
+        episode, trajectory=moved, record=replace(record, goal=(float(goal[0]), float(goal[1])))
+    )
+
+
+def distances(flown: Trajectory, rehearsed: Trajectory) -> NDArray[np.float64]:
+    """Return how far the points (n,) of a path are from the nearest ones of another [m], level."""
+    between = flown.position[:, None, :2] - rehearsed.position[None, :, :2]
+    return np.asarray(np.linalg.norm(between, axis=2).min(axis=1), np.float64)
+
+
+def _turned(quaternion: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    """Return attitudes (n, 4) turned about the vertical [rad]."""
+    w, z = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    a, b, c, d = quaternion.T
+    return np.stack([w * a - z * d, w * b - z * c, w * c + z * b, w * d + z * a], axis=1)
+
+
+def _navigated(path: Trajectory, record: Any) -> Trajectory:
+    return path.between(record.navigation_us, record.ended_us)
+
+
+def _write_latencies(episode: FlownEpisode, path: Path) -> None:
+    """Write the latencies of the decisions, as `--latency FILE` reads them."""
+    t2_us = episode.latency["action_ready_us"] - episode.latency["infer_start_us"]
+    lines = [f"{value / US_PER_MS:.3f}\n" for value in t2_us]
+    replace_file(path, "".join(lines).encode())
+
+
+def _plain(episode: FlownEpisode, path: Path) -> str:
+    """Write the profile of an empty arena around a flight, and return its path."""
+    here = np.vstack([episode.trajectory.position[:, :2], [0.0, 0.0], episode.record.goal])
+    low, high = here.min(axis=0) - CLEAR_M, here.max(axis=0) + CLEAR_M
+    (north, east), (start_north, start_east) = high - low, -low
+    goal_north, goal_east = episode.record.goal
+    profile = {
+        "description": "an empty plain",
+        "zones_m": [float(max(np.hypot(north, east), 1.0))],
+        "size": {"north_m": float(north), "east_m": float(east)},
+        "start": {"north_m": float(start_north), "east_m": float(start_east)},
+        "goal": {"north_m": goal_north, "east_m": goal_east},
+        "static": {"count": [0, 0]},
+    }
+    try:
+        ArenaSpec.model_validate(profile)
+    except ValueError:
+        raise UsageError(
+            f"a flight over {north - 2 * CLEAR_M:.0f} x {east - 2 * CLEAR_M:.0f} m; accepted: "
+            f"at most {500 - 2 * CLEAR_M:.0f} m each way"
+        ) from None
+    replace_file(path, tomli_w.dumps(profile).encode())
+    return str(path)
+
+
+def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario:
+    """Return the rehearsal of a flight: what its companion was asked for, in lockstep."""
+    asked = box.run["config"]
+    names = (*Decisions.model_fields, "vehicle", "policy", "seed")
+    kept = {name: asked[name] for name in names if name in asked}
+    how = {
+        "level": "lockstep",
+        "latency": str(latencies),
+        "time_limit_s": asked["limits"]["flight_s"],
+        "cpu_quota": None,  # What its processor took is in the latencies.
+    }
+    return validated(Scenario, {**kept, **how, **given}, box.path)
+
+
+def _check_goal(scenario: Scenario, episode: FlownEpisode) -> None:
+    resolved = resolve(scenario)
+    goal = resolved.arena_of(scenario.seed).goal
+    flown = episode.record.goal
+    if math.hypot(goal[0] - flown[0], goal[1] - flown[1]) > SAME_GOAL_M:
+        raise FieldError(
+            "arena",
+            scenario.arena,
+            f"one with the goal of the flight, {flown[0]:.1f} m north and {flown[1]:.1f} m east of"
+            f" the start, not {goal[0]:.1f} and {goal[1]:.1f}",
+        )
+
+
+def _save(episode: FlownEpisode, info: RunInfo, folder: Path) -> None:
+    RunFolder.adopt(folder, info).save_episodes([episode])
