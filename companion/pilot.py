@@ -58,6 +58,9 @@ class Decided(NamedTuple):
     """When its hold is to end."""
     held_before_us: int
     """When that of the decision before ended; `NO_STAMP` for the first."""
+    expires_us: int | None
+    """When the velocity is zeroed unless another decision has come; None: never."""
+    depth_mm: NDArray[np.uint16]  # (h, w) what the policy saw [mm], compensated where that is asked
 
 
 @dataclass
@@ -167,21 +170,23 @@ class Pilot:
             return ending.reason
         if not self.watchdog.command(setpoint, hold_us):
             return "watchdog"
+        hover_s = self.watchdog.hover_after_s
+        expires_us = None if hover_s is None else sent_us + hold_us + hover_s * US_PER_S
         if self.decided is not None:
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
             times = started_us, ready_us, sent_us, held_us, self.held_us
-            self.decided(Decided(seen, state, setpoint, *times))
+            lasts_us = None if expires_us is None else int(expires_us)
+            self.decided(Decided(seen, state, setpoint, *times, lasts_us, observation.depth_mm))
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)
         else:
-            hover_s = self.watchdog.hover_after_s
             self.compensator.decided(
                 ONE,
                 np.array([setpoint]),
                 t2_us,
                 np.array([sent_us]),
-                None if hover_s is None else np.array([sent_us + hold_us + hover_s * US_PER_S]),
+                None if expires_us is None else np.array([expires_us]),
             )
         if settings.decisions == "sequential":
             self.watchdog.doing("holding an action")

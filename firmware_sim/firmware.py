@@ -197,6 +197,8 @@ class Firmware:
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
         """Called after every tick, if set."""
+        self.on_frame: Callable[[Frame], None] | None = None
+        """Called with every frame of the camera, before it is published, if set."""
         self.on_message: Callable[[Message], None] | None = None
         """Called with every text of the autopilot for its operator, if set."""
         self.on_log_lost: Callable[[str], None] | None = None
@@ -328,7 +330,9 @@ class Firmware:
         receive(began_us)
         # Before the tick, while its time is now: after it the state lies one tick ahead.
         if self._camera is not None:
-            simulation.capture_due(self._camera.publish)
+            simulation.capture_due(
+                self._camera.publish if self.on_frame is None else self._show_and_publish
+            )
         log = self._flight_log
         if log is None:
             simulation.tick()
@@ -341,6 +345,12 @@ class Firmware:
         flight_stack.send(simulation.time_us)
         if self.on_tick is not None:
             self.on_tick(simulation)
+
+    def _show_and_publish(self, frame: Frame) -> None:
+        if self.on_frame is not None:
+            self.on_frame(frame)
+        if self._camera is not None:
+            self._camera.publish(frame)
 
     def save(self, path: Path) -> None:
         """Write the episode's arrays and close its logs; the flight goes on unrecorded."""

@@ -133,6 +133,11 @@ class Plant:
         at = self.motion.item
         return at(0), at(1), at(2)
 
+    @property
+    def rotor_speeds(self) -> Speeds:
+        """Speeds of the rotors, as shares of that at full command, in the order of the motors."""
+        return self._speeds
+
     def step(self, controls: ActuatorControls) -> SensorSample:
         """Apply motor commands for one tick and return what the sensors then measure."""
         body, before, wind = self.body, self.motion, self.wind.step()

@@ -58,7 +58,8 @@ def main(path: Path) -> None:
         depth = np.full((48, 64), number % 20_000, np.uint16)
         seen = ReceivedFrame(Frame(number, now_us, depth, LENS), now_us)
         times = now_us, now_us, now_us, now_us + PERIOD_US, now_us
-        recorder.decided(Decided(seen, link.kinematics(), BodyVelocity(1.0, 0.0, 0.0, 0.0), *times))
+        command = BodyVelocity(1.0, 0.0, 0.0, 0.0)
+        recorder.decided(Decided(seen, link.kinematics(), command, *times, None, depth))
         sys.stdout.write(f"{now_us}\n")
         sys.stdout.flush()
         clock.sleep_until(now_us + PERIOD_US)
