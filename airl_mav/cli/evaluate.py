@@ -11,17 +11,19 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, RENAMED, scenario_of
+from airl_mav.cli.viewing import Viewing, view_of
+from airl_mav.core.errors import FieldError
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
 from airl_mav.experiments.experiment import known_seeds
-from airl_mav.experiments.fly import fly_scenario
-from airl_mav.experiments.live import EXIT_CODES
+from airl_mav.experiments.fly import fly_scenario, run_name
+from airl_mav.experiments.live import EXIT_CODES, fly_live
 from airl_mav.flight.record import run_sha256
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_report import show_report, verdict_of
 
 
-class EvaluateOptions(Gate, ExperimentOptions):
+class EvaluateOptions(Gate, Viewing, ExperimentOptions):
     """Fly policies through seeded episodes: success, time, distance and energy with intervals.
 
     Several policies or arenas give a table of policies x arenas. The same --out goes on with what
@@ -75,6 +77,13 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     each_fault = options.each_fault
     cells = evaluation_cells(scenario, options.policies, options.arena, each_fault=each_fault)
+    view = view_of(options)
+    if view is not None and (len(cells) > 1 or options.level == "gym"):
+        raise FieldError(
+            "view",
+            True,
+            problem="accepted: with one policy in one arena, at level lockstep or sitl",
+        )
     if options.on_card:
         check_plain(cells)
     if len(cells) > 1:
@@ -89,7 +98,12 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     with RichProgress(console) as progress:
         for warning in known_seeds(cells):
             progress.note(warning, "yellow")
-        run_ = fly_scenario(cell.scenario, options.out, progress)
+        if view is None:
+            run_ = fly_scenario(cell.scenario, options.out, progress)
+        else:
+            # One flight after the other, in the order in which they are watched.
+            name = run_name(cell.scenario)
+            run_ = fly_live(cell.scenario, options.out, progress, name=name, view=view)
     if options.on_card and run_.ended == "complete":
         write_on_card(cell, run_.episodes)
     code = EXIT_CODES[run_.ended]

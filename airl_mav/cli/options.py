@@ -347,6 +347,7 @@ EXTRAS = {
     "profile": ("onnx",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
+    "view": ("viser",),
 }
 """What the extras install, by their names in pyproject.toml."""
 

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import RENAMED, run_command, scenario_of
+from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
 
 
-class SitlOptions(Gate, Scenario):
+class SitlOptions(Gate, Viewing, Scenario):
     """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
 
     A first word that ends in .toml is a scenario file, whose values the options override; a run
@@ -34,6 +35,7 @@ class SitlOptions(Gate, Scenario):
         airl-sitl --vehicle quad
         airl-sitl --computer ras-pi-4 --workload template-5x32 --episodes 10
         airl-sitl --level lockstep --policy dynamic-obstacles --arena crowded
+        airl-sitl --level lockstep --arena dynamic-obstacles --view
         airl-sitl rehearsal.toml --latency 150ms --require "success >= 90 %"
     """
 
@@ -56,10 +58,15 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     """
     console = console or Console()
     requirements = requirements_of(options, reference=False)
+    view = view_of(options)
     scenario = resolve(scenario_of(options))
     with RichProgress(console) as progress:
         flown = fly_live(
-            scenario, options.out, progress, announce=partial(_announce, scenario, console)
+            scenario,
+            options.out,
+            progress,
+            announce=partial(_announce, scenario, console),
+            view=view,
         )
     judged = conclude(flown, options, requirements, console)
     return EXIT_CODES[flown.ended] or judged

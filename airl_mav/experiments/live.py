@@ -5,8 +5,8 @@ Light to import, so that the processes of a rehearsal are started at once.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,14 +18,24 @@ from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.progress import LiveObserver
+from airl_mav.rehearsal.progress import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import check_program
 
 Ended = Literal["complete", "interrupted", "broken off"]
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """That flights are to be watched while they fly."""
+
+    port: int | None = None
+    """TCP port of the page; None: any free one."""
+
 
 EXIT_CODES: dict[Ended, int] = {
     "complete": 0,
@@ -56,6 +66,7 @@ def fly_live(
     *,
     name: str | None = None,
     announce: Callable[[], None] = lambda: None,
+    view: ViewRequest | None = None,
 ) -> FlownRun:
     """Fly what is left of a scenario one flight after the other, at level sitl or lockstep.
 
@@ -65,6 +76,7 @@ def fly_live(
         progress: Who looks on.
         name: Name of a new run; None: after level and policy.
         announce: Called before the first flight, if there is one.
+        view: Shows the flights in a browser; None: nobody watches.
 
     Raises:
         UsageError: The input cannot be used; what was flown before is kept.
@@ -87,36 +99,61 @@ def fly_live(
         if len(done) == asked.episodes:
             return FlownRun(folder.path, "complete", done, 0)
         announce()
-        observer = LiveObserver(progress, done, asked.episodes)
+        live = LiveObserver(progress, done, asked.episodes)
+        observer: Observer = live
+        ends: ViewEnds | None = None
         indices = {record.index for record in done}
         ended: Ended = "complete"
         problem = ""
         try:
+            if view is not None:
+                ends, observer = held.enter_context(_watched(scenario, view, live, progress))
             if asked.level == "lockstep":
                 # Imported here: level sitl starts its processes sooner without the simulator.
                 from airl_mav.lockstep.flight import rehearse
 
-                rehearse(scenario, folder, observer, indices)
+                rehearse(scenario, folder, observer, indices, ends)
             else:
-                with Rehearsal(scenario, folder, observer, keeps=(keeps,)) as rehearsal:
+                with Rehearsal(scenario, folder, observer, (keeps,), ends) as rehearsal:
                     rehearsal.run(done=indices)
         except (RehearsalError, LockstepError) as error:
             ended, problem = "broken off", str(error)
         except KeyboardInterrupt:
             ended = "interrupted"
         except UsageError:
-            if not known and not observer.finished_records:
+            if not known and not live.finished_records:
                 folder.discard()
             raise
         finally:
-            observer.close()
+            live.close()
             folder.sweep()
             if asked.cpu_quota is not None:
                 remove_left()
         tell_end(folder.path, ended, problem, progress)
-        new = observer.finished_records
+        new = live.finished_records
         episodes = tuple(sorted((*done, *new), key=lambda record: record.index))
         return FlownRun(folder.path, ended, episodes, len(new), problem)
+
+
+@contextmanager
+def _watched(
+    scenario: ResolvedScenario, asked: ViewRequest, onwards: Observer, progress: Progress
+) -> Iterator[tuple[ViewEnds, Observer]]:
+    """Show flights: give where they connect, and who tells of them and passes it on."""
+    # Imported here: a run that nobody watches does without.
+    from airl_mav.rehearsal.view_observer import ViewObserver
+    from airl_mav.view.viewer import Viewer, ViewError
+
+    onwards.waiting("starting the view")
+    name = f"{scenario.policy.name} in {scenario.arena_name}, {scenario.level}"
+    try:
+        started = Viewer(scenario, name, asked.port)
+    except ViewError as error:
+        raise RehearsalError(str(error)) from None
+    with started as viewer:
+        progress.note(f"view       {viewer.url}")
+        with closing(ViewObserver(viewer.ends, onwards)) as observer:
+            yield viewer.ends, observer
 
 
 def tell_end(path: Path, ended: Ended, problem: str, progress: Progress) -> None:

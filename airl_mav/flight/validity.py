@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.latency.stamps import NO_STAMP
 
+BY_HAND = "latency or compensation was changed by hand"
+"""Why a flight is no test of its scenario that somebody has changed while it flew."""
+
 LATE_FRAMES = 3.0
 """A frame older than so many camera periods when it is decided on, or a decision that comes so much
 later than the end of the hold time before it, was late: with a host that keeps pace it is one

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Collection, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.validity import BY_HAND
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
@@ -27,18 +31,26 @@ from airl_mav.rehearsal.supervisor import Order, Supervisor
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
 from companion.mission import MissionResult, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
 
+if TYPE_CHECKING:  # A flight that nobody watches need not load it.
+    from airl_mav.lockstep.watched import Watched
+
 SHOW_EVERY = 125
 """The observer sees the true state every so many ticks: twice a simulated second."""
 
 
 def rehearse(
-    scenario: ResolvedScenario, folder: RunFolder, observer: Observer, done: Collection[int] = ()
+    scenario: ResolvedScenario,
+    folder: RunFolder,
+    observer: Observer,
+    done: Collection[int] = (),
+    view: ViewEnds | None = None,
 ) -> None:
     """Fly episodes one after the other; each is saved as it ends.
 
@@ -47,6 +59,7 @@ def rehearse(
         folder: Where everything goes.
         observer: Who looks on.
         done: Numbers of the episodes that need not be flown.
+        view: Where they are watched; None: nowhere.
 
     Raises:
         UsageError: The policy cannot use the camera; no arena can be made of a seed.
@@ -59,7 +72,7 @@ def rehearse(
             continue
         policy, tlog = scenario.fresh_policy(seed), folder.tlog_path(index)
         log = folder.path / FIRMWARE_PRINTS
-        flown = fly(scenario, policy, index, seed, tlog=tlog, log=log, observer=observer)
+        flown = fly(scenario, policy, index, seed, tlog=tlog, log=log, observer=observer, view=view)
         folder.save_episodes([flown])
         observer.finished(flown.record)
 
@@ -73,6 +86,7 @@ def fly(
     tlog: Path | None = None,
     log: Path | None = None,
     observer: Observer | None = None,
+    view: ViewEnds | None = None,
 ) -> FlownEpisode:
     """Fly one episode; the same scenario, policy and seed give the same flight, bit by bit.
 
@@ -87,6 +101,8 @@ def fly(
         tlog: Where its MAVLink log goes; None: no log.
         log: What real firmware prints goes here; None: to a file in its folder.
         observer: Who looks on.
+        view: Where it is watched, which may change its pace and, on record, its latency; None:
+            nowhere.
 
     Raises:
         UsageError: The policy cannot use the camera; no arena can be made of the seed; there is no
@@ -96,7 +112,7 @@ def fly(
     observer = observer or Observer()
     notes: list[str] = []
     while True:
-        flight = _Flight(resolved, policy, index, seed, observer, notes)
+        flight = _Flight(resolved, policy, index, seed, observer, notes, view)
         try:
             return flight.fly(tlog, log)
         except FirmwareLostError as error:
@@ -122,7 +138,10 @@ class _Flight:
         seed: int,
         observer: Observer,
         notes: Sequence[str],
+        view: ViewEnds | None,
     ) -> None:
+        self._view = view
+        self._watched: Watched | None = None
         self._notes = tuple(notes)
         self._resolved, self._policy, self._index, self._seed = resolved, policy, index, seed
         self._observer = observer
@@ -147,15 +166,25 @@ class _Flight:
         )
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
-        with Stage(
-            transport_us=TRANSPORT_US,
-            digest=self._digest,
-            speed=resolved.speed,
-            faults=resolved.scenario.faults,
-            vehicle=vehicle,
-        ) as self._stage:
+        with ExitStack() as held:
+            if self._view is not None:
+                from airl_mav.lockstep.watched import Watched
+
+                self._watched = held.enter_context(Watched(self._view, resolved))
+            self._stage = held.enter_context(
+                Stage(
+                    transport_us=TRANSPORT_US,
+                    digest=self._digest,
+                    # Who watches sets the pace.
+                    speed=resolved.speed if self._view is None else None,
+                    faults=resolved.scenario.faults,
+                    vehicle=vehicle,
+                )
+            )
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
+            if self._watched is not None:
+                self._stage.firmware.on_frame = self._watched.frame
             simulation = self._stage.run(
                 setup,
                 self._program,
@@ -168,14 +197,20 @@ class _Flight:
 
     def _begun(self, started_us: int) -> None:
         self._supervisor.started_us = started_us
+        if self._watched is not None:
+            self._watched.begin(self._seed, self._arena, started_us)
         self._observer.episode(self._index, self._seed, self._goal)
 
     # --- the companion's thread
 
     def _program(self) -> None:
-        resolved, stage = self._resolved, self._stage
-        compensator = resolved.compensator()
+        resolved, stage, watched = self._resolved, self._stage, self._watched
+        compensator, decided = resolved.compensator(), None
+        latency = resolved.latency_sampler(self._seed, native=False)
         check_camera(self._policy, stage.camera, self._stop, compensator)
+        if watched is not None:
+            latency = watched.companion.latency(latency)
+            compensator, decided = watched.companion.compensator(), watched.decided
         self._result = fly_mission(
             stage.link,
             stage.camera,
@@ -189,9 +224,10 @@ class _Flight:
             watchdog_settings=resolved.watchdog,
             limit_settings=resolved.scenario.limits,
             guard=stage.clock,
-            latency=resolved.latency_sampler(self._seed, native=False),
+            latency=latency,
             compensator=compensator,
             mount_pitch_up_rad=math.radians(resolved.vehicle.camera.pitch_up_deg),
+            decided=decided,
         )
 
     def _announce(self, phase: str) -> None:
@@ -204,6 +240,8 @@ class _Flight:
     def _look(self, simulation: Simulation) -> None:
         """Take the true state after a tick."""
         self._judge.look(simulation)
+        if self._watched is not None:
+            self._watched.tick(simulation, self._judge.hit)
         self._ticks += 1
         if self._ticks % SHOW_EVERY == 0:
             self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
@@ -253,6 +291,9 @@ class _Flight:
             faults=faults_of(arrays),
             sha256=self._fingerprint(),
         )
+        if self._watched is not None and self._watched.companion.touched:
+            notes = (*record.notes, BY_HAND)
+            record = replace(record, notes=notes, invalid=(*record.invalid, BY_HAND), sha256=None)
         return FlownEpisode(record, trajectory, latency)
 
     def _fingerprint(self) -> dict[str, str] | None:

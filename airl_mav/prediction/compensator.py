@@ -95,6 +95,10 @@ class Compensator:
         self._kept[i] = 0
         self._setpoint[i], self._answered_us[i], self._stopped_us[i] = 0.0, 0, NEVER_US
 
+    def forget(self, i: int) -> None:
+        """Forget the images of companion i: what comes next does not follow on them."""
+        self._kept[i] = 0
+
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         return {

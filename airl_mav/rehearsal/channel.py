@@ -20,6 +20,7 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
 
 
 class _Line(BaseModel):
@@ -42,6 +43,8 @@ class Begin(_Line):
     scenario: ResolvedScenario
     log: str | None = None
     """What real firmware prints goes to this file."""
+    view: ViewEnds | None = None
+    """Where the flights are watched; None: nowhere."""
 
 
 # --- rehearsal -> firmware
@@ -193,6 +196,8 @@ class Ended(_Line):
     notes: tuple[str, ...] = ()
     path: str
     """Of the decision log."""
+    by_hand: bool = False
+    """Whether its latency or its compensation was changed by hand."""
     use: ProcessUse | None = None
     """What the mission took of the companion's machine; None where it is no process of its own."""
     sha256: dict[str, str] = Field(default_factory=dict)

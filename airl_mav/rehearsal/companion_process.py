@@ -10,9 +10,9 @@ import os
 import queue
 import sys
 import threading
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.cpu_quota import held_to
@@ -39,6 +39,9 @@ from companion.mavsdk_link import MavsdkLink
 from companion.mission import check_camera, fly_mission
 from companion.signing_proxy import signed
 
+if TYPE_CHECKING:  # A companion that nobody watches need not load it.
+    from airl_mav.view.taps import CompanionTap
+
 CONNECT_TIMEOUT_S = 30.0
 """Longest wait for the flight controller [wall s]."""
 
@@ -46,9 +49,16 @@ CONNECT_TIMEOUT_S = 30.0
 class Missions:
     """Flies missions; link and camera stay open for all of them."""
 
-    def __init__(self, scenario: ResolvedScenario, channel: ChildChannel) -> None:
-        """Load the policy; nothing is connected yet. Raises UsageError if it cannot be run."""
+    def __init__(
+        self, scenario: ResolvedScenario, channel: ChildChannel, tap: CompanionTap | None = None
+    ) -> None:
+        """Load the policy; nothing is connected yet.
+
+        A `tap` shows the decisions, to those who may set how late they are. Raises UsageError if
+        the policy cannot be run.
+        """
         self._scenario = scenario
+        self._tap = tap
         self._channel = channel
         self._clock = WallClock(scenario.speed or 1.0)
         self._requests: queue.Queue[Any] = queue.Queue()
@@ -94,6 +104,12 @@ class Missions:
                     link.connect(CONNECT_TIMEOUT_S)
                 policy = self._scenario.fresh_policy(request.seed)
                 check_camera(policy, frames, self._stop, compensator)
+                latency = self._scenario.latency_sampler(request.seed, native=True)
+                carries, decided, tap = compensator, None, self._tap
+                if tap is not None:
+                    tap.begin()
+                    latency, carries = tap.latency(latency), tap.compensator()
+                    decided = tap.decided
                 use.begin()
                 result = fly_mission(
                     link,
@@ -108,14 +124,21 @@ class Missions:
                     watchdog_settings=self._scenario.watchdog,
                     limit_settings=self._scenario.scenario.limits,
                     guard=ThreadGuard(clock),
-                    latency=self._scenario.latency_sampler(request.seed, native=True),
-                    compensator=compensator,
+                    latency=latency,
+                    compensator=carries,
                     mount_pitch_up_rad=math.radians(self._scenario.vehicle.camera.pitch_up_deg),
+                    decided=decided,
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())
                 self._channel.send(
-                    Ended(reason=result.reason, notes=result.notes, path=request.record, use=used)
+                    Ended(
+                        reason=result.reason,
+                        notes=result.notes,
+                        path=request.record,
+                        by_hand=tap is not None and tap.touched,
+                        use=used,
+                    )
                 )
 
     def _announce(self, phase: str) -> None:
@@ -124,11 +147,17 @@ class Missions:
 
 def fly(begin: Begin, channel: ChildChannel) -> None:
     """Fly missions on request, until the pipe ends."""
-    missions = Missions(begin.scenario, channel)
-    # Without its rehearsal a companion has no business in the air, whatever it is doing: its
-    # setpoints end and the flight controller's offboard-loss failsafe takes over.
-    channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
-    missions.run()
+    with ExitStack() as held:
+        tap: CompanionTap | None = None
+        if begin.view is not None:
+            from airl_mav.view.taps import CompanionTap
+
+            tap = held.enter_context(closing(CompanionTap(begin.view, begin.scenario)))
+        missions = Missions(begin.scenario, channel, tap)
+        # Without its rehearsal a companion has no business in the air, whatever it is doing: its
+        # setpoints end and the flight controller's offboard-loss failsafe takes over.
+        channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
+        missions.run()
 
 
 if __name__ == "__main__":

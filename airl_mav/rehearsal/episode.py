@@ -18,7 +18,7 @@ from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.flight.validity import host_faults, host_figures
+from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.rehearsal.channel import Ended, Loaded, State
@@ -113,6 +113,9 @@ def join_episode(
     if scenario.scenario.validity:
         strangers = arrays["commands/strangers"].tolist()
         record = replace(record, invalid=host_faults(figures, strangers))
+    if episode.ended is not None and episode.ended.by_hand:
+        notes, invalid = (*record.notes, BY_HAND), (*record.invalid, BY_HAND)
+        record = replace(record, notes=notes, invalid=invalid)
     return FlownEpisode(record, trajectory, latency)
 
 

@@ -9,9 +9,9 @@ import contextlib
 import queue
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.constants import US_PER_S
@@ -52,6 +52,9 @@ from firmware_sim.pacing import Pacing, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from firmware_sim.warm_up import warm_up
+
+if TYPE_CHECKING:  # A firmware that nobody watches need not load it.
+    from airl_mav.view.taps import SimulationTap
 
 STATE_EVERY_US = 40_000
 """The rehearsal hears the true state so often: 25 Hz."""
@@ -139,8 +142,12 @@ class Service:
         firmware: Firmware,
         channel: ChildChannel,
         scenario: ResolvedScenario,
+        tap: SimulationTap | None = None,
     ) -> None:
-        """Take what flies, whom to tell, and what is flown."""
+        """Take what flies, whom to tell, what is flown, and what shows it to a view."""
+        self._tap = tap
+        if tap is not None:
+            firmware.on_frame = tap.frame
         self._firmware = firmware
         self._channel = channel
         self._scenario = scenario
@@ -185,6 +192,8 @@ class Service:
         self._crash = CrashDetector()
         self._due.clear()
         loaded = self._firmware.load(episode, tlog, unix_us())
+        if self._tap is not None:
+            self._tap.begin(request.seed, arena, loaded.time_us)
         self._record = Path(request.record)
         self._channel.send(
             Loaded(
@@ -205,7 +214,10 @@ class Service:
         if simulation.faults is not None:
             self._tell_faults(simulation.faults, simulation.time_us)
         period = simulation.time_us // STATE_EVERY_US
-        if not self._crash.look(simulation) and period == self._reported:
+        hit = self._crash.look(simulation)
+        if self._tap is not None:
+            self._tap.tick(simulation, self._crash.hit)
+        if not hit and period == self._reported:
             return
         self._reported = period
         self._channel.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
@@ -245,10 +257,16 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
         WallPacing(scenario.speed or 1.0),
         log=None if begin.log is None else Path(begin.log),
     )
-    with closing(firmware):
+    with ExitStack() as held:
+        held.enter_context(closing(firmware))
+        tap: SimulationTap | None = None
+        if begin.view is not None:
+            from airl_mav.view.taps import SimulationTap
+
+            tap = held.enter_context(closing(SimulationTap(begin.view, scenario)))
         warm_up(scenario.vehicle, scenario.scenario.plant)
         channel.send(Ready())
-        Service(firmware, channel, scenario).run(requests)
+        Service(firmware, channel, scenario, tap).run(requests)
 
 
 if __name__ == "__main__":

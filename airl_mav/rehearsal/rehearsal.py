@@ -13,6 +13,7 @@ from pathlib import Path
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
+from airl_mav.flight.validity import BY_HAND
 from airl_mav.rehearsal.channel import (
     Abort,
     Begin,
@@ -42,6 +43,7 @@ from airl_mav.rehearsal.progress import WARNING, Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import TAKEOFF_LIMIT_S, Order, Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
 from firmware_sim.external.programs import load_timeout_s
 
 WRAP_UP_S = 90.0
@@ -63,6 +65,7 @@ class Rehearsal:
         folder: RunFolder,
         observer: Observer,
         keeps: Sequence[int] = (),
+        view: ViewEnds | None = None,
     ) -> None:
         """Take the scenario; nothing is started yet.
 
@@ -71,7 +74,9 @@ class Rehearsal:
             folder: Where everything goes.
             observer: Who looks on.
             keeps: File descriptors that the processes inherit: locks.
+            view: Where the flights are watched; None: nowhere.
         """
+        self._view = view
         self._scenario = scenario
         self._speed = scenario.speed or 1.0
         self._folder = folder
@@ -119,7 +124,9 @@ class Rehearsal:
                 self._observer.lost(f"{flight} begins again: {error}")
                 continue
             faults = "; ".join(flown.record.invalid)
-            if not faults or len(notes) + 1 == MAX_ATTEMPTS:
+            # What somebody has changed on purpose is not flown again behind their back.
+            by_hand = BY_HAND in flown.record.invalid
+            if not faults or by_hand or len(notes) + 1 == MAX_ATTEMPTS:
                 break
             notes.append(f"flown again: invalid: {faults}")
             self._observer.lost(f"{flight} is invalid and begins again: {faults}")
@@ -134,7 +141,7 @@ class Rehearsal:
             self._pair = pair = ProcessPair()
             self._observer.waiting("starting firmware and companion")
             log = (self._folder.path / FIRMWARE_PRINTS).absolute()
-            begin = Begin(scenario=self._scenario, log=str(log))
+            begin = Begin(scenario=self._scenario, log=str(log), view=self._view)
             pair.start(begin, self._folder.path, self._keeps)
         return self._pair
 

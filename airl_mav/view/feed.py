@@ -1,0 +1,129 @@
+"""How snapshots reach the view, and what its watchers ask for reaches the flight: ZeroMQ.
+
+Nobody waits: what a view that hangs or is gone cannot take is dropped.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import zmq
+from pydantic import ValidationError
+
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.view.ends import ViewEnds
+from airl_mav.view.messages import Depth, Message, Steering, Told, from_parts, to_parts
+
+QUEUED = 64
+"""Messages that wait for a view at most, on either side; more are dropped."""
+
+SILENCE_S = 5.0
+"""A view that says nothing for so long is gone: nothing that it asked for holds any more [s]."""
+
+
+class Feed:
+    """Sends snapshots. To be used from one thread at a time."""
+
+    def __init__(self, ends: ViewEnds) -> None:
+        """Connect; the view may start later, or be gone."""
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.PUSH)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.connect(ends.told)
+
+    def send(self, message: Message, depth_mm: Depth | None = None) -> None:
+        """Send a message with its image (h, w), or drop it."""
+        with suppress(zmq.Again):
+            self._socket.send_multipart(to_parts(message, depth_mm), zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Disconnect; what is still on its way is dropped."""
+        self._socket.close(linger=0)
+        self._context.term()
+
+
+class Asked:
+    """What the watchers ask for. To be used from one thread at a time."""
+
+    def __init__(self, ends: ViewEnds, default: Steering, clock: Clock | None = None) -> None:
+        """Connect.
+
+        Args:
+            ends: Where the view is.
+            default: What holds before it has said anything, and when it is gone.
+            clock: Of its silence; None: the wall clock.
+        """
+        self._clock = clock or WallClock()
+        self._heard_us = self._clock.time_us()
+        self._default = self._newest = default
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.setsockopt(zmq.CONFLATE, 1)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.subscribe(b"")
+        self._socket.connect(ends.asked)
+
+    def newest(self, wait_s: float = 0.0) -> Steering:
+        """Return what is asked for now; if it says nothing new, after waiting for so long."""
+        if self._socket.poll(round(1e3 * wait_s)):
+            with suppress(ValidationError):
+                self._newest = Steering.model_validate_json(self._socket.recv())
+            self._heard_us = self._clock.time_us()
+        elif self._clock.time_us() - self._heard_us > SILENCE_S * US_PER_S:
+            self._newest = self._default
+        return self._newest
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._socket.close(linger=0)
+        self._context.term()
+
+
+class Ends:
+    """The view's own ends: takes snapshots in, says what is asked for."""
+
+    def __init__(self) -> None:
+        """Bind two free ports of the loopback address."""
+        self._context = zmq.Context()
+        self._told = self._bound(zmq.PULL)
+        self._asked = self._bound(zmq.PUB)
+        self.ends = ViewEnds(told=_address(self._told), asked=_address(self._asked))
+        """Where flights connect."""
+
+    def _bound(self, kind: int) -> zmq.Socket[bytes]:
+        socket: zmq.Socket[bytes] = self._context.socket(kind)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM if kind == zmq.PULL else zmq.SNDHWM, QUEUED)
+        socket.bind(f"tcp://{LOOPBACK}:*")
+        return socket
+
+    def take(self, wait_s: float) -> list[tuple[Told, Depth | None]]:
+        """Return all that has come, oldest first; if it is nothing, after waiting for so long."""
+        found: list[tuple[Told, Depth | None]] = []
+        wait_ms = round(1e3 * wait_s)
+        while self._told.poll(wait_ms):
+            read = from_parts(self._told.recv_multipart())
+            if read is not None:
+                found.append(read)
+            wait_ms = 0
+            if len(found) >= 16 * QUEUED:
+                break  # A flight at full speed: what is there is drawn first.
+        return found
+
+    def ask(self, steering: Steering) -> None:
+        """Say what is asked for; again and again, for those who connect later."""
+        self._asked.send(steering.model_dump_json().encode(), zmq.NOBLOCK)
+
+    def close(self) -> None:
+        """Free the ports."""
+        self._told.close(linger=0)
+        self._asked.close(linger=0)
+        self._context.term()
+
+
+def _address(socket: zmq.Socket[Any]) -> str:
+    return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).rstrip("\0")

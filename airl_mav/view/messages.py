@@ -1,0 +1,264 @@
+"""What a flight tells its view: small snapshots of pure data, and their bytes on the wire.
+
+Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
+simulated [µs]. A message is one part of JSON; an image follows as a second part, little-endian
+uint16 millimetres.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.profiles.vehicle import Momentum, VehicleProfile
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Depth = NDArray[np.uint16]
+
+ROTOR_SHARE = 0.8
+"""Radius of a rotor as a share of half the distance to its neighbour, where the profile does not
+say it."""
+
+
+class Message(BaseModel):
+    """One message."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TourShown(Message):
+    """The way of a moving obstacle, as `arena.geometry.Tour`."""
+
+    times_s: tuple[float, ...]
+    points: tuple[tuple[float, float], ...]
+
+
+class ArenaShown(Message):
+    """An arena as plain numbers, as `arena.geometry.Arena`."""
+
+    name: str
+    seed: int
+    bounds: tuple[float, float, float, float, float]
+    wall_colour: tuple[int, int, int]
+    shape: tuple[int, ...]
+    center: tuple[Vector3, ...]
+    half_size: tuple[Vector3, ...]
+    yaw: tuple[float, ...]
+    tours: tuple[TourShown, ...]
+    goal: tuple[float, float]
+
+    @classmethod
+    def of(cls, arena: Arena) -> ArenaShown:
+        """Return an arena as plain numbers."""
+        obstacles, (north, east) = arena.obstacles, arena.goal.tolist()
+        return cls(
+            name=arena.name,
+            seed=arena.seed,
+            bounds=_row(arena.bounds.as_array()),
+            wall_colour=arena.wall_colour,
+            shape=tuple(obstacles.shape.tolist()),
+            center=_rows(obstacles.center),
+            half_size=_rows(obstacles.half_size),
+            yaw=tuple(obstacles.yaw.tolist()),
+            tours=tuple(
+                TourShown(times_s=tuple(tour.times_s.tolist()), points=_rows(tour.points))
+                for tour in arena.tours
+            ),
+            goal=(north, east),
+        )
+
+    def arena(self) -> Arena:
+        """Return the arena."""
+        n = len(self.shape)
+        return Arena(
+            name=self.name,
+            seed=self.seed,
+            bounds=Bounds(*self.bounds),
+            wall_colour=self.wall_colour,
+            obstacles=Obstacles(
+                np.array(self.shape, np.int8),
+                np.array(self.center, np.float64).reshape(n, 3),
+                np.array(self.half_size, np.float64).reshape(n, 3),
+                np.array(self.yaw, np.float64),
+            ),
+            tours=tuple(Tour(np.array(t.times_s), np.array(t.points)) for t in self.tours),
+            goal=np.array(self.goal),
+        )
+
+
+class VehicleShape(Message):
+    """What a vehicle looks like, and where its camera looks [m, deg]."""
+
+    arm_forward_m: float
+    arm_right_m: float
+    rotor_radius_m: float
+    height_m: float
+    camera_forward_m: float
+    camera_up_m: float
+    camera_pitch_up_deg: float
+    camera_fov_deg: float
+    """Horizontal."""
+    camera_aspect: float
+    """Width over height."""
+    camera_range_m: float
+
+    @classmethod
+    def of(cls, vehicle: VehicleProfile) -> VehicleShape:
+        """Return what a vehicle of a profile looks like."""
+        rotor, camera, power = vehicle.rotor, vehicle.camera, vehicle.power
+        radius_m = ROTOR_SHARE * min(rotor.arm_forward_m, rotor.arm_right_m)
+        if isinstance(power, Momentum):
+            radius_m = 0.5 * power.propeller_diameter_m
+        return cls(
+            arm_forward_m=rotor.arm_forward_m,
+            arm_right_m=rotor.arm_right_m,
+            rotor_radius_m=radius_m,
+            height_m=vehicle.body.height_m,
+            camera_forward_m=camera.forward_m,
+            camera_up_m=camera.up_m,
+            camera_pitch_up_deg=camera.pitch_up_deg,
+            camera_fov_deg=camera.horizontal_fov_deg,
+            camera_aspect=camera.width_px / camera.height_px,
+            camera_range_m=camera.range_m,
+        )
+
+
+class Episode(Message):
+    """An episode begins, in a new arena."""
+
+    kind: Literal["episode"] = "episode"
+    seed: int
+    started_us: int
+    """When moving obstacles set out."""
+    arena: ArenaShown | None
+    """None: an endless floor."""
+    vehicle: VehicleShape
+    goal_radius_m: float
+
+
+class Vehicle(Message):
+    """The true state of the vehicle."""
+
+    kind: Literal["vehicle"] = "vehicle"
+    time_us: int
+    position: Vector3
+    velocity: Vector3
+    quaternion: Quaternion
+    rotors: Quaternion
+    """Their speeds, as shares of that at full command, in PX4's order."""
+    battery: float
+    """State of charge, 1 to 0."""
+    mode: str
+    armed: bool
+    collision: str | None
+    """What has been hit."""
+
+
+class Picture(Message):
+    """The camera's newest image."""
+
+    kind: Literal["picture"] = "picture"
+    captured_us: int
+    shape: tuple[int, int]
+    """Height and width [px]."""
+
+
+class Decided(Message):
+    """A decision that was sent, with the image that the policy saw."""
+
+    kind: Literal["decided"] = "decided"
+    captured_us: int
+    """Exposure of the frame."""
+    began_us: int
+    ready_us: int
+    sent_us: int
+    expires_us: int | None
+    """When the vehicle is told to hover if no other has come; None: never."""
+    setpoint: Quaternion
+    """Velocity forward, right, down [m/s] in the heading frame, yaw rate [rad/s]."""
+    compensated: bool
+    """Whether the policy saw what was expected, not what was."""
+    shape: tuple[int, int]
+    """Height and width of the image [px]."""
+
+
+class Flight(Message):
+    """A flight of the run begins, also one that begins again."""
+
+    kind: Literal["flight"] = "flight"
+    index: int
+    seed: int
+    goal: tuple[float, float]
+
+
+class Phase(Message):
+    """The companion has entered a phase, or the flight was judged."""
+
+    kind: Literal["phase"] = "phase"
+    time_us: int
+    phase: str
+
+
+class Said(Message):
+    """The autopilot has said something, or the run has."""
+
+    kind: Literal["said"] = "said"
+    time_us: int | None
+    severity: int
+    """MAV_SEVERITY: 4 is a warning, less is graver."""
+    text: str
+
+
+Told = Annotated[
+    Episode | Vehicle | Picture | Decided | Flight | Phase | Said, Field(discriminator="kind")
+]
+_TOLD: TypeAdapter[Told] = TypeAdapter(Told)
+
+
+class Steering(Message):
+    """What the watchers ask of the flight; the newest one counts."""
+
+    paused: bool = False
+    speed: float | None = None
+    """Simulated seconds per wall second; None: as fast as it goes."""
+    steps: int = 0
+    """How many single decisions were asked for so far, while paused."""
+    t2_ms: float | None = None
+    """The latency of every decision; None: as the scenario says."""
+    compensate: bool | None = None
+    """Whether it is compensated; None: as the scenario says."""
+
+
+def to_parts(message: Message, depth_mm: Depth | None = None) -> list[bytes]:
+    """Return the parts of a message; `depth_mm` (h, w) is its image."""
+    parts = [message.model_dump_json().encode()]
+    if depth_mm is not None:
+        parts.append(np.ascontiguousarray(depth_mm, "<u2").tobytes())
+    return parts
+
+
+def from_parts(parts: list[bytes]) -> tuple[Told, Depth | None] | None:
+    """Return a message and its image (h, w) [mm]; None for what is no message."""
+    try:
+        message = _TOLD.validate_json(parts[0])
+    except (ValidationError, IndexError):
+        return None
+    if not isinstance(message, Picture | Decided):
+        return message, None
+    height, width = message.shape
+    if len(parts) != 2 or min(height, width) < 1 or len(parts[1]) != 2 * height * width:
+        return None
+    return message, np.frombuffer(parts[1], "<u2").reshape(height, width)
+
+
+def _row(array: NDArray[np.float64]) -> Any:
+    return tuple(array.tolist())
+
+
+def _rows(array: NDArray[np.float64]) -> Any:
+    return tuple(tuple(row) for row in array.tolist())

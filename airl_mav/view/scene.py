@@ -1,0 +1,307 @@
+"""The scene in three dimensions: arena, vehicle, trail, arrows, camera.
+
+The scene's frame is the world's, local NED, with up = -z; the vehicle's parts are in its body
+frame FRD.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena, Bounds, Shape
+from airl_mav.core.frames import heading_to_ned, quat_from_euler, quat_multiply, quat_yaw
+from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
+from airl_mav.view.messages import Episode, Vehicle, VehicleShape
+from airl_mav.view.pictures import depth_picture
+from airl_mav.view.shown import Shown
+
+STILL, MOVING, GOAL, START = (139, 151, 163), (240, 147, 43), (27, 138, 63), (31, 78, 140)
+FLOOR, GRID, SECTION = (236, 238, 240), (214, 218, 222), (186, 192, 198)
+FLOWN, COMMANDED, TRAIL, DROP = (40, 104, 168), (214, 84, 10), (47, 127, 196), (120, 128, 136)
+BODY, NOSE, DISC, BLADE = (47, 54, 61), (214, 84, 10), (40, 104, 168), (33, 38, 45)
+
+WALL_OPACITY = 0.25
+FRUSTUM_M = 0.6
+"""How far in front of the vehicle the camera's image is drawn [m]."""
+
+ARROW_S = 0.6
+"""A velocity's arrow ends where the vehicle would be after so long [s]."""
+
+LEAST_ARROW_M = 0.02
+"""A shorter one is not drawn."""
+
+CHUNK = 200
+"""Segments of a finished part of the trail, which is not sent again."""
+
+BLADE_TURN_RAD = 1.9
+"""How far a rotor at full speed turns from one drawing to the next. A real one turns some ten
+times between two, which no screen shows."""
+
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+
+CAMERA_FROM_BODY = np.array([0.5, 0.5, 0.5, 0.5])
+"""From a camera that looks along +z with y down, as viser draws it, to the body frame FRD."""
+
+Floats = NDArray[np.float64]
+
+
+class FlightScene:
+    """The scene of one server. All calls come from one thread."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        """Prepare an empty scene."""
+        self._server = server
+        self._scene: Any = server.scene
+        self._scene.set_up_direction((0.0, 0.0, -1.0))
+        self._scene.world_axes.visible = False
+        self._drawn = -1
+        """Number of the episode that is drawn."""
+        self._reset()
+
+    def _reset(self) -> None:
+        self._scene.reset()
+        self._movers: list[Any] = []
+        self._blades: list[Any] = []
+        self._turns = np.zeros(4)
+        self._rotor_turn = np.array([-1.0 if c in COUNTER_CLOCKWISE else 1.0 for c in CORNERS])
+        self._trail: list[Any] = []
+        self._trail_points = 0
+        self._picture: Any = None
+
+    def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
+        return getattr(self._scene, f"add_{kind}")(name, *args, **properties)
+
+    def draw(self, shown: Shown, *, picture: bool) -> None:
+        """Draw what is shown now; the camera's image only where `picture` says so."""
+        episode = shown.episode
+        if episode is None:
+            return
+        with self._server.atomic():
+            if shown.episodes != self._drawn:
+                self._drawn = shown.episodes
+                self._reset()
+                self._build(episode, shown.arena)
+            if shown.vehicle is not None:
+                self._move(shown, shown.vehicle, episode)
+        if picture and shown.picture_mm is not None:
+            range_m = episode.vehicle.camera_range_m
+            self._camera.image = depth_picture(shown.picture_mm, range_m)
+
+    # --- once an episode
+
+    def _build(self, episode: Episode, arena: Arena | None) -> None:
+        if arena is not None:
+            self._build_arena(arena, episode.goal_radius_m)
+        self._build_vehicle(episode.vehicle)
+        none = np.zeros((0, 2, 3), np.float32)
+        # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
+        self._place = self._add("frame", "/place", show_axes=False)
+        self._drop = self._add("line_segments", "/place/drop", none, DROP, thickness=0.015)
+        sizes = {"shaft_radius": 0.025, "head_radius": 0.07, "head_length": 0.16}
+        self._flown = self._add("arrows", "/place/flown", none, FLOWN, **sizes)
+        self._commanded = self._add("arrows", "/place/commanded", none, COMMANDED, **sizes)
+
+    def _build_arena(self, arena: Arena, goal_radius_m: float) -> None:
+        b = arena.bounds
+        length, width = b.north_max - b.north_min, b.east_max - b.east_min
+        middle = (0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max))
+        self._add(
+            "grid",
+            "/arena/floor",
+            *(length, width),
+            plane="xy",
+            cell_size=1.0,
+            section_size=5.0,
+            cell_color=GRID,
+            section_color=SECTION,
+            plane_color=FLOOR,
+            plane_opacity=1.0,
+            fade_distance=400.0,
+            position=(*middle, 0.0),
+            # Its upper side is the one that looks along its own +z.
+            wxyz=quat_from_euler(math.pi, 0.0, 0.0),
+        )
+        corners, faces = walls(b)
+        self._add(
+            "mesh_simple",
+            "/arena/walls",
+            *(corners, faces),
+            color=arena.wall_colour,
+            opacity=WALL_OPACITY,
+            # From outside nobody looks through them.
+            side="front",
+            flat_shading=True,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        for i in range(len(arena.obstacles)):
+            moves = i >= arena.n_static
+            node = self._obstacle(arena, i, MOVING if moves else STILL)
+            if moves:
+                self._movers.append(node)
+        goal = (float(arena.goal[0]), float(arena.goal[1]))
+        self._add(
+            "cylinder",
+            "/goal/disc",
+            radius=goal_radius_m,
+            height=0.04,
+            color=GOAL,
+            opacity=0.45,
+            position=(*goal, -0.03),
+            cast_shadow=False,
+        )
+        height = 0.6 * b.height
+        self._add(
+            "cylinder",
+            "/goal/pole",
+            radius=0.04,
+            height=height,
+            color=GOAL,
+            position=(*goal, -0.5 * height),
+        )
+        self._add("label", "/goal/label", "goal", position=(*goal, -height - 0.2))
+        self._add(
+            "cylinder",
+            "/start",
+            radius=0.4,
+            height=0.03,
+            color=START,
+            opacity=0.5,
+            position=(0.0, 0.0, -0.02),
+            cast_shadow=False,
+        )
+
+    def _obstacle(self, arena: Arena, i: int, colour: tuple[int, int, int]) -> Any:
+        half, at = arena.obstacles.half_size[i].tolist(), tuple(arena.obstacles.center[i].tolist())
+        name = f"/arena/obstacle/{i}"
+        if arena.obstacles.shape[i] == Shape.BOX:
+            turn = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
+            size = tuple(2.0 * extent for extent in half)
+            return self._add("box", name, color=colour, dimensions=size, position=at, wxyz=turn)
+        if arena.obstacles.shape[i] == Shape.SPHERE:
+            return self._add("icosphere", name, radius=half[0], color=colour, position=at)
+        round_ = {"radius": half[0], "height": 2.0 * half[2]}
+        return self._add("cylinder", name, color=colour, position=at, **round_)
+
+    def _build_vehicle(self, shape: VehicleShape) -> None:
+        """Build the vehicle of its parts: a body, two arms, a nose, four rotors, a camera."""
+        self._vehicle = self._add("frame", "/vehicle", show_axes=False)
+        forward, right, radius = shape.arm_forward_m, shape.arm_right_m, shape.rotor_radius_m
+        height = max(0.04, 0.5 * shape.height_m)
+        size = 0.45 * min(forward, right)
+        self._add("box", "/vehicle/body", color=BODY, dimensions=(3.4 * size, 2.2 * size, height))
+        self._add(
+            "box",
+            "/vehicle/nose",
+            color=NOSE,
+            dimensions=(0.9 * size, 1.0 * size, 0.6 * height),
+            position=(2.0 * size, 0.0, 0.0),
+        )
+        for name, side in (("right", 1.0), ("left", -1.0)):
+            self._add(
+                "box",
+                f"/vehicle/arm/{name}",
+                color=BODY,
+                dimensions=(2.0 * math.hypot(forward, right), 0.025, 0.02),
+                wxyz=quat_from_euler(0.0, 0.0, math.atan2(side * right, forward)),
+            )
+        for corner in CORNERS:
+            at = (
+                forward if corner.startswith("front") else -forward,
+                right if corner.endswith("right") else -right,
+                -0.5 * height - 0.02,
+            )
+            name = f"/vehicle/rotor/{corner.replace(' ', '-')}"
+            disc = {"radius": radius, "height": 0.006, "color": DISC, "opacity": 0.5}
+            self._add("cylinder", f"{name}/disc", position=at, cast_shadow=False, **disc)
+            blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": BLADE}
+            self._blades.append(self._add("box", f"{name}/blade", position=at, **blade))
+        pitch = quat_from_euler(0.0, math.radians(shape.camera_pitch_up_deg), 0.0)
+        across = math.tan(0.5 * math.radians(shape.camera_fov_deg))
+        self._camera = self._add(
+            "camera_frustum",
+            "/vehicle/camera",
+            fov=2.0 * math.atan(across / shape.camera_aspect),
+            aspect=shape.camera_aspect,
+            scale=FRUSTUM_M,
+            thickness=0.012,
+            color=FLOWN,
+            position=(shape.camera_forward_m, 0.0, -shape.camera_up_m),
+            wxyz=quat_multiply(pitch, CAMERA_FROM_BODY),
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    # --- every time
+
+    def _move(self, shown: Shown, vehicle: Vehicle, episode: Episode) -> None:
+        at = np.array(vehicle.position)
+        self._vehicle.position, self._vehicle.wxyz = at, np.array(vehicle.quaternion)
+        self._place.position = at
+        self._turns += BLADE_TURN_RAD * self._rotor_turn * np.array(vehicle.rotors)
+        for blade, turn in zip(self._blades, self._turns.tolist(), strict=True):
+            blade.wxyz = quat_from_euler(0.0, 0.0, turn)
+        if shown.arena is not None and self._movers:
+            centers = shown.arena.centers_at(vehicle.time_us - episode.started_us)
+            for node, center in zip(self._movers, centers[shown.arena.n_static :], strict=True):
+                node.position = center
+        self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, -at[2]]]], np.float32)
+        self._flown.points = arrow(np.array(vehicle.velocity))
+        command = shown.command
+        if command is not None:
+            command = heading_to_ned(command, quat_yaw(np.array(vehicle.quaternion)))
+        self._commanded.points = arrow(command)
+        self._extend_trail(shown.trail)
+
+    def _extend_trail(self, trail: list[tuple[float, float, float]]) -> None:
+        """Draw the trail in parts, of which only the last one changes."""
+        if len(trail) == self._trail_points or len(trail) < 2:
+            return
+        self._trail_points = len(trail)
+        for part in range(max(0, len(self._trail) - 1), (len(trail) - 2) // CHUNK + 1):
+            segments = segments_of(trail[part * CHUNK : (part + 1) * CHUNK + 1])
+            if part == len(self._trail):
+                name = f"/trail/{part}"
+                self._trail.append(
+                    self._add("line_segments", name, segments, TRAIL, thickness=0.04)
+                )
+            else:
+                self._trail[part].points = segments
+
+
+def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Return the four walls as a mesh whose front is inside.
+
+    Returns:
+        Corners (8, 3) NED [m], and the corners of the triangles (8, 3).
+    """
+    b = bounds
+    ends = [
+        (b.north_max, b.east_min),
+        (b.north_max, b.east_max),
+        (b.north_min, b.east_max),
+        (b.north_min, b.east_min),
+    ]
+    corners = [(*end, height) for height in (0.0, -b.height) for end in ends]
+    faces = []
+    for here, after in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        faces += [(here, after, after + 4), (here, after + 4, here + 4)]
+    return np.array(corners, np.float32), np.array(faces, np.uint32)
+
+
+def arrow(velocity: Floats | None) -> NDArray[np.float32]:
+    """Return the arrow (n, 2, 3) of a velocity (3,) [m/s], from the origin [m]; n = 0: none."""
+    if velocity is None or np.linalg.norm(velocity) * ARROW_S < LEAST_ARROW_M:
+        return np.zeros((0, 2, 3), np.float32)
+    return np.array([[np.zeros(3), ARROW_S * velocity]], np.float32)
+
+
+def segments_of(points: list[tuple[float, float, float]]) -> NDArray[np.float32]:
+    """Return the segments (n - 1, 2, 3) of a line through n points."""
+    line = np.array(points, np.float32)
+    return np.stack([line[:-1], line[1:]], axis=1)

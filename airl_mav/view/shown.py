@@ -1,0 +1,144 @@
+"""What a view shows: the messages so far, folded into the newest of each kind and a short past."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.view.messages import (
+    Decided,
+    Depth,
+    Episode,
+    Flight,
+    Phase,
+    Picture,
+    Said,
+    Told,
+    Vehicle,
+)
+
+STRIP_S = 20.0
+"""How much of the past the strip shows [simulated s]."""
+
+TEXTS = 6
+"""So many of the newest texts are shown."""
+
+TRAIL_STEP_M = 0.05
+"""A point of the trail lies so far from the one before [m]."""
+
+OFFBOARD = "offboard"
+"""The mode in which setpoints are flown."""
+
+Point = tuple[float, float, float]
+
+
+@dataclass
+class Shown:
+    """All that is drawn."""
+
+    flight: Flight | None = None
+    phase: str = ""
+    texts: deque[Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
+    episode: Episode | None = None
+    arena: Arena | None = None
+    episodes: int = 0
+    """How many episodes have begun so far: another number is another scene."""
+    vehicle: Vehicle | None = None
+    trail: list[Point] = field(default_factory=list)
+    """Where the vehicle was in this episode, NED [m]."""
+    picture_mm: Depth | None = None
+    """The camera's newest image."""
+    decided: Decided | None = None
+    decided_mm: Depth | None = None
+    """What the policy saw at that decision."""
+    decisions: int = 0
+    """How many were sent in this episode, as far as they were heard of."""
+    ages: deque[tuple[float, float, float]] = field(default_factory=deque)
+    """Time since the episode began [s], age of the command and t2 of its decision [ms]."""
+
+    def take(self, message: Told, depth_mm: Depth | None) -> None:
+        """Take in a message, with its image (h, w) [mm]."""
+        if isinstance(message, Vehicle):
+            self._move(message)
+        elif isinstance(message, Picture):
+            self.picture_mm = depth_mm
+        elif isinstance(message, Decided):
+            self.decided, self.decided_mm = message, depth_mm
+            self.decisions += 1
+        elif isinstance(message, Episode):
+            self._begin(message)
+        elif isinstance(message, Phase):
+            self.phase = message.phase
+        elif isinstance(message, Said):
+            self.texts.append(message)
+        else:
+            self.flight, self.phase = message, "booting"
+
+    def _begin(self, episode: Episode) -> None:
+        self.episode = episode
+        self.arena = None if episode.arena is None else episode.arena.arena()
+        self.episodes += 1
+        self.vehicle = self.picture_mm = self.decided = self.decided_mm = None
+        self.trail, self.decisions = [], 0
+        self.ages.clear()
+
+    def _move(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        if not self.trail or math.dist(self.trail[-1], vehicle.position) >= TRAIL_STEP_M:
+            self.trail.append(vehicle.position)
+        age_ms, t2_ms = self.age_ms, self.t2_ms
+        if age_ms is not None and t2_ms is not None:
+            self.ages.append((self.seconds, age_ms, t2_ms))
+        while self.ages and self.ages[0][0] < self.seconds - STRIP_S:
+            self.ages.popleft()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the episode began [simulated s]."""
+        if self.vehicle is None or self.episode is None:
+            return 0.0
+        return (self.vehicle.time_us - self.episode.started_us) / US_PER_S
+
+    @property
+    def flies_setpoints(self) -> bool:
+        """Whether the vehicle flies what was decided."""
+        vehicle = self.vehicle
+        return vehicle is not None and vehicle.armed and vehicle.mode == OFFBOARD
+
+    @property
+    def age_ms(self) -> float | None:
+        """How old the image is that the present command was decided on [ms]."""
+        if self.decided is None or self.vehicle is None or not self.flies_setpoints:
+            return None
+        return max(0.0, (self.vehicle.time_us - self.decided.captured_us) / US_PER_MS)
+
+    @property
+    def t2_ms(self) -> float | None:
+        """What the newest decision took [ms]."""
+        if self.decided is None:
+            return None
+        return (self.decided.ready_us - self.decided.began_us) / US_PER_MS
+
+    @property
+    def command(self) -> NDArray[np.float64] | None:
+        """The velocity that is commanded (3,): forward, right, down [m/s]; None: nobody does."""
+        if self.decided is None or self.vehicle is None or not self.flies_setpoints:
+            return None
+        expires_us = self.decided.expires_us
+        if expires_us is not None and self.vehicle.time_us >= expires_us:
+            return np.zeros(3)
+        return np.array(self.decided.setpoint[:3])
+
+    @property
+    def to_goal_m(self) -> float | None:
+        """How far the goal is, seen from above [m]."""
+        if self.vehicle is None or self.arena is None:
+            return None
+        north, east, _ = self.vehicle.position
+        return math.hypot(self.arena.goal[0] - north, self.arena.goal[1] - east)

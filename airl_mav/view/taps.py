@@ -1,0 +1,146 @@
+"""Where a flight is looked into: its simulation, and its companion's decisions."""
+
+from __future__ import annotations
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import Frame
+from airl_mav.latency.samplers import LatencySampler
+from airl_mav.prediction.compensator import Compensator
+from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.by_hand import Hand, HandCompensator, HandLatency
+from airl_mav.view.ends import ViewEnds
+from airl_mav.view.feed import Asked, Feed
+from airl_mav.view.messages import (
+    ArenaShown,
+    Decided,
+    Episode,
+    Picture,
+    Steering,
+    Vehicle,
+    VehicleShape,
+)
+from companion.pilot import Decided as Decision
+from firmware_sim.autopilot.commander import Phase
+from firmware_sim.simulation import Simulation
+
+VEHICLE_EVERY_US = 32_000
+"""The vehicle is shown so often [simulated µs]: every eighth tick of 4 ms, 31 times a second."""
+
+PICTURE_EVERY_US = 100_000
+"""The camera's image is shown so often [simulated µs]."""
+
+
+class SimulationTap:
+    """Shows the simulation's side of flights. All calls from one thread."""
+
+    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+        """Connect to a view."""
+        self._feed = Feed(ends)
+        self._scenario = scenario
+        self._vehicle_due = self._picture_due = -1
+
+    def begin(self, seed: int, arena: Arena | None, started_us: int) -> None:
+        """An episode begins, in an arena; None: on an endless floor."""
+        self._vehicle_due = self._picture_due = -1
+        self._feed.send(
+            Episode(
+                seed=seed,
+                started_us=started_us,
+                arena=None if arena is None else ArenaShown.of(arena),
+                vehicle=VehicleShape.of(self._scenario.vehicle),
+                goal_radius_m=self._scenario.pilot.goal_radius_m,
+            )
+        )
+
+    def tick(self, simulation: Simulation, collision: str | None) -> None:
+        """A tick was flown; `collision` is what has been hit so far."""
+        due = simulation.time_us // VEHICLE_EVERY_US
+        if due == self._vehicle_due:
+            return
+        self._vehicle_due = due
+        truth, flight = simulation.truth, simulation.autopilot.flight
+        plant = simulation.plant
+        self._feed.send(
+            Vehicle(
+                time_us=truth.time_us,
+                position=tuple(truth.position.tolist()),
+                velocity=tuple(truth.velocity.tolist()),
+                quaternion=tuple(truth.quaternion.tolist()),
+                rotors=plant.rotor_speeds,
+                battery=truth.battery_remaining,
+                mode=flight.mode.name.lower().replace("_", " "),
+                armed=flight.phase >= Phase.GROUND,
+                collision=collision,
+            )
+        )
+
+    def frame(self, frame: Frame) -> None:
+        """The camera has taken a frame."""
+        due = frame.capture_time_us // PICTURE_EVERY_US
+        if due == self._picture_due:
+            return
+        self._picture_due = due
+        height, width = frame.depth_mm.shape
+        shown = Picture(captured_us=frame.capture_time_us, shape=(height, width))
+        self._feed.send(shown, frame.depth_mm)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._feed.close()
+
+
+class CompanionTap:
+    """Shows a companion's decisions, and lets the watchers change how late they are.
+
+    All calls from one thread.
+    """
+
+    def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
+        """Connect to a view."""
+        self._feed = Feed(ends)
+        self._asked = Asked(ends, Steering())
+        self._scenario = scenario
+        self._hand = self._new_hand()
+
+    def _new_hand(self) -> Hand:
+        return Hand(self._asked, compensate=self._scenario.pilot.compensate)
+
+    def begin(self) -> None:
+        """A flight begins."""
+        self._hand = self._new_hand()
+
+    @property
+    def touched(self) -> bool:
+        """Whether the watchers have changed the latency or the compensation of this flight."""
+        return self._hand.touched
+
+    def latency(self, sampler: LatencySampler | None) -> LatencySampler:
+        """Return a latency that the watchers may set, instead of the scenario's."""
+        return HandLatency(self._hand, sampler)
+
+    def compensator(self) -> Compensator | None:
+        """Return one that the watchers may switch; None: the vehicle's response is not known."""
+        if self._scenario.vehicle.response is None:
+            return None
+        return HandCompensator(self._hand, self._scenario)
+
+    def decided(self, decision: Decision) -> None:
+        """A decision was sent."""
+        height, width = decision.depth_mm.shape
+        forward, right, down, turn = (float(number) for number in decision.setpoint)
+        shown = Decided(
+            captured_us=decision.seen.frame.capture_time_us,
+            began_us=decision.started_us,
+            ready_us=decision.ready_us,
+            sent_us=decision.sent_us,
+            expires_us=decision.expires_us,
+            setpoint=(forward, right, down, turn),
+            compensated=self._scenario.vehicle.response is not None and self._hand.compensates(),
+            shape=(height, width),
+        )
+        self._feed.send(shown, decision.depth_mm)
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._asked.close()
+        self._feed.close()

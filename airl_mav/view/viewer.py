@@ -1,0 +1,104 @@
+"""The view of a run, from the side of who flies: its process, started and ended with the run."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from pydantic import ValidationError
+
+from airl_mav.core.child_process import ChildProcess
+from airl_mav.core.errors import FieldError
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
+from airl_mav.view.handshake import Answer, Request
+from airl_mav.view.pace import REAL_TIME
+
+MODULE = "airl_mav.view.server"
+
+
+class ViewError(Exception):
+    """The view cannot be shown; the message says why."""
+
+
+class Viewer:
+    """A page that shows a run. Use as a context manager."""
+
+    def __init__(self, scenario: ResolvedScenario, name: str, port: int | None = None) -> None:
+        """Start it and wait until it can be opened.
+
+        Args:
+            scenario: What is flown.
+            name: What the run is called.
+            port: TCP port of the page on the loopback address; None: any free one.
+
+        Raises:
+            FieldError: The port is taken.
+            ViewError: Its process does not start.
+        """
+        paced = scenario.scenario.level == "lockstep"
+        request = Request(
+            run=name,
+            port=port,
+            paced=paced,
+            speed=(scenario.speed or REAL_TIME) if paced else None,
+            compensable=scenario.vehicle.response is not None,
+            compensated=scenario.pilot.compensate,
+        )
+        self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
+        self._child = ChildProcess(
+            [sys.executable, "-m", MODULE],
+            Path(self._folder.name) / "view.log",
+            capture_stdout=True,
+        )
+        try:
+            answer = self._answer(request)
+            if answer.ends is None:
+                raise FieldError(
+                    "view_port", port, problem="the port is taken; accepted: a free one"
+                )
+        except BaseException:
+            self.close()
+            raise
+        self.ends: ViewEnds = answer.ends
+        """Where flights connect."""
+        self.url = f"http://{LOOPBACK}:{answer.port}"
+        """What to open in a browser."""
+
+    def _answer(self, request: Request) -> Answer:
+        stdin, stdout = self._child.stdin, self._child.stdout
+        line = b""
+        if stdin is not None and stdout is not None:
+            with suppress(BrokenPipeError):
+                stdin.write(request.model_dump_json().encode() + b"\n")
+                stdin.flush()
+                line = stdout.readline()
+        try:
+            return Answer.model_validate_json(line)
+        except ValidationError:
+            self._child.stop()
+            raise ViewError(f"the view did not start\n{self._child.log_tail()}") from None
+
+    def __enter__(self) -> Viewer:
+        """Return the viewer."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End it; the page says that its server is gone."""
+        self.close()
+
+    def close(self) -> None:
+        """End its process; harmless when called again."""
+        self._child.stop()
+        if self._child.stdout is not None:
+            self._child.stdout.close()
+        self._folder.cleanup()

@@ -1,0 +1,190 @@
+"""Flights that are watched: the same bit by bit, and on record where somebody changed them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from airl_mav.flight.validity import BY_HAND
+from airl_mav.lockstep.flight import fly
+from airl_mav.rehearsal.progress import Observer
+from airl_mav.rehearsal.rehearsal import Rehearsal
+from airl_mav.rehearsal.run_folder import FlownEpisode, load, open_folder
+from airl_mav.rehearsal.view_observer import ViewObserver
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from airl_mav.view.ends import ViewEnds
+from airl_mav.view.feed import Ends
+from airl_mav.view.messages import Decided, Episode, Flight, Phase, Picture, Steering, Vehicle
+from airl_mav.view.shown import Shown
+from tests.support.browser import CHROMIUM, Page, browser
+from tests.support.lockstep_kit import SEED, demo_scenario
+from tests.support.ports import choose_ports
+from tests.support.processes import SITL_WITHOUT_REPORT, running, wait_until
+
+SCENE_PX = 540
+"""Width of the scene on the page; the panel is beside it."""
+
+
+class Watchers:
+    """A view's end in this process: takes all in, and pauses, steps and goes on as a person may."""
+
+    def __init__(self, steering: Steering, *, steps: int = 0) -> None:
+        self.shown, self.kinds = Shown(), set[type]()
+        self.t2s_ms: list[float] = []
+        self._steering, self._left = steering, steps
+        self._ends, self._stop = Ends(), threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self.ends: ViewEnds = self._ends.ends
+
+    def _watch(self) -> None:
+        while not self._stop.is_set():
+            self._ends.ask(self._steering)
+            for message, depth_mm in self._ends.take(0.02):
+                self.shown.take(message, depth_mm)
+                self.kinds.add(type(message))
+                if isinstance(message, Decided):
+                    self.t2s_ms.append((message.ready_us - message.began_us) / 1e3)
+                    self._step()
+
+    def _step(self) -> None:
+        """Pause at the first decisions, and let one more be made."""
+        paused = self._left > 0
+        self._left -= 1
+        steps = self._steering.steps + 1
+        self._steering = self._steering.model_copy(update={"paused": paused, "steps": steps})
+
+    @contextmanager
+    def watching(self) -> Iterator[Watchers]:
+        self._thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            self._thread.join()
+            self._ends.close()
+
+
+def flown(ends: ViewEnds | None = None) -> FlownEpisode:
+    resolved = demo_scenario()
+    return fly(resolved, resolved.fresh_policy(SEED), 0, SEED, view=ends)
+
+
+def test_a_watched_flight_is_the_same_bit_by_bit() -> None:
+    alone = flown().record
+    with Watchers(Steering(speed=None), steps=4).watching() as watchers:
+        watched = flown(watchers.ends).record
+        wait_until(lambda: watchers.shown.decisions > 4, "decisions")
+    assert watched == alone
+    assert watched.sha256 is not None
+    assert {Episode, Vehicle, Picture, Decided} <= watchers.kinds
+    shown = watchers.shown
+    # What is drawn of it is what was flown: down at the goal, over the whole way.
+    assert shown.to_goal_m is not None
+    assert shown.to_goal_m < 3.5
+    assert len(shown.trail) > 100
+    assert shown.decided_mm is not None
+    assert shown.decided_mm.shape == (48, 64)
+
+
+def test_a_latency_by_hand_acts_and_is_on_record() -> None:
+    with Watchers(Steering(speed=None, t2_ms=250.0)).watching() as watchers:
+        record = flown(watchers.ends).record
+        wait_until(lambda: watchers.t2s_ms, "decisions")
+    # The first may have been made before anything was heard of the watchers.
+    assert watchers.t2s_ms[-1] == 250.0
+    assert record.invalid == (BY_HAND,)
+    assert BY_HAND in record.notes
+    assert record.sha256 is None
+
+
+@pytest.mark.slow
+def test_two_processes_show_their_flight_and_obey(tmp_path: Path) -> None:
+    """Changed by hand, it is kept as it was flown: not flown again, and not valid."""
+    ports = choose_ports()
+    scenario = resolve(
+        Scenario(
+            seed=SEED,
+            episodes=1,
+            speed=4.0,
+            time_limit_s=60.0,
+            ports={
+                "api_port": ports.api,
+                "api_local_port": ports.api_local,
+                "gcs_port": ports.gcs,
+                "gcs_local_port": ports.gcs_local,
+                "camera_port": ports.camera,
+            },
+        )
+    )
+    folder, _ = open_folder(tmp_path / "run", "watched", scenario)
+    with Watchers(Steering(t2_ms=200.0)).watching() as watchers:
+        observer = ViewObserver(watchers.ends, Observer())
+        with Rehearsal(scenario, folder, observer, view=watchers.ends) as rehearsal:
+            rehearsal.run()
+        wait_until(lambda: watchers.shown.phase == "done", "the end")
+        observer.close()
+    assert {Flight, Phase, Episode, Vehicle, Picture, Decided} <= watchers.kinds
+    (record,) = load(folder.path).episodes
+    assert BY_HAND in record.invalid
+    assert not any("flown again" in note for note in record.notes)
+    assert np.median(watchers.t2s_ms) == pytest.approx(200.0, rel=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+@pytest.mark.xdist_group("chromium")
+def test_a_browser_shows_the_flight(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    # Slowly, so that there is time to look.
+    words = (
+        *("--level", "lockstep", "--episodes", "1", "--seed", "1", "--max-speed-m-s", "1"),
+        *("--speed", "2", "--view", "--out", "run"),
+    )
+    with browser(tmp_path) as page, running([*SITL_WITHOUT_REPORT, *words], tmp_path) as sitl:
+        page.resize(900, 600)
+        page.open(sitl.wait_for_text(r"view +(http://127\.0\.0\.1:\d+)")[1])
+        wait_until(lambda: "navigating" in page.text(), "the flight on the page")
+        assert page.press("Pause")
+        times = [told_time(page.text())]
+
+        def stands() -> bool:
+            times.append(told_time(page.text()))
+            return times[-1] == times[-2]
+
+        wait_until(stands, "the pause")
+        time = times[-1]
+        assert page.press("Step")
+        wait_until(lambda: told_time(page.text()) != time, "a step")
+        # What the policy saw, each pixel three by three.
+        sizes = page.evaluate(
+            "[...document.querySelectorAll('img')].map((i) => [i.naturalWidth, i.naturalHeight])"
+        )
+        assert [192, 144] in sizes
+        shot = tmp_path / "page.png"
+        # The page draws in software here, in its own time.
+        wait_until(lambda: has_drawn(page, shot), "vehicle, trail and image")
+
+
+def told_time(text: str) -> str:
+    """Return the flight's time as the panel tells it."""
+    line = next((line for line in text.splitlines() if line.startswith("time")), "")
+    return line.partition(" s")[0]
+
+
+def has_drawn(page: Page, shot: Path) -> bool:
+    """Return whether the scene has the colours of trail, commanded velocity and depth image."""
+    page.screenshot(shot)
+    with Image.open(shot) as image:
+        scene = np.asarray(image.convert("RGB"))[:, :SCENE_PX].astype(int)
+    red, green, blue = scene[..., 0], scene[..., 1], scene[..., 2]
+    trail = (blue > 150) & (red < 110) & (blue - red > 80)
+    command = (red > 200) & (green > 120) & (blue < 140)
+    depth = (green > 120) & (red < 90) & (blue < 160)
+    return bool(trail.sum() > 200 and command.sum() > 20 and depth.sum() > 50)
