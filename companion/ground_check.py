@@ -74,7 +74,7 @@ def check_on_ground(
                     closing(MavsdkLink(url, clock, stop)) as link,
                 ):
                     link.connect(asked.connect_timeout, stop)
-                    yield from look_at_vehicle(link, stop)
+                    yield from look_at_vehicle(link, mission, stop)
                     if seen is not None and not stop.is_set():
                         yield time_decisions(mission, seen, link.kinematics())
             except (LinkError, UsageError) as error:
@@ -114,7 +114,7 @@ def look_at_camera(
     yield Finding("camera", True, f"{told}; {age_us / US_PER_MS:.0f} ms old where it is decided on")
 
 
-def look_at_vehicle(link: MavsdkLink, stop: threading.Event) -> Iterator[Finding]:
+def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -> Iterator[Finding]:
     """Look at the telemetry for a while, then at what it says."""
     watch, changes, last = WallClock(), 0, link.kinematics()
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
@@ -132,6 +132,13 @@ def look_at_vehicle(link: MavsdkLink, stop: threading.Event) -> Iterator[Finding
     asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
     yield Finding("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
     missing = link.missing_health()
+    charge, least = status.battery, mission.limits.battery
+    yield Finding(
+        "battery",
+        least is None or (charge is not None and charge >= least),
+        ("not told" if charge is None else f"{100.0 * charge:.0f} %")
+        + ("" if least is None else f"; the limit is {100.0 * least:g} %"),
+    )
     yield Finding(
         "health",
         not missing,

@@ -32,6 +32,8 @@ class VehicleStatus(NamedTuple):
     """Whether it flies our setpoints; on ArduPilot GUIDED."""
     mode: str
     """What it flies, in words."""
+    battery: float | None = None
+    """Charge that is left, 1 to 0; None: not told."""
 
 
 class BatteryState(NamedTuple):

@@ -32,6 +32,7 @@ DISARMED = "disarmed"
 TELEMETRY_WRONG = "telemetry wrong"
 CAMERA_FROZEN = "camera frozen"
 CAMERA_WRONG = "camera wrong"
+BATTERY_LOW = "battery low"
 OUT_OF_BOUNDS = "out of bounds"
 OUT_OF_TIME = "out of time"
 
@@ -148,7 +149,7 @@ class Limits:
             now_us: The time of the companion's clock [µs].
         """
         if self.not_ours(status, now_us) is None:
-            self.ending = self._vehicle.broken(state, now_us)
+            self.ending = self._vehicle.broken(status, state, now_us)
         if self.ending is None and seen is not None:
             self.ending = self._camera.broken(seen, state, now_us)
         return self.ending
@@ -175,6 +176,7 @@ class VehicleLimits:
         self.height_m = pilot.altitude_m + CLIMB_M if height_m is None else height_m
         """Highest above the start [m]."""
         self._flight_s = settings.flight_s
+        self._battery = settings.battery
         self._fastest_m_s = SPEEDS * pilot.max_speed_m_s + SPEED_M_S
         self._offboard = self._armed = False
         self._unchanged = [_Unchanged() for _ in TOLD]
@@ -194,7 +196,7 @@ class VehicleLimits:
             return Ending(TAKEN_OVER, f"the mode is {status.mode}")
         return None
 
-    def broken(self, state: Kinematics, now_us: int) -> Ending | None:
+    def broken(self, status: VehicleStatus, state: Kinematics, now_us: int) -> Ending | None:
         """Return which rule telemetry breaks; None: it can be flown on."""
         values = (state.position, state.velocity, state.quaternion)
         for name, unchanged, value in zip(TOLD, self._unchanged, values, strict=True):
@@ -214,7 +216,18 @@ class VehicleLimits:
                 TELEMETRY_WRONG,
                 f"velocity {speed:.1f} m/s; believed: up to {self._fastest_m_s:g} m/s",
             )
-        return self._moved(state, now_us) or self._outside(state, now_us)
+        return self._moved(state, now_us) or self._outside(state, now_us) or self._drained(status)
+
+    def _drained(self, status: VehicleStatus) -> Ending | None:
+        if self._battery is None:
+            return None
+        if status.battery is None:
+            return Ending(BATTERY_LOW, "the flight controller does not tell its charge")
+        if status.battery < self._battery:
+            return Ending(
+                BATTERY_LOW, f"{100.0 * status.battery:.0f} %; at least {100.0 * self._battery:g} %"
+            )
+        return None
 
     def _moved(self, state: Kinematics, now_us: int) -> Ending | None:
         """Return whether position and velocity contradict each other."""

@@ -259,7 +259,8 @@ class MavsdkLink:
         """Return who flies."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
-        return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words)
+        remaining = self.battery().remaining
+        return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words, remaining)
 
     def battery(self) -> BatteryState:
         """Return the newest state of the battery."""

@@ -109,6 +109,13 @@ class LimitSettings(ProfileModel):
         le=36_000,
         default=None,
     )
+    battery: float | None = quantity(
+        "least charge of the battery, 1 is full; by default only the flight controller looks at it",
+        "1",
+        gt=0,
+        lt=1,
+        default=None,
+    )
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.camera import ReceivedFrame
 from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
 from companion.limits import (
+    BATTERY_LOW,
     CAMERA_FROZEN,
     CAMERA_WRONG,
     DISARMED,
@@ -213,6 +214,28 @@ def fly(
             assert limits.ending is ending
             return ending, t_s
     return None, seconds
+
+
+@pytest.mark.parametrize(
+    ("charge", "detail"),
+    [
+        (lambda t_s: 0.5 - 0.01 * t_s, "30 %; at least 30 %"),
+        (
+            lambda t_s: None if t_s > 19.99 else 0.5,
+            "the flight controller does not tell its charge",
+        ),
+    ],
+)
+def test_the_battery_is_looked_at_where_that_is_asked_for(
+    charge: Callable[[float], float | None], detail: str
+) -> None:
+    def told(t_s: float) -> Told:
+        return replace(honest(t_s), status=OURS._replace(battery=charge(t_s)))
+
+    ending, at_s = fly(told, 0.1, 30.0, LimitSettings(battery=0.3))
+    assert ending == (BATTERY_LOW, detail)
+    assert at_s == pytest.approx(20.05, abs=0.06)
+    assert fly(told, 0.1, 30.0, LimitSettings())[0] is None
 
 
 @pytest.mark.parametrize("period_s", PERIODS_S)
