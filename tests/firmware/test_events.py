@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import lzma
+import math
 import re
 import struct
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from mavsdk.plugins.events import Events, EventsError, LogLevel
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkMessage
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
@@ -117,6 +119,37 @@ def test_the_words_on_board_describe_every_event_and_enumeration() -> None:
     groups = component["navigation_mode_groups"]["groups"]
     assert groups["4"] == [custom_mode(Mode.HOLD)] and groups["18"] == [custom_mode(Mode.LAND)]
     assert component["supported_protocols"] == ["health_and_arming_check"]
+
+
+@pytest.mark.parametrize("value", [3e38, -3e38, 1e300, -1e300, math.inf, -math.inf, math.nan])
+def test_an_event_can_be_made_of_any_numbers(value: float) -> None:
+    """What does not fit becomes the nearest: nothing that is told may end a flight."""
+    for definition in definitions():
+        happened = definition.event(*[value] * len(definition.arguments))
+        _, values = read(happened)
+        for argument, told in zip(definition.arguments, values, strict=True):
+            listed = ENUMERATIONS.get(argument.kind)
+            if argument.kind == "float":
+                assert math.isnan(told) is math.isnan(value)
+            elif (listed.base if listed else argument.kind)[0] == "u":
+                assert (told > 0) is (value > 0.0)
+            else:
+                assert (told < 0) is (value < 0.0)
+
+
+def test_a_return_to_a_home_beyond_all_bounds_is_told() -> None:
+    """Two commands of any client ended the flight controller: DO_SET_HOME, and Return."""
+    rig = flight_rig.Rig()
+    rig.boot()
+    for altitude_m in (3e38, -3e38):
+        assert rig.ap.set_home(Geodetic(90.0, 180.0, altitude_m)) is Result.ACCEPTED
+        rig.ap.take_events()
+        assert rig.ap.set_mode(Mode.RETURN) is Result.ACCEPTED
+        told = [read(event)[0] for event in rig.ap.take_events()]
+        assert sum(words.startswith("RTL: start return at") for words in told) == 1
+        rig.ap.set_mode(Mode.HOLD)
+        rig.run(0.5)
+    rig.close()
 
 
 def test_levels_are_two_halves_of_a_byte() -> None:

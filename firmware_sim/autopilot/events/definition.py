@@ -6,6 +6,7 @@ platforms/common/include/px4_platform_common/events.h.
 
 from __future__ import annotations
 
+import math
 import struct
 from enum import IntEnum
 from typing import NamedTuple
@@ -19,6 +20,8 @@ _AUTOPILOT = 1
 """Component id in the uppermost byte of an event's id."""
 _FNV_BASIS, _FNV_PRIME = 0x811C9DC5, 0x01000193
 """Of the hash FNV-1a with 32 bits (http://www.isthe.com/chongo/tech/comp/fnv/)."""
+
+_FLOAT_MAX = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 FORMATS = {
     "uint8_t": "B",
@@ -90,13 +93,16 @@ class Definition(NamedTuple):
     def event(self, *values: float, level: Level | None = None) -> Event:
         """Return an event of this kind; `level` overrides its levels.
 
-        Raises:
-            struct.error: A value, or the number of values, does not fit the arguments.
+        A value that does not fit its argument becomes the nearest that does: what a vehicle says
+        may not depend on whether its home is 3e38 m high. Raises struct.error for another number of
+        values than there are arguments.
         """
         external = self.level if level is None else level
         internal = external if self.internal is None or level is not None else self.internal
-        layout = "<" + "".join(_format(argument.kind) for argument in self.arguments)
-        return Event(self.number, internal << 4 | external, struct.pack(layout, *values))
+        formats = [_format(argument.kind) for argument in self.arguments]
+        fitted = [_fitted(value, of) for value, of in zip(values, formats, strict=False)]
+        packed = struct.pack("<" + "".join(formats), *fitted, *values[len(formats) :])
+        return Event(self.number, internal << 4 | external, packed)
 
 
 def sub_id(name: str) -> int:
@@ -110,6 +116,16 @@ def sub_id(name: str) -> int:
 def arguments(*kinds_and_names: str) -> tuple[Argument, ...]:
     """Return arguments of "type name" each."""
     return tuple(Argument(*text.split()) for text in kinds_and_names)
+
+
+def _fitted(value: float, of: str) -> float:
+    """Return the nearest value that a field of a `struct` format holds; NaN is 0 in whole ones."""
+    if of == "f":
+        # As a cast in C: beyond its range it is infinite.
+        return math.copysign(math.inf, value) if abs(value) > _FLOAT_MAX else value
+    bits = 8 * struct.calcsize(of)
+    low, high = (0, 2**bits - 1) if of.isupper() else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    return 0 if value != value else int(min(high, max(low, value)))
 
 
 def _format(kind: str) -> str:
