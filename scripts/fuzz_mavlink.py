@@ -1,11 +1,14 @@
 """Hostile MAVLink in flight: random bytes, damaged frames, and valid ones with absurd contents.
 
     python scripts/fuzz_mavlink.py --frames 10000000
+    python scripts/fuzz_mavlink.py --steering --frames 200000
 
 Flies the built-in flight controller, one short flight after the other, while both links are fed as
 much as a client may send, and logs are written. Every message that a service reads is drawn, with
 values from the ends of their types, and with commands, parameters, files, shell words and
-addressees that exist. It ends at the first exception or motor command that is no number in 0..1,
+addressees that exist. With `--steering` it draws only what tells the vehicle where to fly, a frame
+every few ticks, so that it flies what it is told before it is told something else. It ends at the
+first exception or motor command that is no number in 0..1,
 and names the flight, which `--first` flies again.
 """
 
@@ -39,6 +42,21 @@ from firmware_sim.simulation import EpisodeSetup
 
 FRAMES_PER_TICK = 8
 """On each link: what one client may send."""
+
+STEERING = (
+    *("COMMAND_LONG", "COMMAND_INT", "COMMAND_LONG", "COMMAND_INT", "LANDING_TARGET"),
+    *("FOLLOW_TARGET", "SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT"),
+    *("SET_ATTITUDE_TARGET", "SET_GPS_GLOBAL_ORIGIN", "MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
+    *("MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_SET_CURRENT", "SET_MODE"),
+)
+"""Messages that steer; what is named twice is drawn twice as often."""
+
+STEERING_COMMANDS = (
+    *(16, 17, 20, 21, 22, 23, 34, 48, 176, 178, 179, 186, 192, 193, 195, 197, 201, 252, 300, 400),
+)
+MODES = ((4, 2), (4, 3), (4, 4), (4, 5), (4, 6), (4, 8), (4, 9), (6, 0), (3, 0), (2, 0), (3, 2))
+"""Main and sub modes of PX4."""
+STEERING_TICKS = 5
 
 BOOT_TICKS = 1_750
 CLIMB_TICKS = 500
@@ -104,11 +122,12 @@ class Dice:
 class Fuzzer:
     """Draws what a hostile or broken client may send."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self, rng: np.random.Generator, *, steering: bool = False) -> None:
         self._dice = dice = Dice(rng)
         # A key that is set refuses all that comes after it.
-        names = [name for name in HANDLERS if name != "SETUP_SIGNING"]
-        self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice) for name in names]
+        names = STEERING if steering else [name for name in HANDLERS if name != "SETUP_SIGNING"]
+        known = {**KNOWN, "command": STEERING_COMMANDS} if steering else KNOWN
+        self._kinds = [_Kind(dialect.mavlink_map[message_id(name)], dice, known) for name in names]
         self._encoders = [Encoder(245, 190), Encoder(1, 191), Encoder(0, 0), Encoder(255, 255)]
 
     def frame(self) -> bytes:
@@ -125,6 +144,15 @@ class Fuzzer:
             return bytes(damaged[: 1 + dice.below(len(damaged))])
         return frame
 
+    def steering(self) -> bytes:
+        """Return a valid frame, often one that asks for a mode."""
+        if self._dice.random() < 0.3:
+            main, sub = self._dice.one_of(MODES)
+            return self._encoders[0].pack(
+                dialect.MAVLink_command_long_message(1, 1, 176, 0, 1, main, sub, 0, 0, 0, 0)
+            )
+        return self._valid()
+
     def _valid(self) -> bytes:
         dice = self._dice
         kind = dice.one_of(self._kinds)
@@ -135,11 +163,11 @@ class Fuzzer:
 class _Kind:
     """One message: its layout, and what draws its fields."""
 
-    def __init__(self, kind: Any, dice: Dice) -> None:
+    def __init__(self, kind: Any, dice: Dice, known: Mapping[str, tuple[int, ...]]) -> None:
         self.layout = Layout(kind)
         lengths = dict(zip(kind.ordered_fieldnames, kind.lengths, strict=True))
         self._fields = [
-            _drawn(kind.msgname, name, of, lengths[name], dice)
+            _drawn(kind.msgname, name, of, lengths[name], dice, known)
             for name, of in zip(kind.fieldnames, kind.fieldtypes, strict=True)
         ]
 
@@ -149,7 +177,12 @@ class _Kind:
 
 
 def _drawn(
-    message: str, name: str, of: str, length: int, dice: Dice
+    message: str,
+    name: str,
+    of: str,
+    length: int,
+    dice: Dice,
+    known: Mapping[str, tuple[int, ...]],
 ) -> Callable[[], Iterable[Any]]:
     """Return what draws one field of a message."""
     special = {
@@ -165,7 +198,7 @@ def _drawn(
         return lambda: [_real(dice) for _ in range(length)]
     if of == "uint8_t" and length > 1:
         return lambda: dice.bytes(length, length)
-    whole = _whole(name, of)
+    whole = _whole(known.get(name, tuple(range(12))), of)
     return lambda: [whole(dice) for _ in range(length)]
 
 
@@ -178,12 +211,12 @@ def _real(dice: Dice) -> float:
     return float(np.float32((dice.random() - 0.5) * 10.0 ** (dice.below(13) - 6)))
 
 
-def _whole(name: str, of: str) -> Callable[[Dice], int]:
+def _whole(listed: tuple[int, ...], of: str) -> Callable[[Dice], int]:
     """Return what draws a whole number: one that exists, an end of the type, or any."""
     bits = int("".join(c for c in of if c.isdigit()))
     low, high = (0, 2**bits - 1) if of[0] == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
     ends = (low, high, low + 1, high - 1)
-    known = [n for n in KNOWN.get(name, range(12)) if low <= n <= high]
+    known = [n for n in listed if low <= n <= high]
 
     def draw(dice: Dice) -> int:
         chance = dice.random()
@@ -211,7 +244,7 @@ def _typed(dice: Dice) -> bytes:
     return b" ".join(words)[:70].ljust(70, b"\n")
 
 
-def fly(seed: int, frames: int) -> int:
+def fly(seed: int, frames: int, *, steering: bool = False) -> int:
     """Fly once with so many hostile frames; return how many of them took effect.
 
     The vehicle keeps its logs, which clients may list and download.
@@ -220,7 +253,7 @@ def fly(seed: int, frames: int) -> int:
         AssertionError: A motor command is no number in 0..1, or the vehicle is nowhere.
         Exception: Whatever else breaks.
     """
-    fuzzer = Fuzzer(np.random.default_rng(seed))
+    fuzzer = Fuzzer(np.random.default_rng(seed), steering=steering)
     setup = EpisodeSetup(load_vehicle("quad"), None, seed)
     ends = MemoryEndpoint(), MemoryEndpoint()
     server = MavlinkServer([onboard_link(ends[0]), gcs_link(ends[1])], boot_unix_us=0)
@@ -245,10 +278,16 @@ def fly(seed: int, frames: int) -> int:
             autopilot.takeoff(3.0)
             ticks(CLIMB_TICKS)
             quiet = sum(link.rx - link.ignored for link in server.counters().values())
-            for _ in range(-(-frames // (2 * FRAMES_PER_TICK))):
-                for end in ends:
-                    end.inbox.extend(fuzzer.frame() for _ in range(FRAMES_PER_TICK))
-                ticks(1)
+            for number in range(frames if steering else -(-frames // (2 * FRAMES_PER_TICK))):
+                if steering:
+                    if number % 100 == 0:  # it may have landed, or crashed
+                        autopilot.arm(force=True)
+                        autopilot.takeoff(3.0)
+                    ends[0].inbox.append(fuzzer.steering())
+                else:
+                    for end in ends:
+                        end.inbox.extend(fuzzer.frame() for _ in range(FRAMES_PER_TICK))
+                ticks(STEERING_TICKS if steering else 1)
                 motors = autopilot.state().motors
                 assert all(0.0 <= motor <= 1.0 for motor in motors), motors
             truth = simulation.plant.truth()
@@ -268,13 +307,15 @@ class Fuzz:
     """Frames of one flight: parameters that were set last as long."""
     first: int = 0
     """First flight; its number is its seed."""
+    steering: bool = False
+    """Only what tells the vehicle where to fly, slowly; some 500 frames a flight do."""
 
 
 def main(asked: Fuzz) -> None:
     clock, done, flight = WallClock(), 0, asked.first
     while done < asked.frames:
         try:
-            effective = fly(flight, asked.per_flight)
+            effective = fly(flight, asked.per_flight, steering=asked.steering)
         except BaseException:
             print(f"flight {flight} broke: --first {flight} --per-flight {asked.per_flight}")
             raise

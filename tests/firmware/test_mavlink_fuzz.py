@@ -179,3 +179,8 @@ def test_hostile_frames_of_all_services_in_flight() -> None:
     """`scripts/fuzz_mavlink.py --frames 10000000` is the long one."""
     frames = 16_000
     assert fly(seed=1, frames=frames) > frames // 3  # they do reach the services
+
+
+def test_absurd_steering_in_flight() -> None:
+    """`scripts/fuzz_mavlink.py --steering` is the long one; this flight once ended at a home's."""
+    assert fly(seed=1, frames=500, steering=True) > 250
