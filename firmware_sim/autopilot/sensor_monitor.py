@@ -15,6 +15,9 @@ from typing import Any
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Severity
+from firmware_sim.autopilot.events import flight_events as events
+from firmware_sim.autopilot.events.definition import Event
+from firmware_sim.autopilot.events.enumerations import SensorFailure, SensorType
 from firmware_sim.interfaces import SensorSample
 
 NO_DATA_US = US_PER_S
@@ -39,6 +42,8 @@ class SensorKind:
     """Silence after which it has failed."""
     stale_us: int
     """Time of repeating itself in flight after which it has failed."""
+    event: Callable[[int], Event] | None = None
+    """Makes an event of a reason (`SensorFailure`); None = PX4 has none."""
 
 
 def _mag(sample: SensorSample) -> Any:
@@ -50,10 +55,32 @@ def _gps(sample: SensorSample) -> Any:
     return None if fix is None else (fix.position, *fix.velocity_ned.tolist())
 
 
-GYRO = SensorKind("GYRO", "Gyro 0", lambda s: tuple(s.gyro.tolist()), 500_000, 400_000)
-ACCEL = SensorKind("ACCEL", "Accel 0", lambda s: tuple(s.accel.tolist()), 500_000, 400_000)
-MAG = SensorKind("MAG", "Compass 0", _mag, 300_000, 2_000_000)
-BARO = SensorKind("BARO", "Baro 0", lambda s: s.pressure_hpa, 300_000, 2_000_000)
+_REASONS = {"TIMEOUT": SensorFailure.TIMEOUT, "STALE": SensorFailure.STALE_DATA}
+
+GYRO = SensorKind(
+    "GYRO",
+    "Gyro 0",
+    lambda s: tuple(s.gyro.tolist()),
+    500_000,
+    400_000,
+    lambda reason: events.IMU_FAILED.event(SensorType.GYRO, 0, reason),
+)
+ACCEL = SensorKind(
+    "ACCEL",
+    "Accel 0",
+    lambda s: tuple(s.accel.tolist()),
+    500_000,
+    400_000,
+    lambda reason: events.IMU_FAILED.event(SensorType.ACCEL, 0, reason),
+)
+MAG = SensorKind(
+    *("MAG", "Compass 0", _mag, 300_000, 2_000_000),
+    lambda reason: events.MAG_FAILED.event(0, reason),
+)
+BARO = SensorKind(
+    *("BARO", "Baro 0", lambda s: s.pressure_hpa, 300_000, 2_000_000),
+    lambda reason: events.BARO_FAILED.event(0, reason),
+)
 GPS = SensorKind("GPS", "GPS 0", _gps, 1_000_000, 1_000_000)
 
 
@@ -112,8 +139,9 @@ class SensorWatch:
             self.failed = ""
         if not self.failed or before:
             return None
-        text = f"{self.kind.name} #0 failed: {self.failed}!"
-        return Message(Severity.EMERGENCY, text)
+        text, event = f"{self.kind.name} #0 failed: {self.failed}!", self.kind.event
+        told = None if event is None else event(_REASONS[self.failed])
+        return Message(Severity.EMERGENCY, text, told)
 
     def has_data(self, now_us: int) -> bool:
         """Return whether its data are valid for flight."""

@@ -37,9 +37,11 @@ from firmware_sim.autopilot.failsafes.actions import Action as FailsafeAction
 from firmware_sim.autopilot.failsafes.actions import Cause
 from firmware_sim.autopilot.failsafes.announcement import announcement
 from firmware_sim.autopilot.failsafes.conditions import NEEDS, Conditions, Need
+from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.autopilot.prearm import can_arm
 from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
+from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, SensorWatch
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.event_buffer import FIRST_SEQUENCE, KEPT
 from firmware_sim.mavlink.services import component_metadata
@@ -344,6 +346,46 @@ def test_another_boot_begins_anew() -> None:
     assert (current.sequence, current.flags) == (FIRST_SEQUENCE - 1, RESET)
     say(rig, "after")
     assert [m.sequence for m in rig.client.received("EVENT")] == [FIRST_SEQUENCE]
+
+
+def test_a_pilot_who_is_heard_no_more_is_told_by_events_alone() -> None:
+    rig = flight_rig.Rig()
+    rig.boot()
+    rig.ap.take_events()
+
+    def told() -> list[str]:
+        words = [read(event)[0] for event in rig.ap.take_events()]
+        return [each for each in words if each.startswith("Manual control")]
+
+    def sticks() -> None:
+        now_us = round(rig.time_s * US_PER_S)
+        rig.ap.manual_control(Sticks(0.0, 0.0, 0.0, 0.0), Source.JOYSTICK, now_us)
+
+    rig.run(0.5, sticks)
+    assert told() == []  # the first is no news
+    rig.run(2.0)
+    assert told() == ["Manual control lost"]
+    rig.run(0.5, sticks)
+    (regained,) = told()
+    assert re.fullmatch(r"Manual control regained after [12]\.\d+ s", regained)
+    rig.close()
+
+
+def test_a_sensor_that_falls_silent_is_an_event() -> None:
+    found = []
+    for kind in (ACCEL, GYRO, MAG, BARO, GPS):
+        watch = SensorWatch(kind)
+        watch._seen_us = 0  # it has measured once
+        message = watch.judge(2 * US_PER_S, flying=True)
+        assert message is not None and message.text == f"{kind.name} #0 failed: TIMEOUT!"
+        found.append(None if message.event is None else read(message.event)[0])
+    assert found == [
+        "Accelerometer sensor #0 failure: Timeout",
+        "Gyroscope sensor #0 failure: Timeout",
+        "Magnetometer sensor #0 failure: Timeout",
+        "Baro sensor #0 failure: Timeout",
+        None,
+    ]
 
 
 def test_a_mode_that_is_not_available_is_refused_with_an_event() -> None:

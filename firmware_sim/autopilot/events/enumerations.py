@@ -137,6 +137,24 @@ class FailsafeAction(IntEnum):
     TERMINATE = 10
 
 
+class SensorType(IntEnum):
+    """Inertial sensors that a message names."""
+
+    ACCEL = 0
+    GYRO = 1
+    MAG = 2
+
+
+class SensorFailure(IntEnum):
+    """Why a sensor has failed, as bits."""
+
+    NO_DATA = 1
+    STALE_DATA = 2
+    TIMEOUT = 4
+    HIGH_ERROR_COUNT = 8
+    HIGH_ERROR_DENSITY = 16
+
+
 class FailsafeCause(IntEnum):
     """What a failsafe's message names as the cause: in the order of `failsafes.actions.Cause`."""
 
@@ -162,6 +180,10 @@ class Enumeration(NamedTuple):
 ENUMERATIONS: Mapping[str, Enumeration] = {
     "navigation_mode_group_t": Enumeration("uint32_t", ModeGroup, "Flight modes", bitfield=True),
     "health_component_t": Enumeration("uint32_t", Component, "Parts of the vehicle", bitfield=True),
+    "sensor_type_t": Enumeration("uint8_t", SensorType, "Sensors"),
+    "sensor_failover_reason_t": Enumeration(
+        "uint16_t", SensorFailure, "Why a sensor has failed", bitfield=True
+    ),
     "arm_disarm_reason_t": Enumeration("uint8_t", ArmingReason, "Why it was armed or disarmed"),
     "navigation_mode_t": Enumeration("uint8_t", NavigationMode, "Flight mode"),
     "failsafe_action_t": Enumeration("uint8_t", FailsafeAction, "What a failsafe does"),
@@ -179,6 +201,9 @@ _WORDS: Mapping[tuple[type[IntEnum], int], str] = {
         (ModeGroup.PRECLAND, "Precision land"),
         (ModeGroup.VTOL_TAKEOFF, "VTOL takeoff"),
         (Component.GPS, "GPS"),
+        (SensorType.ACCEL, "Accelerometer"),
+        (SensorType.GYRO, "Gyroscope"),
+        (SensorType.MAG, "Magnetometer"),
         (Component.MOTORS_ESCS, "Motors and ESCs"),
         (Component.UTM, "UTM"),
         (Component.ACCEL, "Accelerometer"),

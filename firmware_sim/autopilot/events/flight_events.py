@@ -1,7 +1,8 @@
 """Events of a flight: arming, modes, failsafes, missions, links.
 
 Names, arguments and levels: PX4 1.16, commander/Commander.cpp, commander/failsafe/framework.cpp,
-navigator/*.cpp.
+commander/HealthAndArmingChecks/checks/rcAndDataLinkCheck.cpp, sensors/voted_sensors_update.cpp and
+its kin, navigator/*.cpp.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ MODE_NOT_AVAILABLE = Definition(
     kind=_APPENDED,
 )
 PILOT_TOOK_OVER = Definition("commander_rc_override", "Pilot took over using sticks")
+PILOT_LOST = Definition("commander_rc_lost", "Manual control lost")
+PILOT_REGAINED = Definition(
+    "commander_rc_regained", "Manual control regained after {1:.1} s", arguments("float elapsed")
+)
 GCS_LOST = Definition(
     "commander_gcs_lost",
     "Connection to ground control station lost",
@@ -64,6 +69,33 @@ GNSS_STOPPED = Definition(
     internal=Level.INFO,
 )
 GNSS_STARTED = Definition("check_estimator_gnss_fusion_started", "GNSS data fusion started")
+
+_LAND_AND_CHECK = "Land immediately and check the system."
+IMU_FAILED = Definition(
+    "sensor_failover",
+    "{1} sensor #{2} failure: {3}",
+    arguments(
+        "sensor_type_t sensor_type",
+        "uint8_t failover_index",
+        "sensor_failover_reason_t failover_reason",
+    ),
+    Level.EMERGENCY,
+    description=_LAND_AND_CHECK,
+)
+MAG_FAILED = Definition(
+    "sensor_failover_mag",
+    "Magnetometer sensor #{1} failure: {2}",
+    arguments("uint8_t failover_index", "sensor_failover_reason_t failover_reason"),
+    Level.EMERGENCY,
+    description=_LAND_AND_CHECK,
+)
+BARO_FAILED = Definition(
+    "sensor_failover_baro",
+    "Baro sensor #{1} failure: {2}",
+    arguments("uint8_t failover_index", "sensor_failover_reason_t failover_reason"),
+    Level.EMERGENCY,
+    description=_LAND_AND_CHECK,
+)
 
 TAKEOFF_DEFAULT = Definition(
     "navigator_takeoff_default_alt",

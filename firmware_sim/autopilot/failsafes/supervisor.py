@@ -10,10 +10,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot import prearm
 from firmware_sim.autopilot.autopilot_state import Health, Message, Mode, Setpoint, Severity
 from firmware_sim.autopilot.commander import Flight, Phase
 from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.events.health_report import REPORT_US, HealthReporter
 from firmware_sim.autopilot.failsafes.actions import Action
@@ -79,6 +81,9 @@ class Supervisor:
         self._told: tuple[Check, ...] | None = None
         """Checks that were told as failing; None: nothing is told before the vehicle is ready."""
         self._told_us = 0
+        self._tell = tell
+        self._pilot_us: int | None = None
+        """When a pilot was heard at the last look that heard one [µs]."""
         self._reporter = HealthReporter(tell)
         self._asked = False
         """Whether somebody wants the checks told anew."""
@@ -120,6 +125,7 @@ class Supervisor:
         self.next_us = now_us + LOOK_US
         before = self.conditions
         self.conditions, texts = self.watch.look(sample, flight.phase)
+        self._tell_of_pilot(now_us, was_lost=before.manual_control_signal_lost)
         changed = self.conditions != before or flight.phase is not self._checked
         if now_us >= self._check_us or changed:
             self._check_us, self._checked = now_us + CHECK_US, flight.phase
@@ -130,6 +136,15 @@ class Supervisor:
             self._reporter.update(readiness, now_us, force=self._asked)
             texts += self._report(now_us, flight)
         return texts
+
+    def _tell_of_pilot(self, now_us: int, *, was_lost: bool) -> None:
+        """Tell that a pilot is heard no more, or again; PX4 has no text for it."""
+        lost, heard_us = self.conditions.manual_control_signal_lost, self._pilot_us
+        if lost is not was_lost and heard_us is not None:
+            silent_s = (now_us - heard_us) / US_PER_S
+            self._tell(events.PILOT_LOST.event() if lost else events.PILOT_REGAINED.event(silent_s))
+        if not lost:
+            self._pilot_us = now_us
 
     def readiness(self, sample: SensorSample, flight: Flight, mode: Mode) -> Readiness:
         """Return what the pre-arm checks look at, for arming in a mode."""
