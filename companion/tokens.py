@@ -20,7 +20,8 @@ NO_FRAME = -1
 
 _GIVEN = re.compile(r"F(\d+) (\d+) (-1|\d+)(?: (land|abandon|end))?")
 _BACK = re.compile(r"D(\d+)(?: (end|\d+)(?: (\d+)(?: (frame|stop))?)?)?")
-_PHASE = re.compile(r"P(\d+) (.+)")
+_PHASE = re.compile(r"P(\d+) ([ -~]+)")
+"""A phase is shown on a terminal: it has no control characters."""
 
 
 @dataclass(frozen=True)

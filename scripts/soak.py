@@ -117,7 +117,7 @@ class Client:
         """Do what is next in turn."""
         self._turn += 1
         self.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
-        turn = self._turn % 8
+        turn = self._turn % 11
         ids = self._ids
         if turn == 0:
             self.send(dialect.MAVLink_param_request_list_message(*ids))
@@ -137,6 +137,13 @@ class Client:
             value = 5.0 + self._turn % 5
             name = b"MPC_XY_VEL_MAX"
             self.send(dialect.MAVLink_param_set_message(*ids, name, value, 9))
+        elif turn == 7:
+            # Refused with a text and an event, each time another one.
+            self.command(dialect.MAV_CMD_COMPONENT_ARM_DISARM, 2.0 + self._turn % 1000)
+        elif turn == 8:
+            self.send(dialect.MAVLink_request_event_message(*ids, 0, 0xFFFF))
+        elif turn == 9:
+            self.command(512, dialect.MAVLINK_MSG_ID_HIL_STATE_QUATERNION)
         elif self.home is not None:
             self._go_on(*self.home)
 

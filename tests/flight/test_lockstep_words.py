@@ -59,7 +59,19 @@ def test_longest_words_fit_a_status_text() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "F", "F1", "F1 2", "F1 2 3 up", "Failsafe activated", "D", "D1 x", "Disarmed", "P1"],
+    [
+        "",
+        "F",
+        "F1",
+        "F1 2",
+        "F1 2 3 up",
+        "Failsafe activated",
+        "D",
+        "D1 x",
+        "Disarmed",
+        "P1",
+        "P1 \x1b[2J",
+    ],
 )
 def test_other_texts_are_no_words(text: str) -> None:
     assert TurnGiven.parse(text) is None
