@@ -31,6 +31,7 @@ SUBCOMMANDS: dict[str, str] = {
     "train": "train a policy on the batch twin",
     "export": "turn a stable-baselines3 model into a policy folder",
     "sweep": "train and evaluate many networks: the architecture search",
+    "view": "replay the flights of a run in a browser",
     "report": "a run's tables and page again, or a comparison of several runs",
     "refly": "rehearse a flight that was recorded, and compare the two",
     "arena": "look at an arena, or at what its profile draws",

@@ -151,9 +151,10 @@ class Vehicle(Message):
     quaternion: Quaternion
     rotors: Quaternion
     """Their speeds, as shares of that at full command, in PX4's order."""
-    battery: float
-    """State of charge, 1 to 0."""
+    battery: float | None
+    """State of charge, 1 to 0; None: not known."""
     mode: str
+    """Empty: not known."""
     armed: bool
     collision: str | None
     """What has been hit."""

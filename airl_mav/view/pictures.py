@@ -58,12 +58,13 @@ def numbers_html(shown: Shown) -> str:
     if vehicle is not None:
         speed = math.hypot(*vehicle.velocity)
         away = _number(shown.to_goal_m, ", {:.1f} m to the goal")
+        charge = None if vehicle.battery is None else 100.0 * vehicle.battery
         hit = "" if vehicle.collision is None else f", has hit {vehicle.collision}"
         rows += [
-            ("mode", vehicle.mode if vehicle.armed else f"{vehicle.mode}, disarmed"),
+            ("mode", (vehicle.mode or NOTHING) + ("" if vehicle.armed else ", disarmed")),
             ("time", f"{shown.seconds:.1f} s{away}"),
             ("flies", f"{speed:.1f} m/s, {-vehicle.position[2]:.1f} m high{hit}"),
-            ("battery", f"{100.0 * vehicle.battery:.0f} %"),
+            ("battery", _number(charge, "{:.0f} %")),
         ]
     acts, then, how = NOTHING, NOTHING, ""
     if decided is not None and shown.flies_setpoints:

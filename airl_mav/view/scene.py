@@ -7,6 +7,7 @@ frame FRD.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,25 @@ from airl_mav.view.shown import Shown
 
 STILL, MOVING, GOAL, START = (139, 151, 163), (240, 147, 43), (27, 138, 63), (31, 78, 140)
 FLOOR, GRID, SECTION = (236, 238, 240), (214, 218, 222), (186, 192, 198)
-FLOWN, COMMANDED, TRAIL, DROP = (40, 104, 168), (214, 84, 10), (47, 127, 196), (120, 128, 136)
-BODY, NOSE, DISC, BLADE = (47, 54, 61), (214, 84, 10), (40, 104, 168), (33, 38, 45)
+FLOWN, COMMANDED, DROP = (40, 104, 168), (214, 84, 10), (120, 128, 136)
+NOSE, BLADE = (214, 84, 10), (33, 38, 45)
+
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Look:
+    """What tells one flight from another in the same scene."""
+
+    trail: Colour
+    body: Colour
+    disc: Colour
+    whole: bool = True
+    """Whether arena, camera and commanded velocity are drawn, too."""
+
+
+FIRST = Look((47, 127, 196), (47, 54, 61), (40, 104, 168))
+OTHER = Look((150, 80, 170), (110, 50, 130), (150, 80, 170), whole=False)
 
 WALL_OPACITY = 0.25
 FRUSTUM_M = 0.6
@@ -53,18 +71,25 @@ Floats = NDArray[np.float64]
 class FlightScene:
     """The scene of one server. All calls come from one thread."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        """Prepare an empty scene."""
+    def __init__(
+        self, server: viser.ViserServer, root: str = "/flight", look: Look = FIRST
+    ) -> None:
+        """Prepare an empty scene; all its nodes lie below `root`."""
         self._server = server
+        self._root = root
+        self._look = look
         self._scene: Any = server.scene
         self._scene.set_up_direction((0.0, 0.0, -1.0))
         self._scene.world_axes.visible = False
         self._drawn = -1
         """Number of the episode that is drawn."""
+        self._base: Any = None
         self._reset()
 
     def _reset(self) -> None:
-        self._scene.reset()
+        if self._base is not None:
+            self._base.remove()  # and all below it
+        self._base = self._scene.add_frame(self._root, show_axes=False)
         self._movers: list[Any] = []
         self._blades: list[Any] = []
         self._turns = np.zeros(4)
@@ -74,7 +99,7 @@ class FlightScene:
         self._picture: Any = None
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
-        return getattr(self._scene, f"add_{kind}")(name, *args, **properties)
+        return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)
 
     def draw(self, shown: Shown, *, picture: bool) -> None:
         """Draw what is shown now; the camera's image only where `picture` says so."""
@@ -88,14 +113,14 @@ class FlightScene:
                 self._build(episode, shown.arena)
             if shown.vehicle is not None:
                 self._move(shown, shown.vehicle, episode)
-        if picture and shown.picture_mm is not None:
+        if picture and shown.picture_mm is not None and self._look.whole:
             range_m = episode.vehicle.camera_range_m
             self._camera.image = depth_picture(shown.picture_mm, range_m)
 
     # --- once an episode
 
     def _build(self, episode: Episode, arena: Arena | None) -> None:
-        if arena is not None:
+        if arena is not None and self._look.whole:
             self._build_arena(arena, episode.goal_radius_m)
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
@@ -194,7 +219,12 @@ class FlightScene:
         forward, right, radius = shape.arm_forward_m, shape.arm_right_m, shape.rotor_radius_m
         height = max(0.04, 0.5 * shape.height_m)
         size = 0.45 * min(forward, right)
-        self._add("box", "/vehicle/body", color=BODY, dimensions=(3.4 * size, 2.2 * size, height))
+        self._add(
+            "box",
+            "/vehicle/body",
+            color=self._look.body,
+            dimensions=(3.4 * size, 2.2 * size, height),
+        )
         self._add(
             "box",
             "/vehicle/nose",
@@ -206,7 +236,7 @@ class FlightScene:
             self._add(
                 "box",
                 f"/vehicle/arm/{name}",
-                color=BODY,
+                color=self._look.body,
                 dimensions=(2.0 * math.hypot(forward, right), 0.025, 0.02),
                 wxyz=quat_from_euler(0.0, 0.0, math.atan2(side * right, forward)),
             )
@@ -217,10 +247,14 @@ class FlightScene:
                 -0.5 * height - 0.02,
             )
             name = f"/vehicle/rotor/{corner.replace(' ', '-')}"
-            disc = {"radius": radius, "height": 0.006, "color": DISC, "opacity": 0.5}
+            disc = {"radius": radius, "height": 0.006, "color": self._look.disc, "opacity": 0.5}
             self._add("cylinder", f"{name}/disc", position=at, cast_shadow=False, **disc)
             blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": BLADE}
             self._blades.append(self._add("box", f"{name}/blade", position=at, **blade))
+        if self._look.whole:
+            self._build_camera(shape)
+
+    def _build_camera(self, shape: VehicleShape) -> None:
         pitch = quat_from_euler(0.0, math.radians(shape.camera_pitch_up_deg), 0.0)
         across = math.tan(0.5 * math.radians(shape.camera_fov_deg))
         self._camera = self._add(
@@ -252,7 +286,7 @@ class FlightScene:
                 node.position = center
         self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, -at[2]]]], np.float32)
         self._flown.points = arrow(np.array(vehicle.velocity))
-        command = shown.command
+        command = shown.command if self._look.whole else None
         if command is not None:
             command = heading_to_ned(command, quat_yaw(np.array(vehicle.quaternion)))
         self._commanded.points = arrow(command)
@@ -268,7 +302,7 @@ class FlightScene:
             if part == len(self._trail):
                 name = f"/trail/{part}"
                 self._trail.append(
-                    self._add("line_segments", name, segments, TRAIL, thickness=0.04)
+                    self._add("line_segments", name, segments, self._look.trail, thickness=0.04)
                 )
             else:
                 self._trail[part].points = segments

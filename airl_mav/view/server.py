@@ -10,20 +10,21 @@ import os
 import sys
 import threading
 import warnings
-from typing import Any
+from functools import partial
 
-import numpy as np
 import viser
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
+from airl_mav.view.controls import Controls
 from airl_mav.view.feed import Ends
 from airl_mav.view.handshake import Answer, Request
 from airl_mav.view.messages import Steering
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
+from airl_mav.view.watchers import Watchers
 
 DRAW_S = 1.0 / 30.0
 """Time between two drawings of the scene [wall s]."""
@@ -31,17 +32,11 @@ DRAW_S = 1.0 / 30.0
 PICTURE_EVERY, PANEL_EVERY, STRIP_EVERY = 3, 4, 8
 """Drawings of the scene for one of the camera's image, of the panel, of the strip."""
 
-SLIM = 1.5
-"""A page so much higher than wide is a phone's, where the panel covers the lower half."""
-
-BELOW = np.array([0.0, 0.0, 2.2])
-"""There the camera looks so far below the vehicle, NED [m]."""
-
 NICENESS = 10
 """Less than that of flights: on a busy machine it is the view that waits."""
 
-CHASE = np.array([-5.0, 0.0, -3.2])
-"""Where a watcher's camera begins, from the vehicle, NED [m]."""
+NICENESS = 10
+"""Less than that of flights: on a busy machine it is the view that waits."""
 
 
 class View:
@@ -52,38 +47,23 @@ class View:
         self._server, self._ends = server, ends
         self._shown = Shown()
         self._scene = FlightScene(server)
-        self._panel = Panel(
-            server,
-            request.run,
-            Steering(speed=request.speed),
-            paced=request.paced,
+        self._controls = controls = Controls(server.gui, Steering(speed=request.speed))
+        knob = partial(
+            controls.add_knob,
             compensable=request.compensable,
             compensated=request.compensated,
         )
-        self._following: dict[int, Any] = {}
-        """The switch of each watcher."""
-        self._placed: set[int] = set()
-        """Watchers whose camera has been put behind the vehicle."""
+        head = controls.add_pace if request.paced else lambda: None
+        self._panel = Panel(server, request.run, head=head, latency=knob)
+        self._watchers = Watchers(server, controls.let_go)
         self._drawn = 0
-        server.on_client_connect(self._welcome)
-        server.on_client_disconnect(self._part)
-
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        follow = client.gui.add_checkbox("Follow the vehicle", True, order=-1.0)
-        self._following[client.client_id] = follow
-
-    def _part(self, client: viser.ClientHandle) -> None:
-        self._following.pop(client.client_id, None)
-        self._placed.discard(client.client_id)
-        if not self._server.get_clients():
-            self._panel.let_go()
 
     def run(self, ended: threading.Event) -> None:
         """Draw until the run has ended."""
         clock = WallClock()
         due_us = 0
         while not ended.is_set():
-            self._ends.ask(self._panel.steering)
+            self._ends.ask(self._controls.steering)
             left_s = max(0.0, (due_us - clock.time_us()) / US_PER_S)
             for message, depth_mm in self._ends.take(left_s):
                 self._shown.take(message, depth_mm)
@@ -91,32 +71,18 @@ class View:
                 continue
             due_us = clock.time_us() + round(DRAW_S * US_PER_S)
             # Nobody watches: nothing is drawn.
-            if clients := self._server.get_clients():
-                self._draw(clients)
+            if self._watchers.there:
+                self._draw()
 
-    def _draw(self, clients: dict[int, viser.ClientHandle]) -> None:
+    def _draw(self) -> None:
         self._drawn += 1
         self._scene.draw(self._shown, picture=self._drawn % PICTURE_EVERY == 0)
         if self._drawn % PANEL_EVERY == 0:
             self._panel.draw(self._shown)
         if self._drawn % STRIP_EVERY == 0:
             self._panel.draw_strip(self._shown)
-        if self._shown.vehicle is None:
-            return
-        at = np.array(self._shown.vehicle.position)
-        for number, client in clients.items():
-            follow, camera = self._following.get(number), client.camera
-            if follow is not None and follow.value:
-                # As each has turned and zoomed it since.
-                offset = camera.position - camera.look_at
-                if number not in self._placed:
-                    self._placed.add(number)
-                    offset = CHASE
-                slim = camera.image_height > SLIM * camera.image_width
-                aim = at + BELOW if slim else at
-                with client.atomic():
-                    camera.position = aim + offset
-                    camera.look_at = aim
+        if self._shown.vehicle is not None:
+            self._watchers.follow(self._shown.vehicle.position)
 
 
 def main() -> int:

@@ -341,7 +341,7 @@ def test_the_scene_holds_arena_vehicle_and_trail() -> None:
         scene, shown = FlightScene(server), Shown()
 
         def node(name: str) -> Any:
-            return server.scene.get_handle_by_name(name)
+            return server.scene.get_handle_by_name(f"/flight{name}")
 
         shown.take(episode(), None)
         for step in range(2 * CHUNK + 50):

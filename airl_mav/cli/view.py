@@ -1,0 +1,89 @@
+"""`airl view`: replay flights of a run in a browser."""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.arenas import trust_arenas
+from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.scenario.aircraft import GREATEST_PORT
+
+
+class ViewOptions(ProfileModel):
+    """Replay the flights of a run in a browser, the worst first; Ctrl-C ends it.
+
+    Examples:
+        airl view runs/20261122T101530Z-sitl-static-obstacles
+        airl view runs/A 7 --beside runs/B
+    """
+
+    run: Annotated[Path, POSITIONAL] = Field(description="run folder")
+    flight: Annotated[int | None, POSITIONAL] = Field(
+        default=None, description="number of the flight that is shown first; by default the worst"
+    )
+    beside: Path | None = Field(
+        default=None,
+        description="another run: its flight of the same seed flies beside, in another colour",
+    )
+    port: int | None = quantity(
+        "TCP port of the page on the loopback address; by default a free one",
+        "1",
+        ge=1,
+        le=GREATEST_PORT,
+        default=None,
+    )
+    trust: bool = Field(
+        default=False,
+        description="run the arena generators that the runs name: code of whoever made the folder",
+    )
+
+
+OPTIONS = ViewOptions
+EXTRAS = ("view",)
+
+
+def run(options: ViewOptions, console: Console | None = None) -> int:
+    """Serve the page until Ctrl-C. Returns exit status 0.
+
+    Raises UsageError for a folder that holds no run, a flight that is not there, or a taken port.
+    """
+    console = console or Console()
+    folders = [options.run] if options.beside is None else [options.run, options.beside]
+    if options.trust:
+        for folder in folders:
+            trust_arenas(load(folder))
+    replayed, *others = (ReplayedRun(folder) for folder in folders)
+    first = None if options.flight is None else replayed.record(options.flight)
+    # Imported here: what draws is an extra.
+    import viser
+
+    from airl_mav.report.replay.page import ReplayPage
+
+    # What it prints says the same in more lines.
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(LOOPBACK, options.port or 0, verbose=False)
+    try:
+        port = server.get_port()
+        if options.port not in (None, port):
+            raise FieldError("port", options.port, problem="it is taken; accepted: a free one")
+        page = ReplayPage(server, replayed, others[0] if others else None, first)
+        console.print(f"view  http://{LOOPBACK}:{port}", soft_wrap=True, highlight=False)
+        console.file.flush()
+        page.run()
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+    return 0

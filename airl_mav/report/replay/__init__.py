@@ -1,0 +1,1 @@
+"""A run that was flown, in the scene of the live view."""

@@ -1,0 +1,216 @@
+"""A recorded flight at any moment: what a view would have shown then."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import depth_to_z16
+from airl_mav.camera.render import camera_pose, render
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.files import Arrays
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
+from airl_mav.view.messages import (
+    ArenaShown,
+    Decided,
+    Depth,
+    Episode,
+    Flight,
+    Said,
+    Vehicle,
+    VehicleShape,
+)
+from airl_mav.view.shown import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
+
+INFO, WARNING = 6, 4
+"""MAV_SEVERITY."""
+
+STANDING_M = 0.2
+"""Lower than this a vehicle that does not navigate stands [m]."""
+
+TURNING = (0.5, 0.5, 0.5, 0.5)
+"""Rotors of a vehicle that flies: their speeds are not recorded."""
+
+PARTED = 0.05
+"""Setpoints that differ by more are different decisions [m/s, rad/s]."""
+
+AGE_STEP_US = 40_000
+"""The strip has a point so often [µs]."""
+
+
+@dataclass(frozen=True)
+class ReplayedFlight:
+    """One flight of a run. Times are those of its record: simulated µs."""
+
+    record: EpisodeRecord
+    path: Trajectory
+    """To the end of the recording; one sample or more."""
+    stamps: Arrays
+    """Of its decisions, by column; empty where none were recorded."""
+    arena: Arena | None
+    vehicle: VehicleProfile
+    compensated: bool
+    """Whether the companion compensated its latency."""
+
+    @property
+    def label(self) -> str:
+        """What the flight is called."""
+        record = self.record
+        return f"{record.index:03d}, seed {record.seed}, {record.outcome.value}"
+
+    @property
+    def duration_s(self) -> float:
+        """From the reset to the end of the recording [s]."""
+        return (int(self.path.time_us[-1]) - self.record.started_us) / US_PER_S
+
+    @cached_property
+    def episode(self) -> Episode:
+        """Its scene."""
+        return Episode(
+            seed=self.record.seed,
+            started_us=self.record.started_us,
+            arena=None if self.arena is None else ArenaShown.of(self.arena),
+            vehicle=VehicleShape.of(self.vehicle),
+            goal_radius_m=self.record.goal_radius_m,
+        )
+
+    @cached_property
+    def trail(self) -> list[tuple[float, float, float]]:
+        """The whole way (n, 3) NED [m]."""
+        way, kept = self.path.position, [0]
+        for i, step in enumerate(way):
+            if np.linalg.norm(step - way[kept[-1]]) >= TRAIL_STEP_M:
+                kept.append(i)
+        return [(x, y, z) for x, y, z in way[kept].tolist()]
+
+    @cached_property
+    def sent_us(self) -> NDArray[np.int64]:
+        """When each decision was sent (n,), increasing; n = 0: none is recorded."""
+        return np.asarray(self.stamps.get("sent_us", np.zeros(0)), np.int64)
+
+    @cached_property
+    def ages(self) -> NDArray[np.float64]:
+        """Age of the command and t2 over time (n, 3): s since the reset, ms, ms."""
+        if not len(self.sent_us):
+            return np.zeros((0, 3))
+        ends_us = max(int(self.sent_us[-1]), self.record.ended_us)
+        times = np.arange(int(self.sent_us[0]), ends_us, AGE_STEP_US)
+        which = np.searchsorted(self.sent_us, times, side="right") - 1
+        ages = (times - self.stamps["capture_us"][which]) / US_PER_MS
+        t2s = (self.stamps["action_ready_us"] - self.stamps["infer_start_us"])[which] / US_PER_MS
+        return np.stack([(times - self.record.started_us) / US_PER_S, ages, t2s], axis=1)
+
+    def time_us(self, seconds: float) -> int:
+        """Return the time so long after the reset [µs]."""
+        return self.record.started_us + round(seconds * US_PER_S)
+
+    def decision(self, time_us: int) -> int | None:
+        """Return the number of the decision that acts at a time; None: none yet."""
+        number = int(np.searchsorted(self.sent_us, time_us, side="right")) - 1
+        return None if number < 0 else number
+
+    def image_mm(self, time_us: int) -> Depth | None:
+        """Return what the camera saw at a time (h, w) [mm], without noise; None: no arena."""
+        if self.arena is None:
+            return None
+        camera = PolicyCamera.of(self.vehicle.camera)
+        position, _, quaternion = pose_at(self.path, time_us)
+        from_us = time_us - self.record.started_us
+        at, attitude = camera_pose(position, quaternion, camera.mount)
+        centers = self.arena.centers_at(from_us)
+        depth_m = render(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
+        return depth_to_z16(depth_m)
+
+    def show(self, shown: Shown, seconds: float) -> None:
+        """Make `shown` what it was so long after the reset [s]; episode and arena are there."""
+        record, time_us = self.record, self.time_us(seconds)
+        position, velocity, quaternion = pose_at(self.path, time_us)
+        navigates = record.navigation_us is not None and (
+            record.navigation_us <= time_us < record.ended_us
+        )
+        flies = navigates or -position[2] > STANDING_M
+        x, y, z = position.tolist()
+        vx, vy, vz = velocity.tolist()
+        q0, q1, q2, q3 = quaternion.tolist()
+        shown.vehicle = Vehicle(
+            time_us=time_us,
+            position=(x, y, z),
+            velocity=(vx, vy, vz),
+            quaternion=(q0, q1, q2, q3),
+            rotors=TURNING if flies else (0.0, 0.0, 0.0, 0.0),
+            battery=None,
+            mode=OFFBOARD if navigates else "",
+            armed=flies,
+            collision=None,
+        )
+        ended = time_us >= record.ended_us
+        shown.phase = record.outcome.value if ended else "navigating" if navigates else "before"
+        self._show_decision(shown, time_us)
+        ages = self.ages
+        inside = (ages[:, 0] > seconds - STRIP_S) & (ages[:, 0] <= seconds)
+        shown.ages = deque(map(tuple, ages[inside].tolist()))
+        shown.picture_mm = self.image_mm(time_us)
+
+    def _show_decision(self, shown: Shown, time_us: int) -> None:
+        number = self.decision(time_us)
+        if number is None:
+            shown.decided = shown.decided_mm = None
+            shown.decisions = 0
+            return
+        if shown.decided is not None and shown.decisions == number + 1:
+            return
+        captured_us, began_us, ready_us, sent_us = (
+            int(self.stamps[name][number])
+            for name in ("capture_us", "infer_start_us", "action_ready_us", "sent_us")
+        )
+        forward, right, down, turn = (float(part) for part in self.stamps["setpoint"][number])
+        image = self.image_mm(captured_us)
+        shown.decided_mm, shown.decisions = image, number + 1
+        shown.decided = Decided(
+            captured_us=captured_us,
+            began_us=began_us,
+            ready_us=ready_us,
+            sent_us=sent_us,
+            expires_us=None,
+            setpoint=(forward, right, down, turn),
+            compensated=self.compensated,
+            shape=(1, 1) if image is None else (image.shape[0], image.shape[1]),
+        )
+
+    def begin(self, shown: Shown) -> None:
+        """Make `shown` this flight's, instead of another's."""
+        record = self.record
+        shown.take(self.episode, None)
+        shown.flight = Flight(index=record.index, seed=record.seed, goal=record.goal)
+        shown.trail = self.trail
+        shown.texts.clear()
+        for fault in record.faults:
+            shown.texts.append(Said(time_us=fault.from_us, severity=WARNING, text=fault.fault))
+        for note in record.notes:
+            shown.texts.append(Said(time_us=None, severity=WARNING, text=note))
+        how = f"{record.outcome.value}: {record.reason}"
+        shown.texts.append(Said(time_us=record.ended_us, severity=INFO, text=how))
+
+
+def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:
+    """Return when two flights part [s since the reset]: at the first decision that differs.
+
+    That is the exposure of its image in the first flight; None: no decision differs.
+    """
+    ours, theirs = first.stamps.get("setpoint"), other.stamps.get("setpoint")
+    if ours is None or theirs is None:
+        return None
+    shared = min(len(ours), len(theirs))
+    differ = np.abs(ours[:shared] - theirs[:shared]).max(axis=1, initial=0.0) > PARTED
+    number = int(np.argmax(differ)) if differ.any() else shared
+    if number >= len(ours):
+        return None
+    return (int(first.stamps["capture_us"][number]) - first.record.started_us) / US_PER_S

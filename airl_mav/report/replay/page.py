@@ -1,0 +1,178 @@
+"""The page on which a run is replayed: the live view's scene and panel, and a slider of time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import viser
+
+from airl_mav.core.clock import Clock, WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.report.replay.flight import ReplayedFlight, parting_s
+from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.view.panel import Panel
+from airl_mav.view.scene import OTHER, FlightScene
+from airl_mav.view.shown import Shown
+from airl_mav.view.watchers import Watchers
+
+DRAW_US = 33_000
+"""Time between two drawings [wall µs]."""
+
+LATE_US = 500_000
+"""A page that was busy for longer goes on from where it was [wall µs]."""
+
+PANEL_EVERY = 4
+"""Drawings of the scene for one of the panel, while it plays."""
+
+STEP_S = 0.02
+"""Step of the slider: that of the recording [s]."""
+
+SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "5 x": 5.0}
+
+BEFORE_S = 0.5
+"""It begins so long before the policy takes over [s]."""
+
+
+class ReplayPage:
+    """Replays flights of a run, with those of another run beside them."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        run: ReplayedRun,
+        beside: ReplayedRun | None = None,
+        first: EpisodeRecord | None = None,
+    ) -> None:
+        """Build the page.
+
+        Args:
+            server: Whose.
+            run: What is replayed.
+            beside: The run whose flights of the same seeds fly beside; None: alone.
+            first: The flight that is shown first; None: the worst.
+        """
+        self._run, self._beside = run, beside
+        self._shown, self._others = Shown(), Shown()
+        self._scene = FlightScene(server)
+        self._ghost = FlightScene(server, "/beside", OTHER)
+        self._records = {_label(record): record for record in run.records}
+        self._gui: Any = server.gui
+        self._panel = Panel(
+            server, run.title, image="what the camera saw for the decision", head=self._add_head
+        )
+        self._watchers = Watchers(server)
+        self._playing = True
+        self._dirty = True
+        self._drawn = 0
+        self._choose(first or run.records[0])
+
+    def _add_head(self) -> None:
+        gui = self._gui
+        labels = tuple(self._records)
+        self._pick = gui.add_dropdown("Flight", labels, initial_value=labels[0])
+        self._time = gui.add_slider("time [s]", 0.0, 1.0, STEP_S, 0.0)
+        self._buttons = gui.add_button_group("Play", ("Play", "Pause", "Step"))
+        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1 x")
+        self._part = gui.add_button("Where the runs part", visible=self._beside is not None)
+
+        @self._pick.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self._choose(self._records[self._pick.value])
+
+        @self._time.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:
+                self._playing = False
+                self._go_to(self._time.value)
+
+        @self._buttons.on_click
+        def _(_event: object) -> None:
+            self._playing = self._buttons.value == "Play"
+            if self._buttons.value == "Step":
+                self._go_to(self._next_decision_s())
+            elif self._playing and self._seconds >= self._flight.duration_s:
+                self._go_to(self._begin_s())
+
+        @self._part.on_click
+        def _(_event: object) -> None:
+            if self._other is not None and (at := parting_s(self._flight, self._other)) is not None:
+                self._playing = False
+                self._go_to(at)
+
+    # --- where it is
+
+    def _choose(self, record: EpisodeRecord) -> None:
+        """Show another flight, from its beginning."""
+        self._flight: ReplayedFlight = self._run.flight(record)
+        self._other = None if self._beside is None else self._beside.same(record)
+        self._flight.begin(self._shown)
+        self._others = Shown()
+        if self._other is not None:
+            self._other.begin(self._others)
+        if self._pick.value != _label(record):
+            self._pick.value = _label(record)
+        self._time.max = max(STEP_S, round(self._flight.duration_s, 2))
+        self._go_to(self._begin_s())
+
+    def _begin_s(self) -> float:
+        record = self._flight.record
+        if record.navigation_us is None:
+            return 0.0
+        return max(0.0, (record.navigation_us - record.started_us) / US_PER_S - BEFORE_S)
+
+    def _next_decision_s(self) -> float:
+        """Return when the next decision is sent [s]; the end where none is."""
+        now_us = self._flight.time_us(self._seconds)
+        later = self._flight.sent_us[self._flight.sent_us > now_us + 1]
+        if not len(later):
+            return self._flight.duration_s
+        return (int(later[0]) - self._flight.record.started_us) / US_PER_S
+
+    def _go_to(self, seconds: float) -> None:
+        self._seconds = min(max(0.0, seconds), self._flight.duration_s)
+        self._dirty = True
+
+    # --- drawing
+
+    def run(self, clock: Clock | None = None) -> None:
+        """Play until interrupted."""
+        clock = clock or WallClock()
+        before_us = clock.time_us()
+        while True:
+            clock.sleep_until(before_us + DRAW_US)
+            now_us = clock.time_us()
+            self.advance(min(now_us - before_us, LATE_US) / US_PER_S)
+            before_us = now_us
+
+    def advance(self, wall_s: float) -> None:
+        """Play so much wall time, and draw; nothing happens while nobody watches."""
+        if not self._watchers.there:
+            return
+        if self._playing:
+            self._go_to(self._seconds + wall_s * SPEEDS[self._speed.value])
+            self._playing = self._seconds < self._flight.duration_s
+        if self._dirty:
+            self.draw(panel=not self._playing or self._drawn % PANEL_EVERY == 0)
+        if self._shown.vehicle is not None:
+            self._watchers.follow(self._shown.vehicle.position)
+
+    def draw(self, *, panel: bool = True) -> None:
+        """Draw the present moment; the panel only where `panel` says so."""
+        self._dirty = False
+        self._drawn += 1
+        self._flight.show(self._shown, self._seconds)
+        self._scene.draw(self._shown, picture=panel)
+        if self._other is not None:
+            self._other.show(self._others, self._seconds)
+        self._ghost.draw(self._others, picture=False)
+        if panel:
+            self._time.value = round(self._seconds, 2)
+            self._panel.draw(self._shown)
+            self._panel.draw_strip(self._shown)
+
+
+def _label(record: EpisodeRecord) -> str:
+    """Return what a flight is called in the list."""
+    return f"{record.index:03d}  seed {record.seed}  {record.outcome.value}"

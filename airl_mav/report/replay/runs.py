@@ -1,0 +1,67 @@
+"""The flights of a run, ready to be replayed, the worst first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report.arenas import arenas_of, vehicle_of
+from airl_mav.report.forensics.worst import ranked
+from airl_mav.report.replay.flight import ReplayedFlight
+
+
+class ReplayedRun:
+    """A run folder; what a flight needs beside its record is made when it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        """Read a run folder.
+
+        Raises:
+            UsageError: The folder holds no run, no flight of it was recorded, or a profile of it
+                cannot be found any more.
+        """
+        self._run: LoadedRun = load(path)
+        self._vehicle: VehicleProfile = vehicle_of(self._run.info)
+        self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
+        """What was flown where."""
+        paths = self._run.trajectories
+        recorded = [e for e in ranked(self._run) if e.index in paths and len(paths[e.index])]
+        if not recorded:
+            raise UsageError(f"{path}: no flight is recorded")
+        self.records: tuple[EpisodeRecord, ...] = tuple(recorded)
+        """Those that can be replayed, the worst first."""
+        self._made: dict[int, ReplayedFlight] = {}
+
+    def record(self, index: int) -> EpisodeRecord:
+        """Return the record of a flight. Raises FieldError where it is not there."""
+        found = next((each for each in self.records if each.index == index), None)
+        if found is None:
+            numbers = sorted(each.index for each in self.records)
+            raise FieldError("flight", index, f"{numbers[0]} to {numbers[-1]}, as far as recorded")
+        return found
+
+    def flight(self, record: EpisodeRecord) -> ReplayedFlight:
+        """Return a flight. Raises UsageError where its arena cannot be made any more."""
+        index = record.index
+        if index not in self._made:
+            run = self._run
+            self._made[index] = ReplayedFlight(
+                record,
+                run.trajectories[index],
+                run.latency.get(index, {}),
+                arenas_of([record], self._vehicle).get(index),
+                self._vehicle,
+                bool(run.info.config.get("pilot", {}).get("compensate")),
+            )
+        return self._made[index]
+
+    def same(self, record: EpisodeRecord) -> ReplayedFlight | None:
+        """Return the flight of the same seed and arena as another run's; None: there is none."""
+        key = (record.seed, record.arena, record.arena_seed, record.zone)
+        for each in self.records:
+            if (each.seed, each.arena, each.arena_seed, each.zone) == key:
+                return self.flight(each)
+        return None

@@ -1,0 +1,154 @@
+"""A run that was flown, replayed: what is shown is what is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.flight.judge import Outcome
+from airl_mav.report.replay.flight import ReplayedFlight, parting_s
+from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.view.shown import Shown
+from tests.support.run_demo import write_demo_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    written, _ = write_demo_run(
+        tmp_path_factory.mktemp("replay") / "run", episodes=4, profile="dynamic-obstacles"
+    )
+    return written.path
+
+
+@pytest.fixture
+def run(folder: Path) -> ReplayedRun:
+    return ReplayedRun(folder)
+
+
+@pytest.fixture
+def flight(run: ReplayedRun) -> ReplayedFlight:
+    return run.flight(run.record(1))
+
+
+def test_the_worst_flight_comes_first(run: ReplayedRun) -> None:
+    assert len(run.records) == 4
+    reached = [record.outcome is Outcome.SUCCESS for record in run.records]
+    assert reached == sorted(reached)
+    with pytest.raises(FieldError, match="0 to 3"):
+        run.record(4)
+
+
+def test_a_folder_without_a_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=str(tmp_path)):
+        ReplayedRun(tmp_path)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 7.3, 12.0])
+def test_a_moment_is_shown_as_it_was_recorded(flight: ReplayedFlight, seconds: float) -> None:
+    shown, path = Shown(), flight.path
+    flight.begin(shown)
+    flight.show(shown, seconds)
+    time_us = flight.time_us(seconds)
+    at = [np.interp(time_us, path.time_us, column) for column in path.position.T]
+    assert shown.vehicle is not None
+    np.testing.assert_allclose(shown.vehicle.position, at, atol=1e-9)
+    sent_us = flight.stamps["sent_us"]
+    past = sent_us <= time_us
+    if not past.any():
+        assert shown.decided is None
+        return
+    newest = int(np.flatnonzero(past)[-1])
+    assert shown.decided is not None
+    assert shown.decided.sent_us == sent_us[newest]
+    np.testing.assert_allclose(shown.decided.setpoint, flight.stamps["setpoint"][newest])
+    age_ms = (time_us - flight.stamps["capture_us"][newest]) / 1e3
+    assert shown.age_ms == pytest.approx(age_ms)
+    assert shown.ages
+    assert shown.ages[-1][1] == pytest.approx(age_ms, abs=41.0)
+    # The camera sees the arena: what it shows is not blank.
+    assert shown.decided_mm is not None
+    assert len(np.unique(shown.decided_mm)) > 20
+
+
+def test_scrubbing_back_shows_the_earlier_decision(flight: ReplayedFlight) -> None:
+    shown = Shown()
+    flight.begin(shown)
+    newest = {}
+    for seconds in (12.0, 7.0):
+        flight.show(shown, seconds)
+        assert shown.decided is not None
+        newest[seconds] = shown.decided.sent_us
+        assert newest[seconds] <= flight.time_us(seconds)
+    assert newest[7.0] < newest[12.0]
+
+
+def test_flights_part_at_the_first_other_decision(flight: ReplayedFlight) -> None:
+    assert parting_s(flight, flight) is None
+    changed = flight.stamps["setpoint"].copy()
+    changed[3:, 0] += 1.0
+    other = ReplayedFlight(
+        flight.record,
+        flight.path,
+        flight.stamps | {"setpoint": changed},
+        flight.arena,
+        flight.vehicle,
+        flight.compensated,
+    )
+    taken_us = int(flight.stamps["capture_us"][3])
+    assert parting_s(flight, other) == (taken_us - flight.record.started_us) / 1e6
+
+
+class Watched:
+    """A page that somebody watches, though nobody does."""
+
+    def __init__(self, folder: Path, beside: Path | None = None) -> None:
+        viser = pytest.importorskip("viser")
+        from airl_mav.report.replay.page import ReplayPage
+
+        self.server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        other = None if beside is None else ReplayedRun(beside)
+        self.page = ReplayPage(self.server, ReplayedRun(folder), other)
+        self.page._watchers = SimpleNamespace(there=True, follow=lambda _at: None)  # type: ignore[assignment]
+
+    def node(self, name: str) -> Any:
+        return self.server.scene.get_handle_by_name(name)
+
+
+@pytest.fixture
+def watched(folder: Path) -> Iterator[Watched]:
+    made = Watched(folder, folder)
+    yield made
+    made.server.stop()
+
+
+def test_the_page_plays_steps_and_shows_the_other_run(watched: Watched) -> None:
+    page, node = watched.page, watched.node
+    page.advance(0.0)
+    begun = node("/flight/vehicle").position.copy()
+    np.testing.assert_allclose(node("/beside/vehicle").position, begun)
+    assert node("/beside/camera") is None
+    for _ in range(20):
+        page.advance(0.1)
+    assert np.linalg.norm(node("/flight/vehicle").position - begun) > 0.5
+    seconds = page._seconds
+    page._playing = False
+    page.advance(5.0)
+    assert page._seconds == seconds
+    page._go_to(page._next_decision_s())
+    assert page._seconds > seconds
+    page._go_to(1e9)
+    page.advance(0.0)
+    assert page._seconds == page._flight.duration_s
+    # Another flight: another arena, and the vehicle at its beginning.
+    last = page._run.records[-1]
+    page._choose(last)
+    page.advance(0.0)
+    assert page._shown.flight is not None
+    assert page._shown.flight.index == last.index
+    assert page._pick.value.startswith(f"{last.index:03d}")
