@@ -291,6 +291,8 @@ class BuiltinAutopilot:
 
     def _ask(self, mode: Mode, request: Request | None = None) -> Result:
         self._look_anew(mode)
+        if self.flight.phase >= _GROUND:
+            request = self._navigator.permitted(request, self._situation())
         available = self.supervisor.available(mode)
         if mode in WITH_STICKS:
             available = available and self._manual_control.sticks(self._now_us) is not None

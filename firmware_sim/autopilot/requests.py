@@ -38,6 +38,8 @@ class Reposition(Request):
     place: Place
     speed_m_s: float = NAN
     """NaN = as fast as before."""
+    altitude_alone: bool = False
+    """Whether that is all that was asked for (MAV_CMD_DO_CHANGE_ALTITUDE)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,14 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Mode
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Result
 from firmware_sim.autopilot.navigation.fence import Circle, Polygon, all_allow, areas
 from firmware_sim.autopilot.navigation.fence_monitor import PERIOD_US, FenceMonitor
 from firmware_sim.autopilot.navigation.fence_prediction import braking_distance
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
 from firmware_sim.autopilot.navigation.rally import destination
+from firmware_sim.autopilot.requests import Place, Reposition
 from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place
 
@@ -235,6 +236,34 @@ def test_a_vehicle_that_looks_ahead_stays_inside(predict: int) -> None:
     )
     assert rig.mode is Mode.HOLD
     assert (farthest_m[0] < 40.0) is bool(predict)
+
+
+def test_no_place_outside_is_taken_to_hold_at() -> None:
+    """As PX4: the vehicle holds where it is, and says why; a fence that only warns is no fence."""
+    limits = {"GF_MAX_HOR_DIST": 20.0, "GF_MAX_VER_DIST": 15.0, "GF_ACTION": 3}
+    rig = Rig(seed=2, parameters=limits)
+    outside = Reposition(Place((40.0, 0.0, -5.0), math.nan))
+    nowhere = Place((math.nan, math.nan, -40.0), math.nan)
+    assert rig.ap.set_mode(Mode.HOLD, outside) is Result.ACCEPTED  # disarmed it means nothing
+    rig.take_off(5.0)
+    assert math.isnan(rig.said("outside geofence"))
+    for request, text in (
+        (outside, "Reposition is outside geofence"),
+        (Reposition(nowhere, altitude_alone=True), "Altitude change is outside geofence"),
+    ):
+        assert rig.ap.set_mode(Mode.HOLD, request) is Result.ACCEPTED
+        assert rig.said(text) == pytest.approx(rig.time_s, abs=0.1)
+        rig.run(2.0)
+        assert np.linalg.norm(rig.truth.position[:2]) < 0.5
+        assert rig.height == pytest.approx(5.0, abs=0.5)
+    rig.ap.set_mode(Mode.HOLD, Reposition(Place((10.0, 0.0, -5.0), math.nan)))
+    rig.run(2.0)
+    assert rig.truth.position[0] > 1.0
+    rig.ap.parameters.set("GF_ACTION", 1)
+    said_s = rig.said("Reposition is outside")
+    rig.ap.set_mode(Mode.HOLD, outside)
+    assert rig.said("Reposition is outside") == said_s
+    rig.close()
 
 
 # --- rally points

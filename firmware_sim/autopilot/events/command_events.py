@@ -1,7 +1,7 @@
 """Events of commands and setpoints that are refused, and of calibrations.
 
 Names, words, arguments and levels: PX4 1.16, commander/Commander.cpp, commander/rc_calibration.cpp,
-mavlink/mavlink_receiver.cpp, flight_mode_manager/tasks/Orbit.
+mavlink/mavlink_receiver.cpp, navigator/navigator_main.cpp, flight_mode_manager/tasks/Orbit.
 """
 
 from __future__ import annotations
@@ -29,6 +29,18 @@ NO_HIGH_LATENCY = Definition(
     "commander_ctrl_high_latency_failed",
     "Control high latency failed! Telemetry unavailable",
     level=Level.CRITICAL,
+    internal=Level.INFO,
+)
+REPOSITION_OUTSIDE = Definition(
+    "navigator_reposition_outside_geofence",
+    "Reposition is outside geofence",
+    level=Level.ERROR,
+    internal=Level.INFO,
+)
+ALTITUDE_OUTSIDE = Definition(
+    "navigator_change_altitude_outside_geofence",
+    "Altitude change is outside geofence",
+    level=Level.ERROR,
     internal=Level.INFO,
 )
 ORBIT_TOO_WIDE = Definition(

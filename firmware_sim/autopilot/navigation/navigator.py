@@ -10,6 +10,7 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.events import command_events
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import FenceBreach
 from firmware_sim.autopilot.failsafes.watch import Reports
@@ -29,7 +30,10 @@ from firmware_sim.autopilot.navigation.way_home import (
     landing_start,
     onwards,
 )
-from firmware_sim.autopilot.requests import Place
+from firmware_sim.autopilot.requests import Place, Reposition, Request
+
+_WARN = 1
+"""GF_ACTION: up to here the fence is told of, and not kept."""
 
 
 class Navigator:
@@ -74,6 +78,23 @@ class Navigator:
         if situation is not None:
             self.mission.review(situation)
         return self.mission.valid
+
+    def permitted(self, request: Request | None, now: Situation | None) -> Request | None:
+        """Return a request; None where the geofence forbids the place, which is said.
+
+        As PX4: with a GF_ACTION that does no more than warn, any place is allowed.
+        """
+        kept = round(self._value("GF_ACTION")) > _WARN
+        if now is None or not kept or not isinstance(request, Reposition):
+            return request
+        wanted = zip(request.place.position, now.position, strict=True)
+        there = [here if math.isnan(axis) else axis for axis, here in wanted]
+        if self.fence.inside(local_to_geodetic(np.array(there), now.origin), now.home):
+            return request
+        height, place = command_events.ALTITUDE_OUTSIDE, command_events.REPOSITION_OUTSIDE
+        why = height if request.altitude_alone else place
+        self._crew.say(Message.of(Severity.CRITICAL, why))
+        return None
 
     def return_place(self, situation: Situation, home: Place) -> Place | None:
         """Return where Return goes: home, or what RTL_TYPE prefers; its height is the ground's.

@@ -41,7 +41,7 @@ def _change_altitude(command: Command, context: Context) -> Result:
     nowhere = (NAN, NAN, NAN, NAN, NAN, NAN)
     above = replace(command, params=(*nowhere, command.params[0]))
     place = Place(local_place(above, context), NAN)
-    return context.port.set_mode(Mode.HOLD, Reposition(place))
+    return context.port.set_mode(Mode.HOLD, Reposition(place, altitude_alone=True))
 
 
 def _change_speed(command: Command, context: Context) -> Result:
