@@ -8,8 +8,8 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.black_box.messages import SUFFIX
-from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.cli.recordings import folder_of
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
@@ -66,7 +66,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     console = console or Console()
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")
-    options = options.model_copy(update={"runs": tuple(map(_folder_of, options.runs))})
+    options = options.model_copy(update={"runs": tuple(map(folder_of, options.runs))})
     first = options.runs[0]
     if options.trust:
         for folder in options.runs:
@@ -83,17 +83,6 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     else:
         show_comparison(*rebuild_comparison(first), first, console)
     return 0
-
-
-def _folder_of(path: Path) -> Path:
-    """Return the folder of a run; a black box becomes one."""
-    if path.suffix != SUFFIX or path.is_dir():
-        return path
-    check_installed("black-box")
-    # Imported here: MCAP is an extra.
-    from airl_mav.report.recorded_flight import take_in
-
-    return take_in(path)
 
 
 def _compare(options: ReportOptions, console: Console) -> int:

@@ -11,6 +11,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.cli.recordings import folder_of
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
@@ -26,9 +27,12 @@ class ViewOptions(ProfileModel):
     Examples:
         airl view runs/20261122T101530Z-sitl-static-obstacles
         airl view runs/A 7 --beside runs/B
+        airl view flights/20261123T101530.123456Z.mcap
     """
 
-    run: Annotated[Path, POSITIONAL] = Field(description="run folder")
+    run: Annotated[Path, POSITIONAL] = Field(
+        description="run folder, or the black box of a flight (.mcap)"
+    )
     flight: Annotated[int | None, POSITIONAL] = Field(
         default=None, description="number of the flight that is shown first; by default the worst"
     )
@@ -59,7 +63,8 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
     Raises UsageError for a folder that holds no run, a flight that is not there, or a taken port.
     """
     console = console or Console()
-    folders = [options.run] if options.beside is None else [options.run, options.beside]
+    paths = [options.run] if options.beside is None else [options.run, options.beside]
+    folders = [folder_of(path) for path in paths]
     if options.trust:
         for folder in folders:
             trust_arenas(load(folder))

@@ -138,6 +138,8 @@ class Episode(Message):
     arena: ArenaShown | None
     """None: an endless floor."""
     vehicle: VehicleShape
+    goal: tuple[float, float]
+    """North, east [m]."""
     goal_radius_m: float
 
 

@@ -43,6 +43,9 @@ class Look:
 FIRST = Look((47, 127, 196), (47, 54, 61), (40, 104, 168))
 OTHER = Look((150, 80, 170), (110, 50, 130), (150, 80, 170), whole=False)
 
+OPEN = Bounds(-50.0, 50.0, -50.0, 50.0, 5.0)
+"""The floor of a flight outside of all arenas: around its start."""
+
 WALL_OPACITY = 0.25
 FRUSTUM_M = 0.6
 """How far in front of the vehicle the camera's image is drawn [m]."""
@@ -120,8 +123,12 @@ class FlightScene:
     # --- once an episode
 
     def _build(self, episode: Episode, arena: Arena | None) -> None:
-        if arena is not None and self._look.whole:
-            self._build_arena(arena, episode.goal_radius_m)
+        if self._look.whole:
+            bounds = OPEN if arena is None else arena.bounds
+            self._build_floor(bounds)
+            self._build_ends(episode, 0.6 * bounds.height)
+            if arena is not None:
+                self._build_arena(arena)
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
         # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
@@ -131,8 +138,7 @@ class FlightScene:
         self._flown = self._add("arrows", "/place/flown", none, FLOWN, **sizes)
         self._commanded = self._add("arrows", "/place/commanded", none, COMMANDED, **sizes)
 
-    def _build_arena(self, arena: Arena, goal_radius_m: float) -> None:
-        b = arena.bounds
+    def _build_floor(self, b: Bounds) -> None:
         length, width = b.north_max - b.north_min, b.east_max - b.east_min
         middle = (0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max))
         self._add(
@@ -151,7 +157,9 @@ class FlightScene:
             # Its upper side is the one that looks along its own +z.
             wxyz=quat_from_euler(math.pi, 0.0, 0.0),
         )
-        corners, faces = walls(b)
+
+    def _build_arena(self, arena: Arena) -> None:
+        corners, faces = walls(arena.bounds)
         self._add(
             "mesh_simple",
             "/arena/walls",
@@ -169,18 +177,20 @@ class FlightScene:
             node = self._obstacle(arena, i, MOVING if moves else STILL)
             if moves:
                 self._movers.append(node)
-        goal = (float(arena.goal[0]), float(arena.goal[1]))
+
+    def _build_ends(self, episode: Episode, height: float) -> None:
+        """Build start and goal, with a pole of a height [m]."""
+        goal = episode.goal
         self._add(
             "cylinder",
             "/goal/disc",
-            radius=goal_radius_m,
+            radius=episode.goal_radius_m,
             height=0.04,
             color=GOAL,
             opacity=0.45,
             position=(*goal, -0.03),
             cast_shadow=False,
         )
-        height = 0.6 * b.height
         self._add(
             "cylinder",
             "/goal/pole",

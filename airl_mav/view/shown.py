@@ -138,7 +138,6 @@ class Shown:
     @property
     def to_goal_m(self) -> float | None:
         """How far the goal is, seen from above [m]."""
-        if self.vehicle is None or self.arena is None:
+        if self.vehicle is None or self.episode is None:
             return None
-        north, east, _ = self.vehicle.position
-        return math.hypot(self.arena.goal[0] - north, self.arena.goal[1] - east)
+        return math.dist(self.episode.goal, self.vehicle.position[:2])

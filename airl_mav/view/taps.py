@@ -39,15 +39,17 @@ class SimulationTap:
         self._scenario = scenario
         self._vehicle_due = self._picture_due = -1
 
-    def begin(self, seed: int, arena: Arena | None, started_us: int) -> None:
-        """An episode begins, in an arena; None: on an endless floor."""
+    def begin(self, seed: int, arena: Arena, started_us: int) -> None:
+        """An episode begins, in an arena."""
+        north, east = arena.goal.tolist()
         self._vehicle_due = self._picture_due = -1
         self._feed.send(
             Episode(
                 seed=seed,
                 started_us=started_us,
-                arena=None if arena is None else ArenaShown.of(arena),
+                arena=ArenaShown.of(arena),
                 vehicle=VehicleShape.of(self._scenario.vehicle),
+                goal=(north, east),
                 goal_radius_m=self._scenario.pilot.goal_radius_m,
             )
         )

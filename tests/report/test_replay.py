@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -92,16 +93,29 @@ def test_flights_part_at_the_first_other_decision(flight: ReplayedFlight) -> Non
     assert parting_s(flight, flight) is None
     changed = flight.stamps["setpoint"].copy()
     changed[3:, 0] += 1.0
-    other = ReplayedFlight(
-        flight.record,
-        flight.path,
-        flight.stamps | {"setpoint": changed},
-        flight.arena,
-        flight.vehicle,
-        flight.compensated,
-    )
+    other = replace(flight, stamps=flight.stamps | {"setpoint": changed})
     taken_us = int(flight.stamps["capture_us"][3])
     assert parting_s(flight, other) == (taken_us - flight.record.started_us) / 1e6
+
+
+def test_a_flight_outside_of_all_arenas_has_its_goal(flight: ReplayedFlight) -> None:
+    viser = pytest.importorskip("viser")
+    from airl_mav.view.scene import FlightScene
+
+    outside, shown = replace(flight, arena=None), Shown()
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        scene = FlightScene(server)
+        outside.begin(shown)
+        outside.show(shown, 12.0)
+        scene.draw(shown, picture=True)
+        assert shown.decided is not None
+        assert shown.decided_mm is None
+        assert server.scene.get_handle_by_name("/flight/arena/walls") is None
+        north, east, _ = server.scene.get_handle_by_name("/flight/goal/disc").position
+        assert (north, east) == pytest.approx(flight.record.goal)
+    finally:
+        server.stop()
 
 
 class Watched:

@@ -67,7 +67,8 @@ def some_arena() -> Arena:
 def episode(arena: Arena | None = None) -> Episode:
     shape = VehicleShape.of(resolve(Scenario()).vehicle)
     shown = ArenaShown.of(arena or some_arena())
-    return Episode(seed=3, started_us=START_US, arena=shown, vehicle=shape, goal_radius_m=2.0)
+    known = {"vehicle": shape, "goal": (20.0, 5.0), "goal_radius_m": 2.0}
+    return Episode(seed=3, started_us=START_US, arena=shown, **known)
 
 
 def vehicle(seconds: float, north: float = 0.0, mode: str = "offboard") -> Vehicle:

@@ -79,6 +79,7 @@ class ReplayedFlight:
             started_us=self.record.started_us,
             arena=None if self.arena is None else ArenaShown.of(self.arena),
             vehicle=VehicleShape.of(self.vehicle),
+            goal=self.record.goal,
             goal_radius_m=self.record.goal_radius_m,
         )
 

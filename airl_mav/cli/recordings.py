@@ -1,0 +1,22 @@
+"""What commands take for a run: its folder, or the black box of a flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from airl_mav.black_box.messages import SUFFIX
+from airl_mav.cli.options import check_installed
+
+
+def folder_of(path: Path) -> Path:
+    """Return the folder of a run; a black box becomes one.
+
+    Raises UsageError where it cannot be read, or what reads it is not installed.
+    """
+    if path.suffix != SUFFIX or path.is_dir():
+        return path
+    check_installed("black-box")
+    # Imported here: MCAP is an extra.
+    from airl_mav.report.recorded_flight import take_in
+
+    return take_in(path)
