@@ -1,9 +1,10 @@
-"""The picture of the live view in the documentation: a flight, paused, as Chromium shows it.
+"""The pictures of the live view in the documentation, as Chromium shows them.
 
-    python scripts/view_pictures.py        # writes docs/images/view.png
+    python scripts/view_pictures.py        # writes docs/images/view.png and view.gif
 
-A rehearsal in lockstep flies with --view. A headless Chromium watches, pauses it in the middle of
-the way to the goal, and takes the picture.
+Rehearsals in lockstep fly with --view, and a headless Chromium watches. For the picture it pauses
+one in the middle of the way to the goal. For the film it flies slowly: a browser without a GPU
+draws some frames a second. There the latency is set to 400 ms by hand, and compensated later.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 from PIL import Image
@@ -24,15 +28,16 @@ sys.path.insert(0, str(ROOT))
 
 from tests.support.browser import Page, browser  # noqa: E402 (from here on the checkout is found)
 
-PICTURE = ROOT / "docs" / "images" / "view.png"
+IMAGES = ROOT / "docs" / "images"
 
 FLIGHT = (
     *("--level", "lockstep", "--arena", "dynamic-obstacles", "--policy", "dynamic-obstacles"),
-    *("--computer", "ras-pi-4", "--workload", "template-5x32", "--compensate"),
     *("--seed", "4", "--episodes", "1"),
 )
+LATE = ("--computer", "ras-pi-4", "--workload", "template-5x32", "--compensate")
+
 PAUSE_S = 14.5
-"""When the flight is paused [simulated s]."""
+"""When the flight of the picture is paused [simulated s]."""
 
 SIZE = (1280, 800)
 COLOURS = 256
@@ -41,36 +46,84 @@ COLOURS = 256
 SETTLE_S = 4.0
 """What a browser that draws without a GPU needs to draw all [wall s]."""
 
+SLOWLY = 0.15
+"""Pace of the film's flight [simulated s a wall s]."""
+
+FILM_SIZE, FILM_WIDTH, FILM_COLOURS = (1060, 880), 600, 64
+"""Of the page, and what becomes of it."""
+
+FROM_S, LATE_S, COMPENSATED_S, TO_S = 11.2, 12.2, 15.2, 19.5
+"""When the film begins, the latency is set, compensation is switched on, and the film ends."""
+
+FRAME_S = 0.14
+"""Least time between two frames [simulated s]."""
+
 
 def main() -> None:
+    with page_of((*FLIGHT, *LATE), SIZE) as page:
+        wait_until_flown(page, PAUSE_S)
+        page.press("Pause")
+        time.sleep(SETTLE_S)
+        image = shot(page)
+    reduced = image.quantize(COLOURS, dither=Image.Dither.NONE)
+    data = io.BytesIO()
+    reduced.save(data, "PNG", optimize=True)
+    save("view.png", data)
+    with page_of((*FLIGHT, "--speed", str(SLOWLY)), FILM_SIZE) as page:
+        save("view.gif", film(page))
+
+
+def film(page: Page) -> io.BytesIO:
+    """Return the film: each frame stands as long as it was in the flight."""
+    wait_until_flown(page, FROM_S)
+    due = {LATE_S: "Set t2 by hand", COMPENSATED_S: "Compensate"}
+    frames: list[Image.Image] = []
+    times: list[float] = []
+    while not times or times[-1] < TO_S:
+        now_s = seconds(page)
+        for at_s in [at_s for at_s in due if at_s <= now_s]:
+            page.tick(due.pop(at_s))
+        if times and now_s < times[-1] + FRAME_S:
+            continue
+        image = shot(page)
+        height = round(FILM_WIDTH * image.height / image.width)
+        frames.append(image.resize((FILM_WIDTH, height), Image.Resampling.LANCZOS))
+        times.append(now_s)
+    palette = frames[len(frames) // 2].quantize(FILM_COLOURS, dither=Image.Dither.NONE)
+    small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    lasts = [round(1e3 * (b - a)) for a, b in pairwise(times)]
+    data = io.BytesIO()
+    first, *rest = small
+    first.save(
+        data, "GIF", save_all=True, append_images=rest, duration=[*lasts, 2000], loop=0, disposal=1
+    )
+    return data
+
+
+@contextmanager
+def page_of(words: tuple[str, ...], size: tuple[int, int]) -> Iterator[Page]:
+    """Fly a rehearsal for a while and give the page that shows it."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         printed = folder / "printed.txt"
-        words = [sys.executable, "-m", "airl_mav.cli.sitl", *FLIGHT, "--view", "--out", "run"]
+        command = [sys.executable, "-m", "airl_mav.cli.sitl", *words, "--view", "--out", "run"]
         with browser(folder) as page, printed.open("wb") as file:
             environment = {**os.environ, "PYTHONPATH": str(ROOT)}
             flight = subprocess.Popen(
-                words, cwd=folder, env=environment, stdout=file, stderr=subprocess.STDOUT
+                command, cwd=folder, env=environment, stdout=file, stderr=subprocess.STDOUT
             )
             try:
-                page.resize(*SIZE)
+                page.resize(*size)
                 page.open(address(printed, flight))
-                wait_until_flown(page, PAUSE_S)
-                page.press("Pause")
+                while not page.press("Go on"):
+                    time.sleep(0.2)
+                time.sleep(SETTLE_S)
                 # It says that there is no GPU here.
                 page.evaluate("document.querySelector('[role=alert] button')?.click()")
-                time.sleep(SETTLE_S)
-                picture = folder / "page.png"
-                page.screenshot(picture)
+                yield page
             finally:
                 flight.terminate()
                 flight.wait()
-        with Image.open(picture) as image:
-            reduced = image.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-        data = io.BytesIO()
-        reduced.save(data, "PNG", optimize=True)
-        PICTURE.write_bytes(data.getvalue())
-    print(f"{PICTURE}: {len(data.getvalue()) / 1000:.0f} kB")
 
 
 def address(printed: Path, flight: subprocess.Popen[bytes]) -> str:
@@ -83,13 +136,32 @@ def address(printed: Path, flight: subprocess.Popen[bytes]) -> str:
         time.sleep(0.1)
 
 
-def wait_until_flown(page: Page, seconds: float) -> None:
-    """Return when the page shows that so much of the flight is flown [simulated s]."""
-    while True:
-        told = re.search(r"^time\s+([\d.]+) s", page.text(), re.M)
-        if told and float(told[1]) >= seconds:
-            return
+def seconds(page: Page) -> float:
+    """Return how much of the flight is flown, as the page shows it [simulated s]."""
+    told = re.search(r"^time\s+([\d.]+) s", page.text(), re.M)
+    return float(told[1]) if told else 0.0
+
+
+def wait_until_flown(page: Page, flown_s: float) -> None:
+    """Return when so much of the flight is flown [simulated s]."""
+    while seconds(page) < flown_s:
         time.sleep(0.05)
+
+
+def shot(page: Page) -> Image.Image:
+    """Return what is seen now."""
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "page.png"
+        page.screenshot(path)
+        with Image.open(path) as image:
+            return image.convert("RGB")
+
+
+def save(name: str, data: io.BytesIO) -> None:
+    """Write an image of the documentation."""
+    path = IMAGES / name
+    path.write_bytes(data.getvalue())
+    print(f"{path.relative_to(ROOT)}: {len(data.getvalue()) / 1000:.0f} kB")
 
 
 if __name__ == "__main__":
