@@ -18,6 +18,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing import frames_of
 from airl_mav.core.signing_key import StoredSigning
+from companion.interfaces import LinkError
 
 LINK_ID = 2
 """In the signatures of a companion; the flight controller's links are 0 and 1."""
@@ -33,6 +34,9 @@ _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 def signed(url: str, key: Path | None) -> Iterator[str]:
     """Yield what MAVSDK shall connect to: the URL itself, or with a key a proxy before it.
 
+    A LinkError that comes of it names the URL, and whether frames were refused: with another key
+    than the flight controller's nothing else is seen of it.
+
     Raises:
         UsageError: As `SigningProxy`.
     """
@@ -40,7 +44,13 @@ def signed(url: str, key: Path | None) -> Iterator[str]:
         yield url
         return
     with closing(SigningProxy(url, key)) as proxy:
-        yield proxy.url
+        try:
+            yield proxy.url
+        except LinkError as error:
+            told = str(error).replace(proxy.url, url)
+            refused = proxy.refused
+            hint = f" ({refused} frames refused: bad signature)" if refused else ""
+            raise LinkError(told + hint) from None
 
 
 class SigningProxy:

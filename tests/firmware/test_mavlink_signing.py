@@ -15,9 +15,12 @@ from mavsdk.plugins.action import Action
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as dialect
 
+from airl_mav.core.clock import WallClock
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.signing_key import StoredSigning, read_key, write_key
-from companion.signing_proxy import SigningProxy
+from companion.interfaces import LinkError
+from companion.mavsdk_link import MavsdkLink
+from companion.signing_proxy import SigningProxy, signed
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.link import onboard_link
@@ -204,6 +207,20 @@ def test_mavsdk_flies_through_the_signing_proxy(key: Path) -> None:
         counters = flying.server.counters()["onboard"]
         assert counters.rx > 0
         assert (counters.refused, proxy.refused) == (0, 0)
+
+
+def test_a_companion_with_another_key_is_told_so(key: Path, tmp_path: Path) -> None:
+    (api,), _ = free_ports(1, 0)
+    other = tmp_path / "other"
+    write_key(other, bytes(range(1, 33)))
+    url = f"udpin://{LOOPBACK}:{api}"
+    with (
+        closing(Flying(key, api)),
+        pytest.raises(LinkError, match=rf"heard on {url} in 1 s \(\d+ frames refused: bad sig"),
+        signed(url, other) as proxied,
+        closing(MavsdkLink(proxied, WallClock(), threading.Event())) as link,
+    ):
+        link.connect(1.0)
 
 
 def test_the_proxy_signs_for_mavsdk_alone(key: Path) -> None:
