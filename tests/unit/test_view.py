@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
+from airl_mav.cli.evaluate import EvaluateOptions
+from airl_mav.cli.evaluate import run as evaluate
 from airl_mav.cli.options import check_installed, read_options
 from airl_mav.cli.sitl import SitlOptions
 from airl_mav.cli.viewing import view_of
@@ -401,6 +403,19 @@ def test_a_port_wants_a_view() -> None:
     with pytest.raises(FieldError, match="together with --view"):
         view_of(options)
     assert view_of(read_options(SitlOptions, "airl-sitl", [])) is None
+
+
+def test_the_twin_and_several_runs_are_not_watched() -> None:
+    pytest.importorskip("viser")
+    for words in (
+        ["static-obstacles"],
+        ["static-obstacles", "no-obstacles", "--level", "lockstep"],
+    ):
+        options = read_options(EvaluateOptions, "airl evaluate", [*words, "--view"])
+        with pytest.raises(FieldError) as raised:
+            evaluate(options)
+        assert raised.value.field == "view"
+        assert "level lockstep or sitl" in str(raised.value)
 
 
 def test_a_taken_port_is_one_line() -> None:
