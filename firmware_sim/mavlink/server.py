@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain
 
 from airl_mav.core.clock import Clock
@@ -14,21 +15,20 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.clients import Client, Clients
-from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, Values, WireMessage
+from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.complaints import Complaints
 from firmware_sim.mavlink.endpoint import Endpoint, Peer
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
 from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
+from firmware_sim.mavlink.own_streams import OwnStreams
 from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
-from firmware_sim.mavlink.streams import BUILDERS, Builder, information, sensors
-from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
-from firmware_sim.mavlink.streams.status import manual_control, system_time
-from firmware_sim.mavlink.streams.vibration import VibrationMeter
+from firmware_sim.mavlink.streams import BUILDERS, Builder
+from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.mavlink.traffic_log import TrafficLog
@@ -87,7 +87,6 @@ class MavlinkServer:
                 sets one, which is forgotten with the server.
         """
         self._port: AutopilotPort | None = None
-        self._truth: Callable[[], Truth] | None = None
         self._clock = clock
         self._stored = signing
         self._signing = (
@@ -99,9 +98,11 @@ class MavlinkServer:
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
-        self._vibration = VibrationMeter()
+        self._streams = OwnStreams()
         self._texts: list[Message] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
+        self._answers_apart = any(config.separate_replies for config in links)
+        """Whether answers must leave the telemetry as it is: events are part of that."""
         self._events = EventBuffer()
         self._complaints = Complaints()
         self._first_in_turn = 0
@@ -112,13 +113,8 @@ class MavlinkServer:
         self._builders: dict[str, Builder] = {
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
-            "VIBRATION": lambda state: self._vibration.message(state),
-            "BATTERY_STATUS": self._battery_status,
-            "TIME_ESTIMATE_TO_TARGET": self._time_estimate,
+            **self._streams.builders,
             "TIMESYNC": peers.timesync_request,
-            "HIL_STATE_QUATERNION": self._hil_state_quaternion,
-            "MAG_CAL_REPORT": self._mag_cal_report,
-            "MANUAL_CONTROL": lambda state: manual_control(state, self._system_id),
         }
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)
@@ -134,13 +130,13 @@ class MavlinkServer:
         """
         if self._port is not None:
             self._discard()
-        self._port, self._truth = port, truth
+        self._port = port
         self._forget_us = 0
         self._system_id = _system_id(port)
+        self._streams.attach(port, truth, self._system_id)
         self._senders.forget()
         self._complaints.restart()
         self._announced.renew()
-        self._vibration = VibrationMeter()
         self._calibration = RunningCalibration()
         self._events = EventBuffer()
         for clients in self._links:
@@ -177,7 +173,7 @@ class MavlinkServer:
             return
         sample = port.sample
         if sample is not None:
-            self._vibration.update(sample)
+            self._streams.vibration.update(sample)
         texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
         for event in port.take_events():
             self._events.add(event, now_us)
@@ -346,9 +342,11 @@ class MavlinkServer:
         if not self._announced.left(self._now_us):
             return
         self._announced.take(1, self._now_us)
-        self._texts.append(text)
-        if text.event is not None:
+        if text.event is not None and self._answers_apart:
+            text = replace(text, event=None)
+        elif text.event is not None:
             self._events.add(text.event, self._now_us)
+        self._texts.append(text)
 
     def _broadcast(self, name: str, payload: bytes) -> None:
         for client in self._all():
@@ -356,25 +354,6 @@ class MavlinkServer:
 
     def _all(self) -> Iterator[Client]:
         return chain.from_iterable(self._links)
-
-    def _battery_status(self, state: AutopilotState) -> Values | None:
-        if self._port is None:
-            return None
-        return sensors.battery_status(state, self._port.parameters)
-
-    def _hil_state_quaternion(self, _state: AutopilotState) -> Values | None:
-        if self._truth is None:
-            return None
-        truth = self._truth()
-        return hil_state_quaternion(truth, truth.time_us)
-
-    def _mag_cal_report(self, _state: AutopilotState) -> Values | None:
-        return None if self._port is None else sensors.mag_cal_report(self._port.parameters.value)
-
-    def _time_estimate(self, state: AutopilotState) -> Values | None:
-        if self._port is None:
-            return None
-        return information.time_estimate_to_target(state, self._port.parameters.value)
 
 
 def _stream_news(client: Client, texts: Iterable[Message], now_us: int) -> None:

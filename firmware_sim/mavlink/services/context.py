@@ -34,8 +34,8 @@ class Context:
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
     """Sends a text to the operators, to all clients of all links; and its event, if it is one.
-    Events are part of the telemetry, which is to be the same every time in lockstep: nothing that
-    clients ask by the wall clock there leads to a text."""
+    Events are part of the telemetry: where an answer to a client must not change that, in lockstep,
+    it is a text alone."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
     events: EventBuffer
