@@ -21,6 +21,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
 )
 from firmware_sim.autopilot.commander import (
+    COMMANDED,
     READINESS,
     Ask,
     Event,
@@ -283,20 +284,24 @@ class BuiltinAutopilot:
         self._guidance.take_off_to(altitude_m, place, self._state, flying=flying)
         return self._ask(Mode.TAKEOFF)
 
-    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
-        """Ask for a mode, with what it takes beyond its name."""
+    def set_mode(
+        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+    ) -> Result:
+        """Ask for a mode, with what it takes beyond its name; see `port.AutopilotPort`."""
         if mode is Mode.TAKEOFF:
             return self.takeoff(None)
-        return self._ask(mode, request)
+        return self._ask(mode, request, COMMANDED.get(mode) if commanded else None)
 
-    def _ask(self, mode: Mode, request: Request | None = None) -> Result:
+    def _ask(
+        self, mode: Mode, request: Request | None = None, granted: Message | None = None
+    ) -> Result:
         self._look_anew(mode)
         if self.flight.phase >= _GROUND:
             request = self._navigator.permitted(request, self._situation())
         available = self.supervisor.available(mode)
         if mode in WITH_STICKS:
             available = available and self._manual_control.sticks(self._now_us) is not None
-        return self._commander.handle(Ask(mode, available), request)
+        return self._commander.handle(Ask(mode, available), request, granted)
 
     def change_speed(self, speed_m_s: float) -> None:
         """Set the horizontal speed of the present automatic mode [m/s]."""
@@ -355,8 +360,7 @@ class BuiltinAutopilot:
 
     def return_to_launch(self) -> None:
         """End the mission and return."""
-        self.say(Message.of(Severity.INFO, events.RETURNING))
-        self.set_mode(Mode.RETURN)
+        self.set_mode(Mode.RETURN, commanded=True)
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""

@@ -134,8 +134,8 @@ _LIFTED = Row(phase=_A, text=Message.of(Severity.INFO, events.TAKEOFF_DETECTED))
 _LANDED = Row(phase=_G, text=Message.of(Severity.INFO, events.LANDING_DETECTED))
 
 
-def _ask(mode: Mode, text: Message | None = None) -> Row:
-    return Row(choice=Choice.ASK, mode=mode, text=text)
+def _ask(mode: Mode) -> Row:
+    return Row(choice=Choice.ASK, mode=mode)
 
 
 def _unavailable(mode: Mode) -> Row:
@@ -146,8 +146,7 @@ def _unavailable(mode: Mode) -> Row:
 
 def _asked(mode: Mode) -> tuple[Row, Row, Row, Row]:
     # Also on the ground and disarmed: accepted, the vehicle stays (as PX4 does it).
-    text = _FLYING_TEXT.get(mode)
-    return (_ask(mode), _ask(mode), _ask(mode, text), _ask(mode, text))
+    return (_ask(mode),) * 4
 
 
 def _asked_in_vain(mode: Mode) -> tuple[Row, Row, Row, Row]:
@@ -160,11 +159,12 @@ def _disarm(reason: ArmingReason) -> Row:
     return Row(phase=_S, choice=Choice.RESTORE, text=text)
 
 
-_FLYING_TEXT = {
-    Mode.LAND: _info("Landing at current position", events.LANDING_HERE.event()),
+COMMANDED = {
+    Mode.LAND: Message.of(Severity.INFO, events.LANDING_HERE),
     Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
+    Mode.RETURN: Message.of(Severity.INFO, events.RETURNING),
 }
-"""What an armed vehicle says when it is asked for a mode."""
+"""What is said when a command of its own grants a mode, armed or not; DO_SET_MODE is silent."""
 
 _DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
 _UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)

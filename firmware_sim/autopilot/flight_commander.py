@@ -74,11 +74,20 @@ class FlightCommander:
                 self._say(text)
         self.obey(NO_INTERVENTION)
 
-    def handle(self, event: Ask | Event, request: Request | None = None) -> Result:
-        """Carry out an event; `request` is what a user wants beyond a mode's name."""
+    def handle(
+        self, event: Ask | Event, request: Request | None = None, granted: Message | None = None
+    ) -> Result:
+        """Carry out an event.
+
+        Args:
+            event: What happened, or was asked for.
+            request: What a user wants beyond a mode's name.
+            granted: What is said when it is granted.
+        """
         step = transition(self.flight, event)
-        if step.text is not None:
-            self._say(step.text)
+        text = granted if step.text is None and step.result is Result.ACCEPTED else step.text
+        if text is not None:
+            self._say(text)
         flown = self.flight.mode
         asked = isinstance(event, Ask) and step.result is Result.ACCEPTED
         if asked and step.flight.phase >= _GROUND:
@@ -97,6 +106,7 @@ class FlightCommander:
             self._explain_loss()
         if self._newest.sample is None:
             return
+        self._commanded.guidance.context.armed = flight.phase >= _GROUND
         if flight.mode is not flown or request is not None:
             self._commanded.navigator.due_us = 0
             self._commanded.guidance.enter(flight.mode, self._state, request)

@@ -192,8 +192,16 @@ class AutopilotPort(Protocol):
         """
         ...
 
-    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
-        """Ask for a mode, with what it takes beyond its name."""
+    def set_mode(
+        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+    ) -> Result:
+        """Ask for a mode.
+
+        Args:
+            mode: Which one.
+            request: What it takes beyond its name.
+            commanded: By a command of its own (NAV_LAND), whose grant is told.
+        """
         ...
 
     def change_speed(self, speed_m_s: float) -> None:

@@ -32,8 +32,6 @@ ARMED = (Severity.INFO, "Armed by external command")
 DISARMED = (Severity.INFO, "Disarmed by external command")
 NO_ARM = (Severity.CRITICAL, "Arming denied: Resolve system health failures first")
 NOT_LANDED = (Severity.CRITICAL, "Disarming denied: not landed")
-LANDING = (Severity.INFO, "Landing at current position")
-PRECISELY = (Severity.INFO, "Precision landing")
 CUT = (Severity.INFO, "Disarmed by failsafe")
 LOCKED = (Severity.INFO, "Disarmed by lockdown")
 
@@ -78,10 +76,6 @@ EXPECTED: dict[tuple[Ask | Event, Phase], Expected] = {
     (Event.KILL, AIR): disarmed(DISARMED),
     # Modes may be chosen at any time, a take-off on the ground too.
     **{(Ask(m), p): asked(p, m) for m, p in product(Mode, Phase)},
-    (Ask(Mode.LAND), GROUND): asked(GROUND, Mode.LAND, LANDING),
-    (Ask(Mode.LAND), AIR): asked(AIR, Mode.LAND, LANDING),
-    (Ask(Mode.PRECISION_LAND), GROUND): asked(GROUND, Mode.PRECISION_LAND, PRECISELY),
-    (Ask(Mode.PRECISION_LAND), AIR): asked(AIR, Mode.PRECISION_LAND, PRECISELY),
     # A mode that lacks what it needs (offboard: a setpoint): on the ground disarmed yes, else no.
     **{(Ask(m, available=False), p): asked(p, m) for m, p in product(Mode, (BOOT, STANDBY))},
     **{

@@ -536,7 +536,7 @@ def test_landing_from_eight_metres() -> None:
     with flight(SEED) as rig:
         rig.take_off(8.0)
         above = rig.truth.position
-        assert rig.ap.set_mode(Mode.LAND) is Result.ACCEPTED
+        assert rig.ap.set_mode(Mode.LAND, commanded=True) is Result.ACCEPTED
         assert count(rig, "Landing at current position") == 1
         took_s = until_said(rig, "Landing detected", 30.0)
         assert 10.0 < took_s < 20.0  # PX4: 14.5 s
@@ -566,3 +566,27 @@ def test_return_near_home_does_not_climb() -> None:
         rig.ap.set_mode(Mode.RETURN)
         assert highest_until_disarmed(rig, 40.0) < 4.5
         assert horizontal(rig) < 1.0
+
+
+@pytest.mark.parametrize(
+    ("mode", "text"),
+    [
+        (Mode.LAND, "Landing at current position"),
+        (Mode.PRECISION_LAND, "Precision landing"),
+        (Mode.RETURN, "Returning to launch"),
+    ],
+)
+def test_a_command_of_its_own_is_told_and_a_choice_of_modes_is_not(mode: Mode, text: str) -> None:
+    """On a PX4 1.16: disarmed, in flight, and when it is flown already."""
+    with flight(SEED) as rig:
+        rig.boot()
+        assert rig.ap.set_mode(mode, commanded=True) is Result.ACCEPTED
+        assert count(rig, text) == 1
+        assert count(rig, "RTL: start return at") == 0, "disarmed nothing is flown"
+        rig.ap.set_mode(Mode.HOLD)
+        rig.take_off(6.0)
+        rig.ap.set_mode(mode)
+        assert count(rig, text) == 1
+        for said in (2, 3):
+            rig.ap.set_mode(mode, commanded=True)
+            assert count(rig, text) == said

@@ -53,7 +53,7 @@ def test_it_lands_on_the_target_and_follows_it() -> None:
     rig.take_off(6.0, settle_s=0.0)
     beacon = Beacon(rig, 5.0, -3.0)
     beacon.run(0.2)
-    assert rig.ap.set_mode(Mode.PRECISION_LAND) is Result.ACCEPTED
+    assert rig.ap.set_mode(Mode.PRECISION_LAND, commanded=True) is Result.ACCEPTED
     assert rig.said("Precision landing") > 0.0
     beacon.run(6.0)
     # It stays at its height until it is above the target.

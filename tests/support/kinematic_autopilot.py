@@ -198,7 +198,9 @@ class KinematicAutopilot:
     def change_speed(self, speed_m_s: float) -> None:
         self.commands.append(f"speed {speed_m_s}")
 
-    def set_mode(self, mode: Mode, request: Request | None = None) -> Result:
+    def set_mode(
+        self, mode: Mode, request: Request | None = None, *, commanded: bool = False
+    ) -> Result:
         self.requests.append(request)
         self.commands.append(f"mode {mode.name}")
         in_air = self.landed is not Landed.ON_GROUND

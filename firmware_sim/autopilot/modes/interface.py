@@ -54,6 +54,8 @@ class FlightContext:
     """What Mission mode flies, and Return where it flies items of the mission."""
     mission_over: bool = False
     """Whether the mission has come to its end."""
+    armed: bool = False
+    """Whether the motors may turn: a mode that is chosen before is only entered."""
     standing: bool = True
     """Whether the vehicle stands on the ground."""
     sticks: Sticks | None = None

@@ -84,7 +84,8 @@ class ReturnToLaunch(FlightMode):
         above_sea = math.ceil(ground + at)
         text = f"RTL: start return at {above_sea} m ({math.ceil(at)} m above destination)"
         event = events.RTL_RETURN_AT.event(above_sea, math.ceil(at))
-        context.say(Message(Severity.INFO, text, event))
+        if context.armed:  # Disarmed nothing is flown, and nothing is told of it.
+            context.say(Message(Severity.INFO, text, event))
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Fly the present stage, and on to the next when it is over."""

@@ -97,15 +97,20 @@ def _reboot(command: Command, _context: Context) -> Result:
     return Result.ACCEPTED if command.integer(1) == 0 else Result.DENIED
 
 
+def _mode(mode: Mode) -> Action:
+    """Return what grants a mode by a command of its own."""
+    return lambda _, context: context.port.set_mode(mode, commanded=True)
+
+
 _REQUEST_CAPABILITIES: int = dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES
 _REQUEST_PROTOCOL: int = dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION
 
 ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_COMPONENT_ARM_DISARM: _arm_disarm,
     dialect.MAV_CMD_NAV_TAKEOFF: _takeoff,
-    dialect.MAV_CMD_NAV_LAND: lambda _, context: context.port.set_mode(Mode.LAND),
-    dialect.MAV_CMD_NAV_LAND_LOCAL: (lambda _, context: context.port.set_mode(Mode.PRECISION_LAND)),
-    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _, context: context.port.set_mode(Mode.RETURN),
+    dialect.MAV_CMD_NAV_LAND: _mode(Mode.LAND),
+    dialect.MAV_CMD_NAV_LAND_LOCAL: _mode(Mode.PRECISION_LAND),
+    dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
