@@ -2,7 +2,8 @@
 
     python scripts/learning_curves.py [--configs NAME ...] [--seeds N] [--steps N] [--out DIR]
 
-By default the paper's algorithm exploration (DQN and PPO, with and without curriculum). Each run is
+By default the paper's algorithm exploration (DQN and PPO, with and without curriculum), and the
+default policy's training. Each run is
 an `airl train` of its own that survives a kill: start the script again and it goes on where it was.
 The picture shows the success rate on the selection seeds, mean over the training seeds with a 95 %
 interval (Student's t); the table says after how many decisions each configuration reached 97 %, not
@@ -33,7 +34,12 @@ from airl_mav.report.saved_table import write_table
 from airl_mav.report.table import NONE, Column, TableView, markdown_table
 from airl_mav.training.store import CONFIG_FILE, SCHEMA, Evaluation, TrainingFolder
 
-PAPER = ("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum")
+CONFIGS = (
+    *("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum"),
+    "static-obstacles",
+)
+"""The paper's exploration, and what the default policy was trained with."""
+
 REACHED = 0.97
 
 
@@ -41,7 +47,7 @@ REACHED = 0.97
 class Command:
     """Train, collect, draw."""
 
-    configs: tuple[str, ...] = PAPER
+    configs: tuple[str, ...] = CONFIGS
     """Training configurations: shipped names or paths."""
 
     seeds: int = 5

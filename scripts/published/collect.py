@@ -20,6 +20,8 @@ from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.model import Comparison, load_comparison
 from airl_mav.report.saved_table import read_table
+from airl_mav.sweep.store import SCHEMA as SWEEP_SCHEMA
+from airl_mav.sweep.store import SWEEP_FILE
 from published.declared import Declared
 from published.record import (
     MEASURES,
@@ -49,6 +51,8 @@ def collect(declared: Declared, out: Path, behaviour: str | None) -> Record:
             return _of_table(declared, _fault_matrix(out), behaviour)
         case "roofline":
             return _of_table(declared, _roofline(out), behaviour)
+        case "sweep":
+            return _of_table(declared, _sweep(out), behaviour)
         case "table":
             return _of_table(declared, _table(out), behaviour)
         case "run":
@@ -109,6 +113,28 @@ def _roofline(out: Path) -> _Table:
     }
     rows = tuple(tuple(cell(point) for cell in shown.values()) for point in found.points)
     return _Table(Printed(columns=tuple(shown), rows=rows), data, frozenset({found.policy}))
+
+
+def _sweep(out: Path) -> _Table:
+    """Return the success of a sweep's networks in its first arena, layers by filters."""
+    path = out / SWEEP_FILE
+    data = read_json(path, SWEEP_SCHEMA, "sweep")
+    if data["trials_ended"] < data["trials_planned"]:
+        raise UsageError(f"{path}: {data['trials_ended']} trials of {data['trials_planned']}")
+    arena, best = next(iter(data["best"].items()))
+    cells = {(c["layers"], c["filters"]): c for c in data["cells"] if c["arena"] == arena}
+
+    def cell(layers: int, filters: int) -> str:
+        found = cells[layers, filters]
+        value, std = 100.0 * found["success_rate"]["value"], 100.0 * found["success_std"]
+        shown = f"{value:.1f} ± {std:.1f}"
+        is_best = (layers, filters) == (best["layers"], best["filters"])
+        return f"**{shown}**" if is_best else shown
+
+    layers, filters = (sorted({key[axis] for key in cells}) for axis in (0, 1))
+    columns = ("%", *(f"{n} filters" for n in filters))
+    rows = tuple((f"{k} layers", *(cell(k, n) for n in filters)) for k in layers)
+    return _Table(Printed(columns=columns, rows=rows), data["made"])
 
 
 def _table(out: Path) -> _Table:

@@ -20,7 +20,16 @@ from published.record import RESULTS
 DECLARED_FILE = RESULTS / "results.toml"
 
 Kind = Literal[
-    "gap", "matrix", "ladder", "degradation", "compare", "run", "faults", "roofline", "table"
+    "gap",
+    "matrix",
+    "ladder",
+    "degradation",
+    "compare",
+    "run",
+    "faults",
+    "roofline",
+    "sweep",
+    "table",
 ]
 
 
