@@ -1,8 +1,10 @@
-"""How MAVSDK is opened, and a flight controller found on it."""
+"""How MAVSDK is opened, finds a flight controller, and exchanges bytes without sockets."""
 
 from __future__ import annotations
 
+import ctypes
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk
@@ -15,6 +17,16 @@ from companion.interfaces import LinkError
 
 SLICE_S = 0.5
 """Longest single wait for a flight controller [wall s]."""
+
+RAW_URL = "raw://"
+"""Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
+
+RAW_CHUNK = 65_536
+"""Bytes passed at a time; MAVSDK's parser reassembles a divided frame."""
+
+RAW_TIMEOUT_S = 3600.0
+"""MAVSDK's time-out of a command on a raw connection [wall s]. The answer is certain, but not its
+wall time: a process that was stopped must not repeat commands when it resumes."""
 
 
 def open_connection(url: str, kind: ComponentType) -> Mavsdk:
@@ -51,3 +63,36 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
         if system is not None:
             return system
     return None
+
+
+def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
+    """Take over the bytes of a `raw://` connection.
+
+    Args:
+        mavsdk: Opened on it.
+        sent: Called with every MAVLink frame that MAVSDK sends, from MAVSDK's own thread: it
+            must return at once and take no lock that somebody who feeds bytes may hold.
+
+    Returns:
+        What to feed MAVSDK with, whole frames, from one thread at a time.
+    """
+    set_timeout(mavsdk, RAW_TIMEOUT_S)
+    mavsdk.subscribe_raw_bytes_to_be_sent(sent)
+    # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
+    buffer = (ctypes.c_uint8 * RAW_CHUNK)()
+    handle, pass_bytes = mavsdk._handle, mavsdk._lib.mavsdk_pass_received_raw_bytes
+
+    def feed(data: bytes) -> None:
+        for start in range(0, len(data), RAW_CHUNK):
+            chunk = data[start : start + RAW_CHUNK]
+            ctypes.memmove(buffer, chunk, len(chunk))
+            pass_bytes(handle, buffer, len(chunk))
+
+    return feed
+
+
+def set_timeout(mavsdk: Mavsdk, seconds: float) -> None:
+    """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
+    call = mavsdk._lib.mavsdk_set_timeout_s  # not wrapped by MAVSDK-Python 4.1
+    call.argtypes = [ctypes.c_void_p, ctypes.c_double]
+    call(mavsdk._handle, seconds)

@@ -7,7 +7,6 @@ this process hangs; `watchdog.py` is there for that.
 
 from __future__ import annotations
 
-import ctypes
 import math
 import threading
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import PX4, Dialect, dialect_of
 from companion.interfaces import STOP, BatteryState, BodyVelocity, LinkError, VehicleStatus
-from companion.mavsdk_connection import first_autopilot, open_connection
+from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
 POLL_S = 0.1
 """Interval at which a condition is checked while waiting for it [s]."""
@@ -56,16 +55,6 @@ STREAM_TIMEOUT_S = 10.0
 
 STREAM_RETRY_S = 0.2
 """Time between two requests for a stream [wall s]."""
-
-RAW_URL = "raw://"
-"""Connection without sockets: the bytes are exchanged with this process, see `exchange_raw`."""
-
-RAW_CHUNK = 65_536
-"""Bytes passed at a time; MAVSDK's parser reassembles a divided frame."""
-
-RAW_TIMEOUT_S = 3600.0
-"""MAVSDK's time-out of a command on a raw connection [wall s]. The answer is certain, but not its
-wall time: a process that was stopped must not repeat commands when it resumes."""
 
 
 class MavsdkLink:
@@ -163,34 +152,12 @@ class MavsdkLink:
         WallClock().sleep_until(int(STREAM_RETRY_S * US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
-        """Take over the bytes of a `raw://` connection.
-
-        Args:
-            sent: Called with every MAVLink frame that MAVSDK sends, from MAVSDK's own thread: it
-                must return at once and take no lock that somebody who feeds bytes may hold.
-
-        Returns:
-            What to feed MAVSDK with, whole frames, from one thread at a time.
-        """
-        self.set_timeout(RAW_TIMEOUT_S)
-        self._mavsdk.subscribe_raw_bytes_to_be_sent(sent)
-        # MAVSDK-Python's own function makes a ctypes array type for every length of `data`: 0.1 ms.
-        buffer = (ctypes.c_uint8 * RAW_CHUNK)()
-        handle, pass_bytes = self._mavsdk._handle, self._mavsdk._lib.mavsdk_pass_received_raw_bytes
-
-        def feed(data: bytes) -> None:
-            for start in range(0, len(data), RAW_CHUNK):
-                chunk = data[start : start + RAW_CHUNK]
-                ctypes.memmove(buffer, chunk, len(chunk))
-                pass_bytes(handle, buffer, len(chunk))
-
-        return feed
+        """Take over the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
+        return exchange_raw(self._mavsdk, sent)
 
     def set_timeout(self, seconds: float) -> None:
         """Set after how long MAVSDK repeats an unanswered request [wall s]; its own is 0.5 s."""
-        call = self._mavsdk._lib.mavsdk_set_timeout_s  # not wrapped by MAVSDK-Python 4.1
-        call.argtypes = [ctypes.c_void_p, ctypes.c_double]
-        call(self._mavsdk._handle, seconds)
+        set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Exchange STATUSTEXTs with the flight controller; `connect` comes first.

@@ -20,7 +20,8 @@ from airl_mav.lockstep.threaded import ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.interfaces import LinkError
-from companion.mavsdk_link import RAW_TIMEOUT_S, RAW_URL, MavsdkLink
+from companion.mavsdk_connection import RAW_TIMEOUT_S, RAW_URL
+from companion.mavsdk_link import MavsdkLink
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.firmware import Firmware
