@@ -12,16 +12,20 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 
 SUFFIX = ".mcap"
 """Of the files."""
+
+Microseconds: TypeAlias = Annotated[int, Field(ge=-1, lt=2**62)]
+Whole: TypeAlias = Annotated[int, Field(ge=0, lt=2**62)]
 
 Number: TypeAlias = float | None
 """None: not a number, or infinite, which JSON cannot say."""
@@ -34,15 +38,15 @@ Vector4: TypeAlias = tuple[Number, Number, Number, Number]
 class Decision:
     """A decision, as soon as its command is sent."""
 
-    capture_us: int
+    capture_us: Microseconds
     """Exposure of the frame that it saw; -1: stamped by another clock than the companion's."""
-    decoded_us: int
-    infer_start_us: int
-    action_ready_us: int
-    sent_us: int
-    held_until_us: int
+    decoded_us: Microseconds
+    infer_start_us: Microseconds
+    action_ready_us: Microseconds
+    sent_us: Microseconds
+    held_until_us: Microseconds
     """Until when the action is to be held; `held_before_us` of the next says when it ended."""
-    held_before_us: int
+    held_before_us: Microseconds
     """When the hold of the decision before had ended; -1: this is the first."""
     position: Vector3
     """Of the vehicle, as the decision saw it [m]."""
@@ -60,7 +64,7 @@ class Decision:
 class Telemetry:
     """What the flight controller says of the vehicle."""
 
-    time_us: int
+    time_us: Microseconds
     position: Vector3
     """[m]."""
     velocity: Vector3
@@ -73,7 +77,7 @@ class Telemetry:
 class Status:
     """Who flies, and the battery."""
 
-    time_us: int
+    time_us: Microseconds
     armed: bool
     offboard: bool
     mode: str
@@ -88,12 +92,12 @@ class Status:
 class Resources:
     """What the companion takes of its computer, and how warm that is."""
 
-    time_us: int
+    time_us: Microseconds
     process_cores: float
     """Cores that the companion kept busy since the message before."""
     machine_percent: float
     """Share of all cores that everything kept busy since then."""
-    memory_bytes: int
+    memory_bytes: Whole
     """Resident set of the companion."""
     temperature_c: float | None
     """Of the warmest sensor; None: the machine has none."""
@@ -103,7 +107,7 @@ class Resources:
 class Phase:
     """A phase of the mission begins."""
 
-    time_us: int
+    time_us: Microseconds
     phase: str
 
 
@@ -111,7 +115,7 @@ class Phase:
 class End:
     """The mission has ended."""
 
-    time_us: int
+    time_us: Microseconds
     reason: str
     notes: tuple[str, ...]
 
@@ -130,11 +134,11 @@ class RawImage:
 
     timestamp: Time
     frame_id: str
-    width: int
-    height: int
+    width: Whole
+    height: Whole
     encoding: str
     """`mono16`: depth in millimetres, 0 = no return."""
-    step: int
+    step: Whole
     """Bytes of a row."""
     data: str
     """Base64 of the rows, little endian."""

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from mcap.exceptions import InvalidMagic, McapError
 from mcap.records import Channel, DataEnd, Metadata
 from mcap.records import Message as Record
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.black_box.messages import (
@@ -49,6 +49,8 @@ class BlackBox:
     messages: dict[type[Message], list[Any]] = field(default_factory=dict)
     whole: bool = False
     """Whether it was closed, or ends somewhere: the program, the computer or the power failed."""
+    damaged: bool = False
+    """Whether it was closed, and is no longer what was written."""
 
     def all_of(self, kind: type[M]) -> list[M]:
         """Return the messages of a kind, in their order."""
@@ -64,18 +66,19 @@ def read_black_box(path: Path) -> BlackBox:
     box = None
     try:
         with path.open("rb") as file:
-            reader = StreamReader(file, record_size_limit=_RECORD_BYTES)
+            reader = StreamReader(file, validate_crcs=True, record_size_limit=_RECORD_BYTES)
             for record in _whole_records(reader):
                 if isinstance(record, Metadata) and record.name == METADATA and box is None:
-                    box = BlackBox(path, json.loads(record.metadata[RUN]))
-                elif isinstance(record, DataEnd) and box is not None:
+                    box = BlackBox(path, dict(json.loads(record.metadata[RUN])))
+                elif isinstance(record, DataEnd | CRCValidationError) and box is not None:
                     box.whole = True
+                    box.damaged = isinstance(record, CRCValidationError)
                 elif isinstance(record, tuple) and box is not None:
                     kind, message = record
                     box.messages.setdefault(kind, []).append(message)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
-    except (InvalidMagic, KeyError, json.JSONDecodeError):
+    except (InvalidMagic, KeyError, TypeError, ValueError):
         box = None
     if box is None:
         raise UsageError(f"{path}: accepted: a black box of airl-companion (MCAP)")
@@ -83,7 +86,10 @@ def read_black_box(path: Path) -> BlackBox:
 
 
 def _whole_records(reader: StreamReader) -> Iterator[Any]:
-    """Give metadata, the end, and messages with their kinds, up to the first torn record."""
+    """Give metadata, the end, and messages with their kinds, up to the first torn record.
+
+    A wrong checksum of all records is given in place of the end.
+    """
     kinds = {topic: kind for kind, topic in TOPICS.items()}
     adapters: dict[int, tuple[type[Message], TypeAdapter[Any]]] = {}
     records = reader.records
@@ -98,6 +104,9 @@ def _whole_records(reader: StreamReader) -> Iterator[Any]:
                 yield kind, adapter.validate_json(record.data)
             elif isinstance(record, (Metadata, DataEnd)):
                 yield record
+        except CRCValidationError as error:
+            yield error
+            return
         except InvalidMagic:
             if adapters:
                 return  # At the end of the file: torn there.

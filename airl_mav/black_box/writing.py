@@ -46,6 +46,7 @@ class BlackBoxFile:
             compression=CompressionType.NONE,
             index_types=IndexType.METADATA,
             use_chunking=False,
+            enable_data_crcs=True,
         )
         self._writer.start(library="airl-mav")
         self._writer.add_metadata(METADATA, {RUN: json.dumps(run)})

@@ -17,13 +17,14 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file
 from airl_mav.core.frames import quat_yaw
+from airl_mav.core.plugins import names_code
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, RunInfo
-from airl_mav.report.recorded_flight import episode_of, info_of
+from airl_mav.report.recorded_flight import episode_of, info_of, settings_of
 from airl_mav.scenario.model import Decisions, Scenario
 from airl_mav.scenario.resolve import resolve
 
@@ -121,10 +122,14 @@ def refly(
     if arena is None:
         episode = from_its_start(episode)
         arena = _plain(episode, out / ARENA_FILE)
+    flew = str(box.run["config"].get("policy"))
+    if policy is None and names_code(flew) and not trust:
+        accepted = "with --trust, or a --policy of yours: it is code that would run on this machine"
+        raise FieldError("policy", flew, accepted)
     given = {
         "arena": arena,
         "arena_seed": episode.record.seed if arena_seed is None else arena_seed,
-        "policy": policy or box.run["config"]["policy"],
+        "policy": policy or flew,
         "trust": trust,
         "episodes": episodes,
     }
@@ -234,7 +239,7 @@ def _scenario(box: BlackBox, latencies: Path, given: dict[str, Any]) -> Scenario
     how = {
         "level": "lockstep",
         "latency": str(latencies),
-        "time_limit_s": asked["limits"]["flight_s"],
+        "time_limit_s": settings_of(box).limits.flight_s,
         "cpu_quota": None,  # What its processor took is in the latencies.
     }
     return validated(Scenario, {**kept, **how, **given}, box.path)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter
 
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
 from airl_mav.black_box.reading import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.core.files import typed
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
@@ -40,6 +42,40 @@ DIGEST = "recording_sha256"
 """Setting of the run that tells which file it was made of."""
 
 
+@dataclass(frozen=True)
+class FlownPilot:
+    """How the policy was flown."""
+
+    hold_s: float
+    goal_radius_m: float
+
+
+@dataclass(frozen=True)
+class FlownLimits:
+    """How far it was flown."""
+
+    flight_s: float
+
+
+@dataclass(frozen=True)
+class FlownSettings:
+    """What a flight's page needs of its settings."""
+
+    goal: tuple[float, float]
+    seed: int
+    speed: Annotated[float, Field(gt=0.0)]
+    pilot: FlownPilot
+    limits: FlownLimits
+
+
+_SETTINGS = TypeAdapter(FlownSettings)
+
+
+def settings_of(box: BlackBox) -> FlownSettings:
+    """Return what was asked for. Raises UsageError where the black box does not hold it."""
+    return typed(_SETTINGS, box.run.get("config", {}), box.path)
+
+
 def take_in(path: Path) -> Path:
     """Make the run folder of a black box, beside it, and return it; it may be there already.
 
@@ -63,12 +99,17 @@ def take_in(path: Path) -> Path:
 def info_of(box: BlackBox, digest: str = "") -> RunInfo:
     """Return what flew. Raises UsageError where the black box does not hold it."""
     run = box.run
-    return run_info({**run, "config": {**run.get("config", {}), DIGEST: digest}}, box.path)
+    info = run_info(run, box.path)
+    return replace(info, config={**info.config, DIGEST: digest})
 
 
 def episode_of(box: BlackBox) -> FlownEpisode:
-    """Return the flight: its path is the one that the flight controller told."""
-    config = box.run["config"]
+    """Return the flight: its path is the one that the flight controller told.
+
+    Raises:
+        UsageError: The black box does not hold its settings.
+    """
+    asked = settings_of(box)
     path = path_of(box)
     stamps = stamps_of(box.all_of(Decision))
     started_us = int(path.time_us[0]) if len(path) else 0
@@ -78,8 +119,10 @@ def episode_of(box: BlackBox) -> FlownEpisode:
     ended_us = _ended_us(box, path, navigation_us)
     ends = box.all_of(End)
     reason, notes = (ends[-1].reason, ends[-1].notes) if ends else _cut(box, ended_us)
+    if box.damaged:
+        notes = (*notes, "the recording is damaged: its checksum is wrong")
     outcome = Outcome.TIMEOUT if reason == OUT_OF_TIME else Outcome.ABORTED
-    arrived_us = _arrived_us(path, navigation_us, ended_us, config)
+    arrived_us = _arrived_us(path, navigation_us, ended_us, asked)
     if arrived_us is not None:
         outcome, ended_us = Outcome.SUCCESS, arrived_us
     quality = None
@@ -87,23 +130,23 @@ def episode_of(box: BlackBox) -> FlownEpisode:
         quality = measure_quality(
             *(path, navigation_us, ended_us, 0.0),
             decisions=stamps,
-            hold_s=config["pilot"]["hold_s"],
+            hold_s=asked.pilot.hold_s,
         )
     batteries = [status.battery_remaining for status in box.all_of(Status)]
     record = EpisodeRecord(
         index=0,
-        seed=config["seed"],
+        seed=asked.seed,
         arena=NO_ARENA,
         arena_seed=0,
         outcome=outcome,
         reason=reason,
-        goal=(config["goal"][0], config["goal"][1]),
-        goal_radius_m=config["pilot"]["goal_radius_m"],
-        time_limit_s=config["limits"]["flight_s"],
+        goal=asked.goal,
+        goal_radius_m=asked.pilot.goal_radius_m,
+        time_limit_s=asked.limits.flight_s,
         started_us=started_us,
         navigation_us=navigation_us,
         ended_us=ended_us,
-        wall_s=(ended_us - started_us) / US_PER_S / config["speed"],
+        wall_s=(ended_us - started_us) / US_PER_S / asked.speed,
         slipped_us=0,
         battery_remaining=next((b for b in reversed(batteries) if b is not None), None),
         quality=quality,
@@ -176,7 +219,7 @@ def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
 
 
 def _arrived_us(
-    path: Trajectory, navigation_us: int | None, ended_us: int, config: Mapping[str, Any]
+    path: Trajectory, navigation_us: int | None, ended_us: int, asked: FlownSettings
 ) -> int | None:
     """Return when the goal was reached [µs], as the referee of a rehearsal sees it; None: never.
 
@@ -185,8 +228,8 @@ def _arrived_us(
     if navigation_us is None:
         return None
     flown = path.between(navigation_us, ended_us)
-    away = np.hypot(*(flown.position[:, :2] - config["goal"]).T)
-    there = np.flatnonzero(away < config["pilot"]["goal_radius_m"])
+    away = np.hypot(*(flown.position[:, :2] - asked.goal).T)
+    there = np.flatnonzero(away < asked.pilot.goal_radius_m)
     return int(flown.time_us[there[0]]) if len(there) else None
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from airl_mav.black_box.messages import Decision, End, Log, Phase, RawImage, Resources
+from airl_mav.black_box.messages import Decision, End, Log, Phase, RawImage, Resources, Telemetry
 from airl_mav.black_box.reading import read_black_box
+from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.cli.report import ReportOptions
 from airl_mav.cli.report import run as report
 from airl_mav.core.constants import US_PER_S
@@ -21,6 +23,7 @@ from airl_mav.core.frames import quat_yaw
 from airl_mav.experiments.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.experiments.run import Run, load_run
 from airl_mav.flight.judge import Outcome
+from airl_mav.flight.setup import Setup
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import Stage
 from airl_mav.report.comparison.runs import compare_folders
@@ -188,6 +191,31 @@ def test_rehearsed_where_it_flew_it_is_the_same_flight(
         refly(recorded.path, out)
     with pytest.raises(FieldError, match="one with the goal of the flight"):
         refly(recorded.path, tmp_path / "other", arena="static-obstacles", arena_seed=4)
+
+
+def test_code_that_a_recording_names_is_not_run_unasked(tmp_path: Path) -> None:
+    scenario = demo_scenario()
+    config = {
+        "policy": "evil.py:Policy",
+        "goal": [9.0, 0.0],
+        "seed": 1,
+        "speed": 1.0,
+        "pilot": {"hold_s": 0.5, "goal_radius_m": 3.0},
+        "limits": {"flight_s": 60.0},
+    }
+    made = {"name": "flight", "created_utc": "", "seeds": [1], "versions": {}, "machine": {}}
+    setup = TypeAdapter(Setup).dump_python(scenario.setup, mode="json")
+    run = {**made, "git": None, "setup": setup, "config": config}
+    file = BlackBoxFile(tmp_path / "flight.mcap", run)
+    level = (1.0, 0.0, 0.0, 0.0)
+    file.write(Phase(0, "navigating"), 0)
+    for k in range(5):
+        file.write(Telemetry(k * SAMPLE_US, (0.1 * k, 0.0, -2.5), (1.0, 0.0, 0.0), level), 0)
+    still = (0.0, 0.0, 0.0)
+    file.write(Decision(0, 0, 0, 0, 0, 0, -1, still, still, level, 9.0, level), 0)
+    file.finish()
+    with pytest.raises(FieldError, match="it is code that would run on this machine"):
+        refly(file.path, tmp_path / "out")
 
 
 def test_a_flight_is_moved_to_where_its_navigation_began(recorded: Recorded) -> None:

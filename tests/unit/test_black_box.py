@@ -32,13 +32,23 @@ from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
+from airl_mav.report.recorded_flight import episode_of
 from companion.black_box import BlackBoxRecorder
 from tests.support.full_disk import largest_file
 from tests.support.processes import running, wait_until
 from tests.support.recording_child import PERIOD_US, Straight
 
 NOW_US = 1_800_000_000_000_000
-RUN = {"name": "flight", "config": {"seed": 1}}
+RUN: dict[str, Any] = {
+    "name": "flight",
+    "config": {
+        "goal": [20.0, 0.0],
+        "seed": 1,
+        "speed": 1.0,
+        "pilot": {"hold_s": 0.5, "goal_radius_m": 3.0},
+        "limits": {"flight_s": 600.0},
+    },
+}
 QUATERNION = (1.0, 0.0, 0.0, 0.0)
 MESSAGES: list[Any] = [
     Phase(5, "navigating"),
@@ -129,17 +139,42 @@ def test_cut_anywhere_all_whole_messages_before_are_read(whole: Path, tmp_path: 
     assert {-1, 0, 1, len(MESSAGES)} <= set(counts)
 
 
-def test_flipped_bytes_end_it_and_raise_nothing_else(whole: Path, tmp_path: Path) -> None:
+def test_flipped_bits_are_told_and_raise_nothing_else(whole: Path, tmp_path: Path) -> None:
     data, draw = whole.read_bytes(), random.Random(1)
-    broken = tmp_path / "broken.mcap"
+    broken, told = tmp_path / "broken.mcap", 0
     for _ in range(300):
         changed = bytearray(data)
         changed[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
         broken.write_bytes(changed)
         try:
-            read_black_box(broken)
+            box = read_black_box(broken)
+            record = episode_of(box).record
         except UsageError:
+            told += 1
             continue
+        told += box.damaged or not box.whole
+        assert not box.damaged or "its checksum is wrong" in record.notes[-1]
+    # The rest is in what lies behind the records: the index.
+    assert told > 200
+
+
+@pytest.mark.parametrize(
+    ("run", "wrong"),
+    [
+        ({}, "goal"),
+        ({"config": []}, "config"),
+        ({"config": {**RUN["config"], "goal": ["far", 0]}}, "goal"),
+        ({"config": {**RUN["config"], "speed": 0}}, "speed"),
+        ({"config": {**RUN["config"], "pilot": {}}}, "pilot.hold_s"),
+    ],
+)
+def test_settings_that_are_none_are_named(run: Any, wrong: str, tmp_path: Path) -> None:
+    file = BlackBoxFile(tmp_path / "flight.mcap", run)
+    file.finish()
+    with pytest.raises(UsageError) as error:
+        episode_of(read_black_box(file.path))
+    assert "flight.mcap" in str(error.value)
+    assert wrong in str(error.value) or wrong == "config"
 
 
 @pytest.mark.parametrize("data", [b"", b"no black box", b"\x89MCAP0\r\n"])
