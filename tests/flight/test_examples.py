@@ -151,7 +151,7 @@ def test_own_camera_flies_to_the_goal(tmp_path: Path, monkeypatch: pytest.Monkey
             assert program.wait(120.0) == 0, program.text()
         found = re.findall(r"^(\w[\w ]+?) +ok +(.*)", program.text(), re.M)
         assert [what for what, _ in found] == [
-            *("policy", "camera", "flight controller", "telemetry", "health", "decision")
+            *("policy", "camera", "flight controller", "telemetry", "battery", "health", "decision")
         ]
         assert "64x48 px" in found[1][1]
         assert "PX4, disarmed, mode hold" in found[2][1]

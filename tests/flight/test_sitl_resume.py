@@ -29,6 +29,7 @@ from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, load
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view.ends import ViewEnds
 from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode
 
@@ -48,8 +49,9 @@ class Stage:
         folder: RunFolder,
         observer: LiveObserver,
         keeps: Collection[int],
+        view: ViewEnds | None,
     ) -> Rehearsal:
-        assert len(keeps) == 1
+        assert len(keeps) == 1 and view is None
         self.begun += 1
         return Rehearsal(self, scenario, folder, observer)
 
