@@ -150,7 +150,7 @@ def _watched(
         started = Viewer(scenario, name, asked.port)
     except ViewError as error:
         raise RehearsalError(str(error)) from None
-    with started as viewer:
+    with closing(started) as viewer:
         progress.note(f"view       {viewer.url}")
         with closing(ViewObserver(viewer.ends, onwards)) as observer:
             yield viewer.ends, observer

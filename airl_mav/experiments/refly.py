@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from airl_mav.black_box.reading import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS
@@ -167,15 +168,14 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
     begun = max(before, 0)
     origin = path.position[begun] * (1.0, 1.0, 0.0)
     yaw = quat_yaw(path.quaternion[begun])
-    turn = np.array(
-        [[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]]
-    )
-    goal = turn @ (np.array([*record.goal, 0.0]) - origin)
+    turn = Rotation.from_euler("z", -yaw)
+    goal = turn.apply(np.array([*record.goal, 0.0]) - origin)
+    attitude = turn * Rotation.from_quat(path.quaternion, scalar_first=True)
     moved = replace(
         path,
-        position=(path.position - origin) @ turn.T,
-        velocity=path.velocity @ turn.T,
-        quaternion=_turned(path.quaternion, -yaw),
+        position=turn.apply(path.position - origin),
+        velocity=turn.apply(path.velocity),
+        quaternion=attitude.as_quat(scalar_first=True),
     )
     return replace(
         episode, trajectory=moved, record=replace(record, goal=(float(goal[0]), float(goal[1])))
@@ -186,13 +186,6 @@ def distances(flown: Trajectory, rehearsed: Trajectory) -> NDArray[np.float64]:
     """Return how far the points (n,) of a path are from the nearest ones of another [m], level."""
     between = flown.position[:, None, :2] - rehearsed.position[None, :, :2]
     return np.asarray(np.linalg.norm(between, axis=2).min(axis=1), np.float64)
-
-
-def _turned(quaternion: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
-    """Return attitudes (n, 4) turned about the vertical [rad]."""
-    w, z = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
-    a, b, c, d = quaternion.T
-    return np.stack([w * a - z * d, w * b - z * c, w * c + z * b, w * d + z * a], axis=1)
 
 
 def _navigated(path: Trajectory, record: Any) -> Trajectory:

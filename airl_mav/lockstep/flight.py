@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Collection, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -170,7 +170,7 @@ class _Flight:
             if self._view is not None:
                 from airl_mav.lockstep.watched import Watched
 
-                self._watched = held.enter_context(Watched(self._view, resolved))
+                self._watched = held.enter_context(closing(Watched(self._view, resolved)))
             self._stage = held.enter_context(
                 Stage(
                     transport_us=TRANSPORT_US,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
-from types import TracebackType
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
@@ -16,7 +15,7 @@ from firmware_sim.simulation import Simulation
 
 
 class Watched:
-    """What a view has of one flight. Use as a context manager.
+    """What a view has of one flight, until it is closed.
 
     The companion's calls come on its thread, all others on the conductor's, which waits meanwhile.
     """
@@ -29,16 +28,7 @@ class Watched:
         """The companion's side."""
         self._pace = self._open.enter_context(closing(Pace(ends, scenario.speed or REAL_TIME)))
 
-    def __enter__(self) -> Watched:
-        """Return it."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
         """Disconnect."""
         self._open.close()
 

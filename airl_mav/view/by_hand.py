@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,22 +13,22 @@ from airl_mav.latency.samplers import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.view.feed import Asked
+from airl_mav.view.messages import Steering
 
 
 class Hand:
     """What the watchers have set, as one companion flies by it."""
 
-    def __init__(self, asked: Asked, *, compensate: bool) -> None:
-        """Take what they ask for, and whether the scenario compensates."""
+    def __init__(self, newest: Callable[[], Steering], *, compensate: bool) -> None:
+        """Take what gives the newest that they ask for, and whether the scenario compensates."""
         self.touched = False
         """Whether a decision of this flight was made otherwise than the scenario says."""
-        self._asked = asked
+        self._newest = newest
         self._as_asked = compensate
 
     def t2_us(self) -> int | None:
         """Return the latency that was set [µs]; None: as the scenario says."""
-        t2_ms = self._asked.newest().t2_ms
+        t2_ms = self._newest().t2_ms
         if t2_ms is None:
             return None
         self.touched = True
@@ -34,7 +36,7 @@ class Hand:
 
     def compensates(self) -> bool:
         """Return whether decisions are compensated now."""
-        wanted = self._asked.newest().compensate
+        wanted = self._newest().compensate
         if wanted is None or wanted == self._as_asked:
             return self._as_asked
         self.touched = True

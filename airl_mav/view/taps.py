@@ -105,7 +105,7 @@ class CompanionTap:
         self._hand = self._new_hand()
 
     def _new_hand(self) -> Hand:
-        return Hand(self._asked, compensate=self._scenario.pilot.compensate)
+        return Hand(self._asked.newest, compensate=self._scenario.pilot.compensate)
 
     def begin(self) -> None:
         """A flight begins."""

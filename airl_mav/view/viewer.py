@@ -6,7 +6,6 @@ import sys
 import tempfile
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 from pydantic import ValidationError
 
@@ -26,7 +25,7 @@ class ViewError(Exception):
 
 
 class Viewer:
-    """A page that shows a run. Use as a context manager."""
+    """A page that shows a run, until it is closed."""
 
     def __init__(self, scenario: ResolvedScenario, name: str, port: int | None = None) -> None:
         """Start it and wait until it can be opened.
@@ -83,21 +82,8 @@ class Viewer:
             self._child.stop()
             raise ViewError(f"the view did not start\n{self._child.log_tail()}") from None
 
-    def __enter__(self) -> Viewer:
-        """Return the viewer."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End it; the page says that its server is gone."""
-        self.close()
-
     def close(self) -> None:
-        """End its process; harmless when called again."""
+        """End its process; the page says that its server is gone. Harmless when called again."""
         self._child.stop()
         if self._child.stdout is not None:
             self._child.stdout.close()

@@ -292,13 +292,13 @@ class FakeAsked:
     def __init__(self, steering: Steering) -> None:
         self.steering = steering
 
-    def newest(self, _wait_s: float = 0.0) -> Steering:
+    def newest(self) -> Steering:
         return self.steering
 
 
 def test_a_latency_by_hand_leaves_its_mark() -> None:
     asked = FakeAsked(Steering())
-    hand = Hand(asked, compensate=False)  # type: ignore[arg-type]
+    hand = Hand(asked.newest, compensate=False)
     latency = HandLatency(hand, FixedSampler(1_000))
     assert (latency.sample_us(), hand.compensates(), hand.touched) == (1_000, False, False)
     asked.steering = Steering(t2_ms=250.0)
@@ -308,7 +308,7 @@ def test_a_latency_by_hand_leaves_its_mark() -> None:
 
 def test_compensation_is_switched_in_flight() -> None:
     asked, scenario = FakeAsked(Steering(compensate=True)), resolve(Scenario())
-    hand = Hand(asked, compensate=False)  # type: ignore[arg-type]
+    hand = Hand(asked.newest, compensate=False)
     compensator = HandCompensator(hand, scenario)
     shape = compensator.intrinsics.height, compensator.intrinsics.width
     depth_mm = np.full((1, *shape), 4_000, np.uint16)
