@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ def draw_bodies(
 
     Every sphere crosses the height `altitude_m` above the floor [m].
     """
-    allowed = np.array([Shape[name.upper()] for name in kind.shapes], np.int8)
+    allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
     width = rng.uniform(*kind.half_width_m, size=(n, 2))
     height = rng.uniform(*kind.height_m, size=n)
@@ -59,3 +60,9 @@ def draw_bodies(
 
     order = np.argsort(-half.max(axis=1), kind="stable")
     return Bodies(shape[order], half_size[order], yaw[order], center_height[order], half[order])
+
+
+@lru_cache
+def _shapes(names: tuple[str, ...]) -> NDArray[np.int8]:
+    """Return the numbers of shapes; looking up members by name is slow."""
+    return np.array([Shape[name.upper()] for name in names], np.int8)

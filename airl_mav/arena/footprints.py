@@ -38,6 +38,13 @@ def join(*parts: Boxes) -> Boxes:
     )
 
 
+def with_room(boxes: Boxes, halves: Floats) -> Boxes:
+    """Return the boxes, and behind them others of half extents (n, 2) [m] without a place yet."""
+    center = np.empty((len(boxes) + len(halves), 2))
+    center[: len(boxes)] = boxes.center
+    return Boxes(center, np.concatenate([boxes.half, halves]))
+
+
 def bounding_half(shape: NDArray[np.int8], half_size: Floats, yaw: Floats) -> Floats:
     """Return half extents (n, 2) [m] north and east of the footprints of n primitives.
 
@@ -45,9 +52,11 @@ def bounding_half(shape: NDArray[np.int8], half_size: Floats, yaw: Floats) -> Fl
     """
     cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
     along, across = half_size[:, 0], half_size[:, 1]
-    turned = np.stack([cos * along + sin * across, sin * along + cos * across], axis=1)
-    is_box = (shape == Shape.BOX)[:, None]
-    return np.where(is_box, turned, half_size[:, :2])
+    is_box = shape == Shape.BOX
+    half = np.empty((len(shape), 2))
+    half[:, 0] = np.where(is_box, cos * along + sin * across, along)
+    half[:, 1] = np.where(is_box, sin * along + cos * across, across)
+    return half
 
 
 def bounding_boxes(obstacles: Obstacles) -> Boxes:
@@ -56,30 +65,19 @@ def bounding_boxes(obstacles: Obstacles) -> Boxes:
     return Boxes(obstacles.center[:, :2], half)
 
 
-def outside_all(points: Floats, boxes: Boxes) -> NDArray[np.bool_]:
-    """Return (q,) whether each point (q, 2) [m] is outside, or on the edge, of every box."""
-    free = np.empty(len(points), np.bool_)
-    _outside_all(points, boxes.center, boxes.half, free)
-    return free
-
-
 @kernel
-def _outside_all(points: Floats, center: Floats, half: Floats, free: NDArray[np.bool_]) -> None:
-    for i in range(len(points)):
-        free[i] = True
-        for j in range(len(center)):
-            north = abs(points[i, 0] - center[j, 0]) - half[j, 0]
-            east = abs(points[i, 1] - center[j, 1]) - half[j, 1]
-            if north < 0.0 and east < 0.0:
-                free[i] = False
-                break
+def outside(point: Floats, center: Floats, half: Floats) -> bool:
+    """Return whether a point (2,) [m] is outside, or on the edge, of every box."""
+    for j in range(len(center)):
+        north = abs(point[0] - center[j, 0]) - half[j, 0]
+        east = abs(point[1] - center[j, 1]) - half[j, 1]
+        if north < 0.0 and east < 0.0:
+            return False
+    return True
 
 
 def segments_clear(start: Floats, ends: Floats, boxes: Boxes) -> NDArray[np.bool_]:
-    """Return (q,) whether the straight ways from `start` (2,) to `ends` (q, 2) touch no box.
-
-    Slab method: a segment meets a box when its stays between the box's two pairs of lines overlap.
-    """
+    """Return (q,) whether the straight ways from `start` (2,) to `ends` (q, 2) touch no box."""
     clear = np.empty(len(ends), np.bool_)
     _segments_clear(start, ends, boxes.center, boxes.half, clear)
     return clear
@@ -90,20 +88,36 @@ def _segments_clear(
     start: Floats, ends: Floats, center: Floats, half: Floats, clear: NDArray[np.bool_]
 ) -> None:
     for i in range(len(ends)):
-        clear[i] = True
-        for j in range(len(center)):
-            enter, leave = -math.inf, math.inf
-            for axis in range(2):
-                step = ends[i, axis] - start[axis]
-                if abs(step) < 1e-12:
-                    # It never leaves, or never reaches, the slab.
-                    step = 1e-12
-                low = (center[j, axis] - half[j, axis] - start[axis]) / step
-                high = (center[j, axis] + half[j, axis] - start[axis]) / step
-                enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
-            if enter <= leave and leave >= 0.0 and enter <= 1.0:
-                clear[i] = False
-                break
+        clear[i] = segment_clear(start, ends[i], center, half)
+
+
+@kernel
+def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> bool:
+    """Return whether the straight way from `start` (2,) to `end` (2,) touches no box.
+
+    Slab method: a segment meets a box when its stays between the box's two pairs of lines overlap.
+    """
+    for j in range(len(center)):
+        enter, leave = -math.inf, math.inf
+        for axis in range(2):
+            step = end[axis] - start[axis]
+            if abs(step) < 1e-12:
+                # It never leaves, or never reaches, the slab.
+                step = 1e-12
+            low = (center[j, axis] - half[j, axis] - start[axis]) / step
+            high = (center[j, axis] + half[j, axis] - start[axis]) / step
+            enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
+        if enter <= leave and leave >= 0.0 and enter <= 1.0:
+            return False
+    return True
+
+
+@kernel
+def draw_points(rng: np.random.Generator, low: Floats, span: Floats, points: Floats) -> None:
+    """Draw points (n, 2) of a rectangle: the numbers of `rng.uniform(low, low + span, (n, 2))`."""
+    for i in range(len(points)):
+        for axis in range(2):
+            points[i, axis] = low[axis] + span[axis] * rng.random()
 
 
 def inner(bounds: Bounds, margin: float | Floats) -> tuple[Floats, Floats]:

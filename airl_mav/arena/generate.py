@@ -7,13 +7,13 @@ from enum import IntEnum
 
 import numpy as np
 
-from airl_mav.arena.bodies import Bodies, draw_bodies
-from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, inner, join
+from airl_mav.arena.bodies import draw_bodies
+from airl_mav.arena.footprints import Boxes, Floats, footprint_areas, join
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
 from airl_mav.arena.own import generate_own
 from airl_mav.arena.passage import passage_exists
-from airl_mav.arena.placement import TRIES, NoRoomError, draw_place, place_all
-from airl_mav.arena.tours import draw_tour
+from airl_mav.arena.placement import TRIES, NoRoomError, place_all
+from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
@@ -23,9 +23,6 @@ LAYOUTS = 20
 
 GOALS_PER_LAYOUT = 4
 """Goals drawn in a layout before it is given up for want of a way to one."""
-
-STARTS_PER_TOUR = 16
-"""Places tried for a moving obstacle that cannot leave where it stands."""
 
 
 class _Stream(IntEnum):
@@ -90,9 +87,9 @@ def generate(
     failure = NoRoomError("", -1)
     for _ in range(LAYOUTS):
         try:
-            static = _draw_static(static_rng, request)
-            goal = _draw_reachable_goal(goal_rng, request, static)
-            moving, tours = _draw_moving(moving_rng, request, static)
+            static, standing = _draw_static(static_rng, request)
+            goal = _draw_reachable_goal(goal_rng, request, static, standing)
+            moving, tours = _draw_moving(moving_rng, request, standing)
         except NoRoomError as error:
             failure = max(failure, error, key=lambda each: each.progress)
             continue
@@ -151,8 +148,8 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
         )
 
 
-def _draw_static(rng: np.random.Generator, request: _Request) -> Obstacles:
-    """Draw and place the static obstacles."""
+def _draw_static(rng: np.random.Generator, request: _Request) -> tuple[Obstacles, Boxes]:
+    """Draw and place the static obstacles; return their bounding boxes as well."""
     spec, (n, _) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.static, spec.flight_altitude_m)
     keep_off = request.start_box
@@ -172,13 +169,15 @@ def _draw_static(rng: np.random.Generator, request: _Request) -> Obstacles:
             f"{spec.size.east_m:g} m floor",
             error.progress,
         ) from None
-    return bodies.at(places)
+    return bodies.at(places), Boxes(places, bodies.bounding_half)
 
 
-def _draw_reachable_goal(rng: np.random.Generator, request: _Request, static: Obstacles) -> Floats:
+def _draw_reachable_goal(
+    rng: np.random.Generator, request: _Request, static: Obstacles, standing: Boxes
+) -> Floats:
     """Return the fixed goal, or draw a free one, with a way to it."""
     spec, progress = request.spec, len(static)
-    keep_off = bounding_boxes(static).grown(spec.goal.clearance_m)
+    keep_off = standing.grown(spec.goal.clearance_m)
     for _ in range(GOALS_PER_LAYOUT):
         goal = (
             draw_goal(rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m)
@@ -202,50 +201,36 @@ def _draw_reachable_goal(rng: np.random.Generator, request: _Request, static: Ob
 
 
 def _draw_moving(
-    rng: np.random.Generator, request: _Request, static: Obstacles
+    rng: np.random.Generator, request: _Request, standing: Boxes
 ) -> tuple[Obstacles, tuple[Tour, ...]]:
-    """Draw the moving obstacles where they are at time 0, and their tours."""
+    """Draw the moving obstacles where they are at time 0, and their tours.
+
+    Args:
+        rng: Source of the draws.
+        request: What is asked for.
+        standing: The bounding boxes of the static obstacles.
+    """
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
-    places = np.empty((n, 2))
-    tours = []
-    for i in range(n):
-        tour = _draw_walk(rng, request, static, bodies, places, i)
-        if tour is None:
-            raise NoRoomError(
-                f"too dense: {i} of {n} moving obstacles found a place and a tour among "
-                f"{len(static)} static ones",
-                len(static) + i,
-            )
-        places[i] = tour.points[0]
-        tours.append(tour)
-    return bodies.at(places), tuple(tours)
-
-
-def _draw_walk(
-    rng: np.random.Generator,
-    request: _Request,
-    static: Obstacles,
-    bodies: Bodies,
-    places: Floats,
-    i: int,
-) -> Tour | None:
-    """Draw the tour of the i-th moving obstacle, clear at time 0 of the i placed before it."""
-    spec, half = request.spec, bodies.bounding_half[i]
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
-    standing = bounding_boxes(static)
-    others = Boxes(places[:i], bodies.bounding_half[:i])
-    keep_off = join(request.start_box, standing.grown(max(gap, walking_gap)), others.grown(gap))
-    walls = join(request.start_box, standing.grown(walking_gap)).grown(half)
-    for _ in range(STARTS_PER_TOUR):
-        start = draw_place(rng, half, keep_off, request.bounds, max(gap, walking_gap))
-        if start is None:
-            return None
-        corners = inner(request.bounds, half + walking_gap)
-        tour = draw_tour(rng, start, walls, corners, spec.moving)
-        if tour is not None:
-            return tour
-    return None
+    start = request.start_box
+    tours = draw_tours(
+        rng,
+        bodies.bounding_half,
+        join(start, standing.grown(max(gap, walking_gap))),
+        join(start, standing.grown(walking_gap)),
+        request.bounds,
+        gap,
+        spec.moving,
+    )
+    if len(tours) < n:
+        raise NoRoomError(
+            f"too dense: {len(tours)} of {n} moving obstacles found a place and a tour among "
+            f"{len(standing)} static ones",
+            len(standing) + len(tours),
+        )
+    places = np.array([tour.points[0] for tour in tours]).reshape(n, 2)
+    return bodies.at(places), tuple(tours)
 
 
 def _around(center: Floats, clearance: float) -> Boxes:

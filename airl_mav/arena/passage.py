@@ -11,8 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Floats, bounding_boxes, outside_all
+from airl_mav.arena.footprints import Floats, bounding_boxes, inner, outside
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
+from airl_mav.core.kernels import kernel
 
 CELL_M = 0.25
 """Raster pitch; coarser on a floor of more than CELLS_MAX cells."""
@@ -33,20 +34,34 @@ def gaps_suffice(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: fl
     A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is
     what remains for the vehicle's centre when no two boxes grown by half its width touch.
     """
-    boxes = bounding_boxes(obstacles)
-    ends = np.stack([np.zeros(2), goal])
-    low = np.array([bounds.north_min, bounds.east_min])
-    high = np.array([bounds.north_max, bounds.east_max])
-    if ((ends - low <= width_m / 2.0) | (high - ends <= width_m / 2.0)).any():
-        return False
-    if not outside_all(ends, boxes.grown(width_m / 2.0)).all():
-        return False
-    to_walls = np.minimum(boxes.center - boxes.half - low, high - boxes.center - boxes.half)
-    if (to_walls <= width_m).any():
-        return False
-    gap: Floats = np.abs(boxes.center[:, None] - boxes.center) - boxes.half[:, None] - boxes.half
-    close = np.all(gap <= width_m, axis=2)
-    return int(close.sum()) == len(boxes)  # only each with itself
+    boxes, (low, high) = bounding_boxes(obstacles), inner(bounds, 0.0)
+    return bool(_gaps_suffice(boxes.center, boxes.half, low, high, goal, width_m))
+
+
+@kernel
+def _gaps_suffice(
+    center: Floats, half: Floats, low: Floats, high: Floats, goal: Floats, width_m: float
+) -> bool:
+    grown = half + width_m / 2.0
+    for end in (np.zeros(2), goal):
+        for axis in range(2):
+            if min(end[axis] - low[axis], high[axis] - end[axis]) <= width_m / 2.0:
+                return False
+        if not outside(end, center, grown):
+            return False
+    for i in range(len(center)):
+        for axis in range(2):
+            south, north = center[i, axis] - half[i, axis], center[i, axis] + half[i, axis]
+            if min(south - low[axis], high[axis] - north) <= width_m:
+                return False
+        for j in range(i):
+            close = True
+            for axis in range(2):
+                apart = abs(center[i, axis] - center[j, axis])
+                close &= apart - half[i, axis] - half[j, axis] <= width_m
+            if close:
+                return False
+    return True
 
 
 def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:

@@ -6,14 +6,17 @@ drawn once (Air Learning's BP_AISpawner). Theirs do not repeat with the seed; th
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Boxes, Floats, segments_clear
-from airl_mav.arena.geometry import Arena, Tour
+from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, segment_clear, with_room
+from airl_mav.arena.geometry import Arena, Bounds, Tour
+from airl_mav.arena.placement import draw_place
+from airl_mav.core.kernels import kernel
 from airl_mav.profiles.arena import MovingObstacles
 
 LEG_MIN_M = 1.0
@@ -21,51 +24,157 @@ LEG_MIN_M = 1.0
 
 BATCH = 32
 BATCHES = 8
+STARTS_PER_TOUR = 16
+"""Places tried for an obstacle that cannot leave where it stands."""
+
 HOMING_LEGS = 16
 """Legs tried for a free way home before the walk goes back the way it came."""
-
 
 ROUNDING_S = 1e-9
 """Way-points that are passed closer to each other are one."""
 
 
-def draw_tour(
+def draw_tours(
     rng: np.random.Generator,
-    start: Floats,
+    halves: Floats,
     keep_off: Boxes,
-    corners: tuple[Floats, Floats],
+    walls: Boxes,
+    bounds: Bounds,
+    gap_m: float,
     kind: MovingObstacles,
-) -> Tour | None:
-    """Draw the tour of one obstacle.
+) -> list[Tour]:
+    """Draw the tours of n obstacles, which begin where they are at time 0, clear of each other.
 
     Args:
         rng: Source of the draws.
-        start: (2,) where it is at time 0 [m].
-        keep_off: What its centre must never enter: grown by its extent and clearance.
-        corners: South-west and north-east corner of where its centre may be [m].
-        kind: Speed range, leg length, dwell and least duration.
+        halves: (n, 2) half extents of their bounding boxes [m].
+        keep_off: What they are clear of at time 0, any clearance already added.
+        walls: What they are clear of on their way, likewise.
+        bounds: The walls of the room.
+        gap_m: Least gap between two of them at time 0 [m].
+        kind: Speed range, leg length, dwell, least duration, clearance on the way.
 
     Returns:
-        The closed tour; None when there is no way to leave `start`.
+        Closed tours; fewer than n when one found no place, or no way to leave it.
     """
-    speed = rng.uniform(*kind.speed_m_s)
-    points = [start]
-    elapsed = 0.0
-    homing = 0
+    boxes = with_room(keep_off, halves + gap_m)
+    low, high = inner(bounds, 0.0)
+    slowest, fastest = kind.speed_m_s
+    points, counts, speeds = _walk_all(
+        rng,
+        halves,
+        boxes.center,
+        boxes.half,
+        walls.center,
+        walls.half,
+        low,
+        high,
+        max(gap_m, kind.clearance_m),
+        kind.clearance_m,
+        kind.leg_max_m,
+        slowest,
+        fastest,
+        kind.dwell_s,
+        kind.tour_min_s,
+    )
+    ends = np.cumsum(counts).tolist()
+    way = points.tolist()
+    return [
+        _timed(way[end - count : end], speed, kind.dwell_s)
+        for end, count, speed in zip(ends, counts.tolist(), speeds.tolist(), strict=True)
+    ]
+
+
+@kernel
+def _walk_all(
+    rng: np.random.Generator,
+    halves: Floats,
+    center: Floats,
+    half: Floats,
+    wall_center: Floats,
+    wall_half: Floats,
+    low: Floats,
+    high: Floats,
+    gap_m: float,
+    clearance_m: float,
+    leg_max_m: float,
+    slowest: float,
+    fastest: float,
+    dwell_s: float,
+    least_s: float,
+) -> tuple[Floats, NDArray[np.int64], Floats]:
+    """Return the way-points (k, 2) of all walks, how many each has (m,), and the speeds (m,).
+
+    Arguments as of `draw_tours`; the starts are written into the last rows of `center`.
+    """
+    n = len(halves)
+    points, counts, speeds = np.empty((0, 2)), np.zeros(n, np.int64), np.empty(n)
+    for i in range(n):
+        at = len(center) - n + i
+        start = center[at]
+        margin = halves[i] + clearance_m
+        for _ in range(STARTS_PER_TOUR):
+            if not draw_place(rng, halves[i], center[:at], half[:at], low, high, gap_m, start):
+                return points, counts[:i], speeds[:i]
+            speeds[i] = slowest + (fastest - slowest) * rng.random()
+            walk = _walk(
+                rng,
+                start,
+                wall_center,
+                wall_half + halves[i],
+                low + margin,
+                high - margin,
+                leg_max_m,
+                speeds[i],
+                dwell_s,
+                least_s,
+            )
+            if len(walk) > 1:
+                points, counts[i] = np.concatenate((points, walk)), len(walk)
+                break
+        if counts[i] == 0:
+            return points, counts[:i], speeds[:i]
+    return points, counts, speeds
+
+
+@kernel
+def _walk(
+    rng: np.random.Generator,
+    start: Floats,
+    center: Floats,
+    half: Floats,
+    south_west: Floats,
+    north_east: Floats,
+    leg_max_m: float,
+    speed: float,
+    dwell_s: float,
+    least_s: float,
+) -> Floats:
+    """Return the way-points (k, 2) of a closed walk; of one that cannot leave `start`, that alone.
+
+    Its centre never enters the boxes, and stays between the corners [m].
+    """
+    points = np.empty((64, 2))
+    points[0] = start
+    count, elapsed, homing = 1, 0.0, 0
     while homing < HOMING_LEGS:
-        here = points[-1]
-        home = math.dist(here, start)
-        if len(points) > 1 and elapsed + home / speed + kind.dwell_s >= kind.tour_min_s:
+        here = points[count - 1]
+        home = math.hypot(here[0] - start[0], here[1] - start[1])
+        if count > 1 and elapsed + home / speed + dwell_s >= least_s:
             homing += 1
-            reachable = LEG_MIN_M <= home <= kind.leg_max_m
-            if reachable and segments_clear(here, start[None], keep_off)[0]:
-                return _timed([*points, start], speed, kind.dwell_s)
-        target = _draw_waypoint(rng, here, keep_off, corners, kind.leg_max_m)
-        if target is None:
-            return None
-        elapsed += math.dist(here, target) / speed + kind.dwell_s
-        points.append(target)
-    return _timed([*points, *points[-2::-1]], speed, kind.dwell_s)
+            if LEG_MIN_M <= home <= leg_max_m and segment_clear(here, start, center, half):
+                return np.concatenate((points[:count], points[:1]))
+        low = np.maximum(south_west, here - leg_max_m)
+        span = np.minimum(north_east, here + leg_max_m) - low
+        if count == len(points):
+            points = np.concatenate((points, np.empty_like(points)))
+            here = points[count - 1]
+        there = points[count]
+        if not _draw_waypoint(rng, low, span, here, leg_max_m, center, half, there):
+            return points[:1]
+        elapsed += math.hypot(there[0] - here[0], there[1] - here[1]) / speed + dwell_s
+        count += 1
+    return np.concatenate((points[:count], points[:count][-2::-1]))
 
 
 def set_out_later(arena: Arena, later_s: float) -> Arena:
@@ -96,32 +205,34 @@ def _begun_at(tour: Tour, at_s: float) -> Tour:
     )
 
 
+@kernel
 def _draw_waypoint(
     rng: np.random.Generator,
+    low: Floats,
+    span: Floats,
     here: Floats,
-    keep_off: Boxes,
-    corners: tuple[Floats, Floats],
     leg_max_m: float,
-) -> Floats | None:
-    """Draw a point that a straight free leg from `here` ends at; None when no try was free."""
-    low = np.maximum(corners[0], here - leg_max_m)
-    high = np.minimum(corners[1], here + leg_max_m)
+    center: Floats,
+    half: Floats,
+    there: Floats,
+) -> bool:
+    """Write the first point that is drawn at the end of a free leg."""
+    points = np.empty((BATCH, 2))
     for _ in range(BATCHES):
-        ends = rng.uniform(low, high, size=(BATCH, 2))
-        length = np.hypot(ends[:, 0] - here[0], ends[:, 1] - here[1])
-        free = (length >= LEG_MIN_M) & (length <= leg_max_m)
-        free &= segments_clear(here, ends, keep_off)
-        if free.any():
-            target: Floats = ends[int(free.argmax())]
-            return target
-    return None
+        draw_points(rng, low, span, points)
+        for point in points:
+            length = math.hypot(point[0] - here[0], point[1] - here[1])
+            if LEG_MIN_M <= length <= leg_max_m and segment_clear(here, point, center, half):
+                there[:] = point
+                return True
+    return False
 
 
-def _timed(points: list[Floats], speed: float, dwell_s: float) -> Tour:
+def _timed(points: list[list[float]], speed: float, dwell_s: float) -> Tour:
     """Return the tour through `points` at constant speed, with a stop at each but the first."""
     times = [0.0]
     places = [points[0]]
-    for here, there in itertools.pairwise(points):
+    for here, there in pairwise(points):
         times.append(times[-1] + math.dist(here, there) / speed)
         places.append(there)
         if dwell_s > 0.0:

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from airl_mav.arena.footprints import Boxes, Floats, inner, outside_all
+from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, outside
 from airl_mav.arena.geometry import Bounds
 from airl_mav.arena.placement import BATCH, BATCHES
 from airl_mav.core.errors import FieldError
+from airl_mav.core.kernels import kernel
 from airl_mav.profiles.arena import ArenaSpec
 
 
@@ -58,11 +59,30 @@ def draw_goal(
     low, high = np.maximum(low, -farthest), np.minimum(high, farthest)
     if (low > high).any():
         return None
-    for _ in range(BATCHES):
-        points = rng.uniform(low, high, size=(BATCH, 2))
-        distance = np.hypot(points[:, 0], points[:, 1])
-        free = (distance >= nearest) & (distance <= farthest) & outside_all(points, keep_off)
-        if free.any():
-            goal: Floats = points[int(free.argmax())]
-            return goal
+    goal = np.empty(2)
+    if _find_goal(rng, low, high - low, nearest, farthest, keep_off.center, keep_off.half, goal):
+        return goal
     return None
+
+
+@kernel
+def _find_goal(
+    rng: np.random.Generator,
+    low: Floats,
+    span: Floats,
+    nearest: float,
+    farthest: float,
+    center: Floats,
+    half: Floats,
+    goal: Floats,
+) -> bool:
+    """Write the first point that is drawn within the ring, outside all boxes."""
+    points = np.empty((BATCH, 2))
+    for _ in range(BATCHES):
+        draw_points(rng, low, span, points)
+        for point in points:
+            distance = math.hypot(point[0], point[1])
+            if nearest <= distance <= farthest and outside(point, center, half):
+                goal[:] = point
+                return True
+    return False

@@ -1,4 +1,4 @@
-"""The pinhole model of the depth camera."""
+"""The two models of the depth camera: a pinhole, and a cylinder that sees all round."""
 
 from __future__ import annotations
 
@@ -6,34 +6,72 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # A frame source needs no profiles.
+from airl_mav.profiles.projection import Projection
+
+if TYPE_CHECKING:  # A frame source needs no models of profiles.
     from airl_mav.profiles.vehicle import Camera
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics with square pixels, RealSense convention.
+    """Intrinsics with square pixels. Pixel centres are at whole numbers.
 
-    A pixel (u, v) looks along ((u - cx) / focal, (v - cy) / focal, 1) in the optical frame
-    (right, down, forward). Pixel centres are at whole numbers.
+    In the optical frame (right, down, forward) a pixel (u, v) looks along
+
+    - pinhole, RealSense convention: ((u - cx) / focal, (v - cy) / focal, 1). Depth is measured
+      along the optical axis.
+    - cylindrical: (sin a, (v - cy) / focal, cos a) with a = (u - cx) / focal [rad], clockwise seen
+      from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
+      the cylinder. Upright edges are upright in the image, and the column of the optical axis is
+      that of a pinhole of the same focal length.
+
+    Both times depth is the factor of that vector which leads to the point that is seen.
     """
 
     width: int
     height: int
     focal: float
-    """Focal length [px]."""
+    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
     cx: float
     cy: float
+    projection: Projection = "pinhole"
 
     @classmethod
-    def from_fov(cls, width: int, height: int, horizontal_fov: float) -> Intrinsics:
-        """Return the intrinsics of a camera with a horizontal field of view [rad] in (0, pi)."""
-        focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
-        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1))
+    def from_fov(
+        cls,
+        width: int,
+        height: int,
+        horizontal_fov: float,
+        projection: Projection = "pinhole",
+    ) -> Intrinsics:
+        """Return the intrinsics of a camera with a horizontal field of view [rad].
+
+        It is in (0, pi) for a pinhole, in (0, 2 pi] for a cylinder.
+        """
+        if projection == "cylindrical":
+            focal = width / horizontal_fov
+        else:
+            focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
+        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1), projection)
 
     @classmethod
     def of(cls, camera: Camera) -> Intrinsics:
         """Return the intrinsics of a vehicle profile's camera."""
         return cls.from_fov(
-            camera.width_px, camera.height_px, math.radians(camera.horizontal_fov_deg)
+            camera.width_px,
+            camera.height_px,
+            math.radians(camera.horizontal_fov_deg),
+            camera.projection,
         )
+
+    @property
+    def cylindrical(self) -> bool:
+        """Whether the image is a cylinder's."""
+        return self.projection == "cylindrical"
+
+    @property
+    def horizontal_fov_rad(self) -> float:
+        """Horizontal field of view [rad], from edge to edge of the image."""
+        if self.cylindrical:
+            return self.width / self.focal
+        return 2.0 * math.atan2(0.5 * self.width, self.focal)

@@ -1,36 +1,54 @@
-"""Noise of a stereo depth camera on its images."""
+"""What makes a depth camera's images differ from the truth: its own matching, and conditions."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.camera.stereo import Matching, matched_depth, matching_of
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import Camera
 
 NOISE_AT_M = 10.0
 """Depth at which the noise is as declared; stereo noise grows with the square of the depth."""
 
 
-def is_noisy(asked: SensorNoise) -> bool:
-    """Return whether images change at all."""
-    return bool(asked.depth_noise or asked.depth_dropout)
+class DepthNoise(NamedTuple):
+    """What happens to images, in this order."""
+
+    matching: Matching | None
+    """That of a stereo camera; None: none."""
+    asked: SensorNoise
+
+
+def noise_of(camera: Camera, asked: SensorNoise) -> DepthNoise | None:
+    """Return what happens to the images of a camera; None: nothing."""
+    matching = matching_of(camera, asked.stereo_noise)
+    changed = matching is not None or asked.depth_noise or asked.depth_dropout
+    return DepthNoise(matching, asked) if changed else None
 
 
 def noisy_frame(
-    depth_mm: NDArray[np.uint16], asked: SensorNoise, seed: int, frame: int
+    depth_mm: NDArray[np.uint16], noise: DepthNoise, seed: int, frame: int
 ) -> NDArray[np.uint16]:
     """Return a frame of an episode as its noise leaves it.
 
     Args:
         depth_mm: Z16 image (h, w).
-        asked: How noisy.
+        noise: What happens to it.
         seed: Of the episode.
         frame: Its number in the episode, by the camera's rate: frames that nobody takes count, so
             that the same moment has the same noise wherever it is flown.
     """
-    return noisy_depth(depth_mm, asked, stream(seed, Stream.DEPTH, frame))
+    if noise.matching is not None:
+        depth_mm = matched_depth(depth_mm, noise.matching, stream(seed, Stream.STEREO, frame))
+    if noise.asked.depth_noise or noise.asked.depth_dropout:
+        depth_mm = noisy_depth(depth_mm, noise.asked, stream(seed, Stream.DEPTH, frame))
+    return depth_mm
 
 
 def noisy_depth(

@@ -1,4 +1,8 @@
-"""Where a body falls in the image: the pixel rectangle that bounds its projection."""
+"""Where a body falls in the image: the pixels that bound its projection.
+
+An image is made of lines: a pinhole's are its rows, a cylinder's its columns. Along each of them a
+pixel's ray is start + x along, affine in x, so that both are drawn by the same loops.
+"""
 
 from __future__ import annotations
 
@@ -18,24 +22,32 @@ _WIDE: Final = 1e9  # slope of a ray (almost) in the image plane
 
 Image = NDArray[np.float32]
 Rectangle = tuple[int, int, int, int]
-"""Rows [top, bottom), columns [left, end)."""
+"""Lines [first, last), pixels of each [begin, end)."""
+
+Span = tuple[float, float, int, int]
+"""Lines first..last, not yet cut to the image, and pixels of each [begin, end)."""
 
 
 class View(NamedTuple):
     """What a pixel looks along, and how far."""
 
     focal: float
-    cx: float
-    cy: float
+    line_centre: float
+    """Line of the optical axis."""
+    pixel_centre: float
+    """Pixel of the optical axis on that line."""
     s_min: float  # inverse of the range
+    cylindrical: bool
 
 
 class Pose(NamedTuple):
     """Camera axes, and a body's centre from the camera, along the body's own axes."""
 
     forward: Vec
-    right: Vec
-    down: Vec
+    across: Vec
+    """From line to line: down of a pinhole, right of a cylinder."""
+    along: Vec
+    """Along a line: right of a pinhole, down of a cylinder."""
     center: Vec
 
 
@@ -64,16 +76,24 @@ def _span(forward: float, lateral: float, radius: float) -> tuple[float, float]:
 
 
 @kernel
-def _pixels(low: float, high: float, focal: float, c: float, n: int) -> tuple[int, int]:
-    """Return the pixels [first, last) of a row or column of n that slopes low..high fall on."""
-    first = min(max(math.floor(c + focal * low), 0.0), float(n))
-    last = min(max(math.ceil(c + focal * high) + 1.0, 0.0), float(n))
+def _pixels(low: float, high: float, n: int) -> tuple[int, int]:
+    """Return the pixels [first, last) of n that those between two places fall on."""
+    first = min(max(math.floor(low), 0.0), float(n))
+    last = min(max(math.ceil(high) + 1.0, 0.0), float(n))
     return int(first), int(last)
 
 
 @kernel
-def bounding_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
-    """Return the pixels that can see a body; empty when none can.
+def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
+    """Return how far a body reaches from its centre along an axis, either way."""
+    if sphere:
+        return half[0]
+    return abs(half[0] * axis[0]) + abs(half[1] * axis[1]) + abs(half[2] * axis[2])
+
+
+@kernel
+def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
+    """Return the pixels of a pinhole that can see a body; empty when none can.
 
     Args:
         out: The image.
@@ -82,13 +102,10 @@ def bounding_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bo
         half: Half extents of the body's bounding box along its own axes [m].
         sphere: The body is a sphere of radius half[0].
     """
-    f, r, d, c = pose.forward, pose.right, pose.down, pose.center
+    f, r, d, c = pose.forward, pose.along, pose.across, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
-    if sphere:
-        reach = radius = half[0]
-    else:
-        reach = abs(half[0] * f[0]) + abs(half[1] * f[1]) + abs(half[2] * f[2])
-        radius = math.sqrt(dot(half, half))
+    reach = _reach(f, half, sphere)
+    radius = half[0] if sphere else math.sqrt(dot(half, half))
     if z + reach <= 0.0 or (z - reach) * view.s_min > 1.0:
         return 0, 0, 0, 0
     if sphere or z - reach < MIN_DEPTH_M:
@@ -105,6 +122,49 @@ def bounding_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bo
             along = (y + i * d[0] + j * d[1] + k * d[2]) * g
             left, right = min(left, across), max(right, across)
             top, bottom = min(top, along), max(bottom, along)
-    u0, u1 = _pixels(left, right, view.focal, view.cx, out.shape[1])
-    v0, v1 = _pixels(top, bottom, view.focal, view.cy, out.shape[0])
+    u_centre, v_centre = view.pixel_centre, view.line_centre
+    u0, u1 = _pixels(u_centre + view.focal * left, u_centre + view.focal * right, out.shape[1])
+    v0, v1 = _pixels(v_centre + view.focal * top, v_centre + view.focal * bottom, out.shape[0])
     return v0, v1, u0, u1
+
+
+@kernel
+def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Span:
+    """Return the pixels of a cylinder that can see a body; no pixels of a line when none can.
+
+    The lines are those around the body's bearing, of which one more turn of the cylinder, or one
+    less, may fall into the image (`cut`). Arguments as of `pinhole_rectangle`; the image's lines
+    are the columns.
+    """
+    f, r, d, c = pose.forward, pose.across, pose.along, pose.center
+    z, x, y = dot(f, c), dot(r, c), dot(d, c)
+    bearing, distance = math.atan2(x, z), math.hypot(x, z)
+    cos, sin = math.cos(bearing), math.sin(bearing)
+    towards = (cos * f[0] + sin * r[0], cos * f[1] + sin * r[1], cos * f[2] + sin * r[2])
+    sideways = (cos * r[0] - sin * f[0], cos * r[1] - sin * f[1], cos * r[2] - sin * f[2])
+    reach, lateral = _reach(towards, half, sphere), _reach(sideways, half, sphere)
+    vertical = _reach(d, half, sphere)
+    near = distance - reach
+    if near * view.s_min > 1.0:
+        return 0.0, 0.0, 0, 0
+    if near < MIN_DEPTH_M:
+        # It may stand across the cylinder's axis: above, below or around the camera.
+        return 0.0, float(out.shape[0]), 0, out.shape[1]
+    half_angle = math.asin(lateral / distance) if sphere else math.atan2(lateral, near)
+    far = math.hypot(distance + reach, lateral)
+    top, bottom = y - vertical, y + vertical
+    top = top / near if top < 0.0 else top / far
+    bottom = bottom / near if bottom > 0.0 else bottom / far
+    centre = view.line_centre + view.focal * bearing
+    v0, v1 = _pixels(
+        view.pixel_centre + view.focal * top, view.pixel_centre + view.focal * bottom, out.shape[1]
+    )
+    return centre - view.focal * half_angle, centre + view.focal * half_angle, v0, v1
+
+
+@kernel
+def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
+    """Return the part of a span that falls into the image after so many turns of the cylinder."""
+    around = turns * 2.0 * math.pi * view.focal
+    first, last = _pixels(span[0] + around, span[1] + around, out.shape[0])
+    return first, last, span[2], span[3]

@@ -1,14 +1,17 @@
 """Depth image of an arena by analytic ray casting: the kernel that training and the plant share.
 
-A pixel's ray is d = forward + x right + y down with (x, y) = ((u - cx) / focal, (v - cy) / focal),
-so the distance t along it is the depth along the optical axis (planar z-depth, RealSense Z16).
+A pinhole's pixel has the ray d = forward + x right + y down with (x, y) = ((u - cx) / focal,
+(v - cy) / focal), so the distance t along it is the depth along the optical axis (planar z-depth,
+RealSense Z16). A cylinder's has d = cos(a) forward + sin(a) right + y down with a = (u - cx) /
+focal, and t is the depth in the plane of forward and right. Either is affine along a line of the
+image, and these lines are what is drawn: the rows of a pinhole, the columns of a cylinder.
 Everything is done on inverse depth s = 1 / t. Of a plane it is n.d / n.(p - o): affine in the
 pixel, no division, finite for grazing rays. Of a sphere or cylinder it is a root of a quadratic.
 A convex body is hit where its last entry is no farther than its first exit. The image keeps the
 greatest s of all bodies; one division a pixel at the end turns it into metres.
 
 Obstacle-outer: an obstacle touches only the pixels of the rectangle that its bounding box or
-sphere projects to. The loops along a row have no branch, so that they vectorise. They are in
+sphere projects to. The loops along a line have no branch, so that they vectorise. They are in
 float64: a float32 direction is off by millimetres on a floor seen at 20 m.
 """
 
@@ -27,8 +30,10 @@ from airl_mav.camera.projection import (
     Pose,
     Rectangle,
     View,
-    bounding_rectangle,
+    cut,
+    cylinder_span,
     dot,
+    pinhole_rectangle,
 )
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
@@ -39,7 +44,9 @@ _CYLINDER: Final = int(Shape.CYLINDER)
 _UNLIMITED: Final = 1e30  # inverse depth of an entry that lies behind the camera
 _TINY: Final = 1e-9  # least distance to a plane [m], least range [1/m]; keeps inverses finite
 
-Row = NDArray[np.float64]
+Line = NDArray[np.float64]
+Lines = NDArray[np.float64]
+"""(n, 2) how much of the forward axis, and of the axis across, is in the first ray of a line."""
 
 
 class _Slab(NamedTuple):
@@ -71,20 +78,20 @@ def _turn(v: Vec, cos: float, sin: float) -> Vec:
 
 
 @kernel
-def _row_start(pose: Pose, y: float) -> Vec:
-    """Return a row's ray at x = 0."""
-    f, d = pose.forward, pose.down
-    return (f[0] + y * d[0], f[1] + y * d[1], f[2] + y * d[2])
+def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
+    """Return a line's ray at x = 0."""
+    f, d = pose.forward, pose.across
+    return (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
 
 
 @kernel
-def _draw_room(out: Image, xs: Row, view: View, pose: Pose, half: Vec) -> None:
+def _draw_room(out: Image, lines: Lines, xs: Line, view: View, pose: Pose, half: Vec) -> None:
     """Write the inverse depth of floor and walls; 0 = no return.
 
     The room is a box without a lid. A ray that leaves it by the lid sees nothing, one that enters
     by the lid sees the inside, any other that enters sees a wall from outside.
     """
-    c, r = pose.center, pose.right
+    c, r = pose.center, pose.along
     north = _slab(c[0] - half[0], c[0] + half[0])
     east = _slab(c[1] - half[1], c[1] + half[1])
     floor, top = 1.0 / (c[2] + half[2]), c[2] - half[2]
@@ -92,7 +99,7 @@ def _draw_room(out: Image, xs: Row, view: View, pose: Pose, half: Vec) -> None:
     lid = 1.0 / (max(top, _TINY) if above else min(top, -_TINY))
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
     for v in range(out.shape[0]):
-        d0, d1, d2 = _row_start(pose, (v - view.cy) / view.focal)
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v]
         for u in range(len(xs)):
             x = xs[u]
@@ -113,9 +120,11 @@ def _draw_room(out: Image, xs: Row, view: View, pose: Pose, half: Vec) -> None:
 
 
 @kernel
-def _draw_box(out: Image, xs: Row, view: View, pose: Pose, half: Vec, rectangle: Rectangle) -> bool:
+def _draw_box(
+    out: Image, lines: Lines, xs: Line, view: View, pose: Pose, half: Vec, rectangle: Rectangle
+) -> bool:
     """Draw a box; return whether the camera is inside."""
-    c, r = pose.center, pose.right
+    c, r = pose.center, pose.along
     i = _slab(c[0] - half[0], c[0] + half[0])
     j = _slab(c[1] - half[1], c[1] + half[1])
     k = _slab(c[2] - half[2], c[2] + half[2])
@@ -124,7 +133,7 @@ def _draw_box(out: Image, xs: Row, view: View, pose: Pose, half: Vec, rectangle:
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _row_start(pose, (v - view.cy) / view.focal)
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         for u in range(len(x_span)):
             x = x_span[u]
@@ -144,10 +153,10 @@ def _draw_box(out: Image, xs: Row, view: View, pose: Pose, half: Vec, rectangle:
 
 @kernel
 def _draw_cylinder(
-    out: Image, xs: Row, view: View, pose: Pose, half: Vec, rectangle: Rectangle
+    out: Image, lines: Lines, xs: Line, view: View, pose: Pose, half: Vec, rectangle: Rectangle
 ) -> bool:
     """Draw a vertical cylinder with caps; return whether the camera is inside."""
-    c, r = pose.center, pose.right
+    c, r = pose.center, pose.along
     k = _slab(c[2] - half[2], c[2] + half[2])
     # Side: (c.c - radius²) s² - 2 (d.c) s + d.d = 0, horizontal components only.
     cc = c[0] * c[0] + c[1] * c[1] - half[0] * half[0]
@@ -159,7 +168,7 @@ def _draw_cylinder(
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _row_start(pose, (v - view.cy) / view.focal)
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         for u in range(len(x_span)):
             x = x_span[u]
@@ -179,10 +188,10 @@ def _draw_cylinder(
 
 @kernel
 def _draw_sphere(
-    out: Image, xs: Row, view: View, pose: Pose, radius: float, rectangle: Rectangle
+    out: Image, lines: Lines, xs: Line, view: View, pose: Pose, radius: float, rectangle: Rectangle
 ) -> bool:
     """Draw a sphere; return whether the camera is inside."""
-    c, r = pose.center, pose.right
+    c, r = pose.center, pose.along
     cc = dot(c, c) - radius * radius
     if cc <= 0.0:
         return True
@@ -190,7 +199,7 @@ def _draw_sphere(
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _row_start(pose, (v - view.cy) / view.focal)
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         for u in range(len(x_span)):
             x = x_span[u]
@@ -206,7 +215,7 @@ def _draw_sphere(
 
 @kernel
 def _draw_obstacle(
-    out: Image, xs: Row, view: View, world: Pose, shape: int, half: Vec, yaw: float
+    out: Image, lines: Lines, xs: Line, view: View, world: Pose, shape: int, half: Vec, yaw: float
 ) -> bool:
     """Draw one obstacle whose centre is `world.center`; return whether the camera is inside."""
     cos, sin = 1.0, 0.0
@@ -219,21 +228,35 @@ def _draw_obstacle(
             cos, sin = world.center[0] / distance, world.center[1] / distance
     pose = Pose(
         _turn(world.forward, cos, sin),
-        _turn(world.right, cos, sin),
-        _turn(world.down, cos, sin),
+        _turn(world.across, cos, sin),
+        _turn(world.along, cos, sin),
         _turn(world.center, cos, sin),
     )
-    rectangle = bounding_rectangle(out, view, pose, half, shape != _BOX and shape != _CYLINDER)
-    if rectangle[0] >= rectangle[1] or rectangle[2] >= rectangle[3]:
-        return False
-    inside: bool
-    if shape == _BOX:
-        inside = _draw_box(out, xs, view, pose, half, rectangle)
-    elif shape == _CYLINDER:
-        inside = _draw_cylinder(out, xs, view, pose, half, rectangle)
+    sphere = shape != _BOX and shape != _CYLINDER
+    turns = 0
+    span = (0.0, 0.0, 0, 0)
+    rectangle = (0, 0, 0, 0)
+    if view.cylindrical:
+        # What is behind the camera may be at both ends of the image.
+        turns = 1
+        span = cylinder_span(out, view, pose, half, sphere)
     else:
-        inside = _draw_sphere(out, xs, view, pose, half[0], rectangle)
-    return inside
+        rectangle = pinhole_rectangle(out, view, pose, half, sphere)
+    for turn in range(-turns, turns + 1):
+        if view.cylindrical:
+            rectangle = cut(out, view, span, turn)
+        if rectangle[0] >= rectangle[1] or rectangle[2] >= rectangle[3]:
+            continue
+        inside: bool
+        if shape == _BOX:
+            inside = _draw_box(out, lines, xs, view, pose, half, rectangle)
+        elif shape == _CYLINDER:
+            inside = _draw_cylinder(out, lines, xs, view, pose, half, rectangle)
+        else:
+            inside = _draw_sphere(out, lines, xs, view, pose, half[0], rectangle)
+        if inside:
+            return True
+    return False
 
 
 @kernel
@@ -257,6 +280,7 @@ def render_depth(
     focal: float,
     cx: float,
     cy: float,
+    cylindrical: bool,
     max_range: float,
     bounds: NDArray[np.float64],
     shape: NDArray[np.int8],
@@ -272,14 +296,16 @@ def render_depth(
     contact's penetration). From inside an obstacle every pixel reads `MIN_DEPTH_M`.
 
     Args:
-        out: (height, width) depth along the optical axis [m], written; 0 = no return.
+        out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
+            in the camera's horizontal plane of a cylinder.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED: its x axis is the optical axis, y points
             to the right of the image, z to its bottom.
-        focal: Focal length [px].
+        focal: Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder.
         cx: Column of the optical axis; pixel centres are at whole numbers.
         cy: Row of the optical axis.
-        max_range: Greatest depth along the optical axis that gives a return [m].
+        cylindrical: The image is a cylinder's, as `Intrinsics` defines it.
+        max_range: Greatest depth that gives a return [m].
         bounds: (5,) `Bounds.as_array()`.
         shape: (n,) `Shape`.
         center: (n, 3) NED [m].
@@ -293,10 +319,27 @@ def render_depth(
         rotate(q, (0.0, 1.0, 0.0)),
         rotate(q, (0.0, 0.0, 1.0)),
     )
-    view = View(focal, cx, cy, max(1.0 / max_range, _TINY))
-    xs = np.empty(out.shape[1])
-    for u in range(len(xs)):
-        xs[u] = (u - cx) / focal
+    height, width = out.shape
+    xs = np.empty(height if cylindrical else width)
+    lines = np.empty((width if cylindrical else height, 2))
+    if cylindrical:
+        # Drawn column by column, each of them in one piece; `out` gets them at the end.
+        drawn = np.empty((width, height), np.float32)
+        view = View(focal, cx, cy, max(1.0 / max_range, _TINY), cylindrical)
+        across, along = right, down
+        for u in range(width):
+            angle = (u - cx) / focal
+            lines[u, 0], lines[u, 1] = math.cos(angle), math.sin(angle)
+        for v in range(height):
+            xs[v] = (v - cy) / focal
+    else:
+        drawn = out
+        view = View(focal, cy, cx, max(1.0 / max_range, _TINY), cylindrical)
+        across, along = down, right
+        for v in range(height):
+            lines[v, 0], lines[v, 1] = 1.0, (v - cy) / focal
+        for u in range(width):
+            xs[u] = (u - cx) / focal
 
     room = (
         0.5 * (bounds[0] + bounds[1]) - camera[0],
@@ -304,12 +347,14 @@ def render_depth(
         -0.5 * bounds[4] - camera[2],
     )
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
-    _draw_room(out, xs, view, Pose(forward, right, down, room), half_room)
+    _draw_room(drawn, lines, xs, view, Pose(forward, across, along, room), half_room)
     for i in range(len(shape)):
         offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
         half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
-        pose = Pose(forward, right, down, offset)
-        if _draw_obstacle(out, xs, view, pose, shape[i], half, yaw[i]):
+        pose = Pose(forward, across, along, offset)
+        if _draw_obstacle(drawn, lines, xs, view, pose, shape[i], half, yaw[i]):
             out[:, :] = MIN_DEPTH_M
             return
-    _invert(out)
+    _invert(drawn)
+    if cylindrical:
+        out[:, :] = drawn.T

@@ -60,7 +60,7 @@ def render(
         arena: What is seen.
         centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
         intrinsics: The camera.
-        max_range: Greatest depth along the optical axis that gives a return [m].
+        max_range: Greatest depth that gives a return [m].
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
     """
@@ -73,6 +73,7 @@ def render(
         k.focal,
         k.cx,
         k.cy,
+        k.cylindrical,
         max_range,
         arena.bounds.as_array(),
         obstacles.shape,

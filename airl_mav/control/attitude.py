@@ -34,8 +34,14 @@ def attitude_setpoint(thrust: Vec, cy: float, sy: float) -> Quat:
     """
     norm = math.sqrt(thrust[0] ** 2 + thrust[1] ** 2 + thrust[2] ** 2)
     if norm < 1e-9:
-        half = 0.5 * math.atan2(sy, cy)
-        return (math.cos(half), 0.0, 0.0, math.sin(half))
+        # Half the heading, without a call that vehicles side by side cannot be compiled with.
+        half_sin = math.sqrt(max(0.0, 0.5 - 0.5 * cy))
+        return (
+            math.sqrt(max(0.0, 0.5 + 0.5 * cy)),
+            0.0,
+            0.0,
+            half_sin if sy >= 0.0 else -half_sin,
+        )
     zx, zy, zz = -thrust[0] / norm, -thrust[1] / norm, -thrust[2] / norm
     # x = y_c x z with y_c = (-sin, cos, 0)
     xx, xy, xz = cy * zz, sy * zz, -sy * zy - cy * zx
@@ -85,21 +91,52 @@ def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
 
     `yaw_rate_ff` is a heading rate about the world's down axis [rad/s].
     """
+    reduced, half_turn = reduced_attitude(q, q_sp)
+    return rates_towards(q, reduced, weighted_turn(half_turn, gains), yaw_rate_ff, gains)
+
+
+@kernel
+def reduced_attitude(q: Quat, q_sp: Quat) -> tuple[Quat, float]:
+    """Return q with its thrust axis turned into that of q_sp, on the shortest way.
+
+    Returns:
+        The attitude, body -> NED, and the sine of half the turn about the thrust axis that then
+        remains to q_sp, -1..1.
+    """
     down = (0.0, 0.0, 1.0)
     reduced = multiply(_shortest(rotate(q, down), rotate(q_sp, down)), q)
     mix = multiply(conjugate(reduced), q_sp)
     sign = 1.0 if mix[0] >= 0.0 else -1.0
-    w = gains.yaw_weight
-    turn_z = math.sin(w * math.asin(clamp(sign * mix[3], -1.0, 1.0)))
-    turn_w = math.sqrt(1.0 - turn_z * turn_z)
-    wanted = multiply(reduced, (turn_w, 0.0, 0.0, turn_z))
+    return reduced, clamp(sign * mix[3], -1.0, 1.0)
+
+
+@kernel
+def weighted_turn(half_turn: float, gains: Gains) -> float:
+    """Return the sine of half the heading's turn with its weight, from that without."""
+    return math.sin(gains.yaw_weight * math.asin(half_turn))
+
+
+@kernel
+def rates_towards(
+    q: Quat, reduced: Quat, half_turn: float, yaw_rate_ff: float, gains: Gains
+) -> Vec:
+    """Return the body rates FRD [rad/s] that turn q into an attitude.
+
+    Args:
+        q: Body -> NED.
+        reduced: The attitude but for a turn about its thrust axis, body -> NED.
+        half_turn: The sine of half that turn.
+        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
+        gains: Gains and limits.
+    """
+    wanted = multiply(reduced, (math.sqrt(1.0 - half_turn * half_turn), 0.0, 0.0, half_turn))
     error = multiply(conjugate(q), wanted)
     two = 2.0 if error[0] >= 0.0 else -2.0
-    # The yaw gain is divided by its weight so that the weight does not slow a pure yaw step.
     ff = rotate(conjugate(q), (0.0, 0.0, yaw_rate_ff))
     p = gains.att_p_roll * two * error[1] + ff[0]
     r = gains.att_p_pitch * two * error[2] + ff[1]
-    y = gains.att_p_yaw / w * two * error[3] + ff[2]
+    # The yaw gain is divided by its weight so that the weight does not slow a pure yaw step.
+    y = gains.att_p_yaw / gains.yaw_weight * two * error[3] + ff[2]
     return (
         clamp(p, -gains.rate_max_roll, gains.rate_max_roll),
         clamp(r, -gains.rate_max_pitch, gains.rate_max_pitch),

@@ -68,6 +68,10 @@ class Output(NamedTuple):
     """Newest velocity setpoint after limits NED [m/s]."""
 
 
+Published = tuple[Quat, float, float]
+"""What the position loop hands on: attitude setpoint, yaw rate [rad/s], collective 0..1."""
+
+
 class Filters(NamedTuple):
     """The low-passes of the cascade, for a fixed tick."""
 
@@ -114,14 +118,14 @@ def cascade_tick(
         weights: `filters(gains, dt)`: the same at every tick.
         dt: Tick [s].
     """
-    first = _start(velocity, omega, memory, weights)
+    first = start(velocity, omega, memory, weights)
     # Setpoints published by an outer loop take effect at the next tick, except at the very first.
-    published = _attitude_sp(memory)
+    published = attitude_sp(memory)
     if memory[WAIT] == 0.0:
-        _position_loop(position, velocity, q, demand, memory, gains, weights, dt)
+        position_loop(position, velocity, q, demand, memory, gains, weights, dt)
         memory[WAIT] = POSITION_TICKS
         if first:
-            published = _attitude_sp(memory)
+            published = attitude_sp(memory)
     memory[WAIT] -= 1.0
     return _inner_loops(q, omega, published, first, memory, gains, weights, dt)
 
@@ -139,13 +143,13 @@ def trajectory_tick(
     dt: float,
 ) -> Output:
     """Run one tick as `cascade_tick` does, for a demand with an acceleration."""
-    first = _start(velocity, omega, memory, weights)
-    published = _attitude_sp(memory)
+    first = start(velocity, omega, memory, weights)
+    published = attitude_sp(memory)
     if memory[WAIT] == 0.0:
         _trajectory_loop(position, velocity, q, demand, memory, gains, weights, dt)
         memory[WAIT] = POSITION_TICKS
         if first:
-            published = _attitude_sp(memory)
+            published = attitude_sp(memory)
     memory[WAIT] -= 1.0
     return _inner_loops(q, omega, published, first, memory, gains, weights, dt)
 
@@ -165,12 +169,12 @@ def attitude_tick(
 
     The velocity setpoint of the output is NaN.
     """
-    first = _start(velocity, omega, memory, weights)
+    first = start(velocity, omega, memory, weights)
     _skip_position_loop(velocity, memory, weights, dt)
     for i in range(4):
         memory[ATTITUDE_SP + i] = demand.attitude[i]
     memory[YAW_RATE_SP], memory[THRUST_SP] = demand.yaw_rate, demand.thrust
-    return _inner_loops(q, omega, _attitude_sp(memory), first, memory, gains, weights, dt)
+    return _inner_loops(q, omega, attitude_sp(memory), first, memory, gains, weights, dt)
 
 
 @kernel
@@ -188,7 +192,7 @@ def rate_tick(
 
     The attitude setpoint of the output is the present attitude, its velocity setpoint NaN.
     """
-    _start(velocity, omega, memory, weights)
+    start(velocity, omega, memory, weights)
     _skip_position_loop(velocity, memory, weights, dt)
     for i in range(4):
         memory[ATTITUDE_SP + i] = q[i]
@@ -201,7 +205,7 @@ def rate_tick(
 
 
 @kernel
-def _start(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> bool:
+def start(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> bool:
     """Settle the filters if this is the first tick; return whether it is."""
     first: bool = memory[PRIMED] == 0.0
     if first:
@@ -213,7 +217,7 @@ def _start(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> bool:
 def _inner_loops(
     q: Quat,
     omega: Vec,
-    published: tuple[Quat, float, float],
+    published: Published,
     first: bool,
     memory: Memory,
     gains: Gains,
@@ -223,6 +227,15 @@ def _inner_loops(
     """Fly what the position loop has published: attitude setpoint, yaw rate, collective."""
     q_sp, yaw_rate, thrust_sp = published
     wanted = rate_setpoint(q, q_sp, yaw_rate, gains)
+    rates_sp, collective = hand_over(wanted, thrust_sp, first, memory)
+    motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
+    newest_sp = attitude_sp(memory)[0]
+    return Output(motors, collective, newest_sp, wanted, three(memory, VELOCITY_SP))
+
+
+@kernel
+def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tuple[Vec, float]:
+    """Publish rates and collective; return those that the rate loop flies in this tick."""
     rates_sp, collective = wanted, thrust_sp
     if not first:
         rates_sp = three(memory, RATES_SP)
@@ -230,9 +243,7 @@ def _inner_loops(
     memory[THRUST_ON] = thrust_sp
     for i in range(3):
         memory[RATES_SP + i] = wanted[i]
-    motors = _rate_loop(omega, rates_sp, collective, memory, gains, weights, dt)
-    newest_sp = _attitude_sp(memory)[0]
-    return Output(motors, collective, newest_sp, wanted, three(memory, VELOCITY_SP))
+    return rates_sp, collective
 
 
 @kernel
@@ -258,7 +269,7 @@ def _prime(velocity: Vec, omega: Vec, memory: Memory, weights: Filters) -> None:
 
 
 @kernel
-def _attitude_sp(memory: Memory) -> tuple[Quat, float, float]:
+def attitude_sp(memory: Memory) -> Published:
     """Return attitude setpoint, yaw rate and collective as the position loop published them."""
     a = ATTITUDE_SP
     q_sp = (memory[a], memory[a + 1], memory[a + 2], memory[a + 3])
@@ -266,7 +277,7 @@ def _attitude_sp(memory: Memory) -> tuple[Quat, float, float]:
 
 
 @kernel
-def _position_loop(
+def position_loop(
     position: Vec,
     velocity: Vec,
     q: Quat,
@@ -302,7 +313,7 @@ def _trajectory_loop(
     weights: Filters,
     dt: float,
 ) -> None:
-    """As `_position_loop`, with an acceleration."""
+    """As `position_loop`, with an acceleration."""
     period = POSITION_TICKS * dt
     _differentiate(velocity, memory, weights, period)
     north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
@@ -367,6 +378,27 @@ def _rate_loop(
     dt: float,
 ) -> Motors:
     """Return the motor commands that turn as wanted, with a collective 0..1."""
+    torque = torque_setpoint(omega, rates_sp, memory, gains, weights, dt)
+    motors, missing = mix(collective, torque, gains)
+    for i in range(3):
+        memory[SAT + i] = missing[i]
+    return motors
+
+
+@kernel
+def torque_setpoint(
+    omega: Vec, rates_sp: Vec, memory: Memory, gains: Gains, weights: Filters, dt: float
+) -> Vec:
+    """Return the torque -1..1 per axis that turns as wanted, and advance the loop's filters.
+
+    Args:
+        omega: Body rates FRD [rad/s].
+        rates_sp: Those wanted [rad/s].
+        memory: Row of this vehicle; its `SAT` is of the mixer's last tick.
+        gains: Gains and limits.
+        weights: `filters(gains, dt)`.
+        dt: Tick [s].
+    """
     rates_now = (omega[0], omega[1], omega[2])
     for i in range(3):
         before, newer = memory[GYRO + i], memory[GYRO_NEWER + i]
@@ -384,8 +416,6 @@ def _rate_loop(
         dt,
     )
     memory[YAW_TORQUE] += weights.yaw_torque * (torque[2] - memory[YAW_TORQUE])
-    motors, missing = mix(collective, (torque[0], torque[1], memory[YAW_TORQUE]), gains)
     for i in range(3):
         memory[RATE_INT + i] = integral[i]
-        memory[SAT + i] = missing[i]
-    return motors
+    return torque[0], torque[1], memory[YAW_TORQUE]

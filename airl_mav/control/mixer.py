@@ -70,14 +70,43 @@ def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
 
     `thrust` is the collective 0..1, `torque` the normalised roll, pitch and yaw torque, -1..1.
     """
-    r, p = gains.mix_roll, gains.mix_pitch
-    rolling = (r * ROLL[0], r * ROLL[1], r * ROLL[2], r * ROLL[3])
-    pitching = (p * PITCH[0], p * PITCH[1], p * PITCH[2], p * PITCH[3])
-    level = (thrust, thrust, thrust, thrust)
-    m = _add(_add(level, rolling, torque[0]), pitching, torque[1])
+    motors, fits = allocate(thrust, torque, gains)
+    if fits:
+        return motors, (0.0, 0.0, 0.0)  # the usual case
+    return desaturate(thrust, torque, gains)
+
+
+@kernel
+def allocate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, bool]:
+    """Return motor commands without limits, and whether none is reached, with and without yaw."""
+    m = _roll_and_pitch(thrust, torque, gains)
     turning = _add(m, YAW, torque[2])
-    if _in_range(m) and _in_range(turning):
-        return turning, (0.0, 0.0, 0.0)  # nothing is saturated, the usual case
+    return turning, _in_range(m) and _in_range(turning)
+
+
+@kernel
+def _roll_and_pitch(thrust: float, torque: Vec, gains: Gains) -> Motors:
+    level = (thrust, thrust, thrust, thrust)
+    m = _add(level, _scaled(ROLL, gains.mix_roll), torque[0])
+    return _add(m, _scaled(PITCH, gains.mix_pitch), torque[1])
+
+
+@kernel
+def _scaled(direction: Motors, share: float) -> Motors:
+    return (
+        share * direction[0],
+        share * direction[1],
+        share * direction[2],
+        share * direction[3],
+    )
+
+
+@kernel
+def desaturate(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
+    """As `mix`, for commands of which some would be out of range."""
+    r, p = gains.mix_roll, gains.mix_pitch
+    rolling, pitching = _scaled(ROLL, r), _scaled(PITCH, p)
+    m = _roll_and_pitch(thrust, torque, gains)
     m = _desaturate(m, THRUST, 1.0, True)
     m = _desaturate(m, rolling, 1.0, False)
     m = _desaturate(m, pitching, 1.0, False)

@@ -1,7 +1,8 @@
 """Coordinate frames: the only place that converts.
 
 The project speaks PX4's frames: world NED (north, east, down), body FRD (forward, right, down).
-pybullet speaks ENU / FLU. Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate
+pybullet, ROS and Foxglove speak ENU / FLU, and cameras look along +z of an optical frame (right,
+down, forward). Quaternions are Hamilton, unit, scalar first [w, x, y, z], and rotate
 body vectors into the world: v_ned = R(q) v_frd. Euler angles are the aerospace sequence yaw,
 pitch, roll (Z-Y-X, intrinsic).
 """
@@ -126,6 +127,25 @@ _FRD_FROM_FLU = np.array([0.0, 1.0, 0.0, 0.0])
 def quat_ned_frd_to_enu_flu(q: Vector) -> Vector:
     """Turn an attitude NED <- FRD (4,) into the same as ENU <- FLU (4,). Its own inverse."""
     return quat_normalize(quat_multiply(quat_multiply(_ENU_FROM_NED, q), _FRD_FROM_FLU))
+
+
+FRD_FROM_OPTICAL = np.array([0.5, 0.5, 0.5, 0.5])
+"""The optical frame of a camera that looks along the body's forward axis, as FRD <- optical."""
+
+
+def quat_flu_from_optical(pitch_up: float) -> Vector:
+    """Return FLU <- optical (4,) of a camera that looks so far above the forward axis [rad]."""
+    tilt = quat_from_euler(0.0, pitch_up, 0.0)
+    return quat_normalize(quat_multiply(quat_multiply(_FRD_FROM_FLU, tilt), FRD_FROM_OPTICAL))
+
+
+def quat_from_direction(direction: Vector) -> Vector:
+    """Return an attitude (4,) whose x axis has a direction (3,) in the parent frame, level in y.
+
+    Any right-handed frame; the direction need not have length 1, and z is the vertical.
+    """
+    x, y, z = (float(part) for part in direction)
+    return quat_from_euler(0.0, -math.atan2(z, math.hypot(x, y)), math.atan2(y, x))
 
 
 def quat_wxyz_to_xyzw(q: Vector) -> tuple[float, float, float, float]:

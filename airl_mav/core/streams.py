@@ -21,6 +21,7 @@ class Stream(IntEnum):
     SOURCE = 15
     WIND = 16
     FAULTS = 17
+    STEREO = 18
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -89,7 +90,7 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     batch.bounds[i] = arena.bounds.as_array()
     batch.n_obstacles[i], batch.n_static[i] = count, arena.n_static
     batch.shape[i, :count] = o.shape
-    batch.center[i, :count] = arena.centers_at(0)
+    batch.center[i, :count] = o.center
     batch.half_size[i, :count] = o.half_size
     batch.yaw[i, :count] = o.yaw
     batch.goal[i] = arena.goal
@@ -100,8 +101,10 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
         batch.tour_times_s[i, j, :k] = tour.times_s
         batch.tour_points[i, j, :k] = tour.points
         batch.tour_period_s[i, j] = tour.times_s[-1]
-        legs = np.linalg.norm(np.diff(tour.points, axis=0), axis=1) / np.diff(tour.times_s)
-        batch.tour_speed[i] = max(batch.tour_speed[i], legs.max())
+        batch.center[i, arena.n_static + j, :2] = tour.points[0]
+        legs, passed_s = np.diff(tour.points, axis=0), np.diff(tour.times_s)
+        speed = math.sqrt(((legs * legs).sum(axis=1) / (passed_s * passed_s)).max())
+        batch.tour_speed[i] = max(batch.tour_speed[i], speed)
 
 
 @kernel

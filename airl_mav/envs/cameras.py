@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.noise import is_noisy, noisy_frame
+from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -33,21 +33,24 @@ NEVER = 1 << 40
 
 
 class Lens(NamedTuple):
-    """The pinhole camera's constants; a tuple, so that compiled loops take it."""
+    """The camera's constants; a tuple, so that compiled loops take it."""
 
     focal: float
-    """Focal length [px]."""
+    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
     cx: float
     """Column of the optical axis [px]; pixel centres are at whole numbers."""
     cy: float
     """Row of the optical axis [px]."""
     range_m: float
-    """Greatest depth along the optical axis that gives a return [m]."""
+    """Greatest depth that gives a return [m]."""
+    cylindrical: bool = False
+    """The image is a cylinder's."""
 
 
 def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
     """Return the lens of a camera that sees `range_m` [m] far."""
-    return Lens(intrinsics.focal, intrinsics.cx, intrinsics.cy, range_m)
+    k = intrinsics
+    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical)
 
 
 class Cameras(Stateful):
@@ -67,7 +70,7 @@ class Cameras(Stateful):
             n: Number of cameras.
             camera: The camera.
             transport_us: From capture to decoded [µs].
-            noise: Of their images.
+            noise: Conditions that their images are taken in.
             faults: Those of the camera happen to all of them.
         """
         self.intrinsics = Intrinsics.of(camera)
@@ -75,7 +78,7 @@ class Cameras(Stateful):
         """(n, h, w) newest frames, Z16 [mm]."""
         self.period_us = camera.period_us
         self.transport_us = transport_us
-        self._noise = noise
+        self._noise = noise_of(camera, noise)
         self._mount = Mount(
             (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
         )
@@ -189,22 +192,24 @@ class Cameras(Stateful):
                 taken = acts & (fleet.time_us + TICK_US // 2 >= self._freeze_us[each.number])
                 self.image[taken] = self._frozen[each.number][taken]
             elif acts.any():
-                noise = SensorNoise(depth_noise=each.fault.amount)
+                noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 own = NOISE_SEED * (each.number + 1) + seeds
                 self._make_noisy(self.image, noise, acts, own, fleet.time_us)
 
     def _make_noisy(
         self,
         image: NDArray[np.uint16],
-        noise: SensorNoise,
+        noise: DepthNoise | None,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
         time_us: NDArray[np.int64],
     ) -> None:
         """Add noise to the images of `who` (n,), taken at these times (n,) [µs]."""
+        if noise is None:
+            return
         # Frames are taken at whole ticks, up to half of one before their time.
         frame = (time_us + TICK_US // 2 - self._first_us) // self.period_us
-        for i in np.flatnonzero(who).tolist() if is_noisy(noise) else ():
+        for i in np.flatnonzero(who).tolist():
             image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frame[i]))
 
     def _held(self) -> Mapping[str, Any]:
@@ -228,8 +233,8 @@ def render_images(
         who: (n,) whose image is rendered; the others' stays as it is.
         mount: The camera's place on the body.
         lens: The camera.
-        out: (n, height, width) depth along the optical axis [mm], written; 0 = no return. Rounded
-            and clipped as `camera.frame.depth_to_z16` does.
+        out: (n, height, width) depth [mm], written; 0 = no return. Rounded and clipped as
+            `camera.frame.depth_to_z16` does.
     """
     image = np.empty(out.shape[1:], np.float32)
     for i in range(len(who)):
@@ -245,6 +250,7 @@ def render_images(
             lens.focal,
             lens.cx,
             lens.cy,
+            lens.cylindrical,
             lens.range_m,
             arenas.bounds[i],
             arenas.shape[i, :count],

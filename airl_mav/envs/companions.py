@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.policy.observation import InFlight, Kinematics
+from airl_mav.policy.observation import InFlight, Kinematics, Rows
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 
@@ -121,21 +121,17 @@ class Companions:
         for kept, found in zip(vars(self._state).values(), vars(then).values(), strict=True):
             kept[who] = found[who]
 
-    def seen(
-        self, image_mm: NDArray[np.uint16], state: Kinematics
-    ) -> tuple[NDArray[np.uint16], Kinematics]:
-        """Return what the decisions see: the present, or what it will be when they act."""
-        if self._compensator is None:
-            return image_mm, state
-        return self._image_mm, self._state
+    def foreseen(self, rows: Rows) -> tuple[NDArray[np.uint16], Kinematics]:
+        """Return what the decisions of those that `foresee` will act on: images and states."""
+        return self._image_mm[rows], self._state.rows(rows)
 
-    def told(self) -> InFlight | None:
+    def told(self, rows: Rows) -> InFlight | None:
         """Return what policies may be told of the decisions; None: nobody keeps account."""
-        return None if self._memory is None else self._memory.in_flight(self._age_us)
+        return None if self._memory is None else self._memory.in_flight(self._age_us).rows(rows)
 
-    def earlier_mm(self) -> tuple[NDArray[np.uint16], ...]:
-        """Return the images (n, h, w) of the decisions before, the newest first."""
-        return tuple(self._earlier_mm)
+    def earlier_mm(self, rows: Rows) -> tuple[NDArray[np.uint16], ...]:
+        """Return the images (k, h, w) of the decisions before, the newest first."""
+        return tuple(image[rows] for image in self._earlier_mm)
 
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""

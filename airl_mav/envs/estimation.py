@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.saved_state import Stateful
-from airl_mav.policy.observation import Kinematics
+from airl_mav.policy.observation import Kinematics, Rows
 from airl_mav.profiles.vehicle import Estimation
 
 N_ERRORS: Final = 9
@@ -130,13 +130,12 @@ class Telemetry(Stateful):
         normals = self._normals[np.arange(len(decisions)), decisions % BLOCK]
         self._errors = step_errors(self._model, self._errors, normals, flown_s)
 
-    def report(self, truth: Kinematics) -> Kinematics:
-        """Return the state of all n as telemetry reports it."""
+    def report(self, truth: Kinematics, rows: Rows) -> Kinematics:
+        """Return the states of `rows` as telemetry reports them."""
         if self._model is None:
             return truth
-        return Kinematics(
-            *perturbed(truth.position, truth.velocity, truth.quaternion, self._errors)
-        )
+        errors = self._errors[rows]
+        return Kinematics(*perturbed(truth.position, truth.velocity, truth.quaternion, errors))
 
     def position(self, truth: Array) -> Array:
         """Return the positions (n, 3) of all n as telemetry reports them; see `report`."""

@@ -62,6 +62,7 @@ class Fleet(NamedTuple):
     distance: NDArray[np.float64]  # (n,) flown since the start [m]
     energy: NDArray[np.float64]  # (n,) of the vehicle since the start, its computer apart [J]
     battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
+    room: NDArray[np.float64]  # (n,) it and the obstacles move so far without contact; 0: look [m]
     touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, WALL, or NOTHING
     verdict: NDArray[np.int64]  # (n,) Verdict
     airframe: NDArray[np.float64]  # (n, fields of Airframe) each one's own
@@ -135,6 +136,7 @@ def new_fleet(n: int) -> Fleet:
         distance=np.zeros(n),
         energy=np.zeros(n),
         battery=np.ones(n),
+        room=np.zeros(n),
         touched=np.full(n, NOTHING, np.int64),
         verdict=np.full(n, int(Verdict.FLYING), np.int64),
         airframe=np.zeros((n, len(Airframe._fields))),

@@ -3,6 +3,10 @@
 The same kernels as the rehearsal (`airl_mav.vehicle`, `airl_mav.control`), without estimator and
 MAVLink: control sees the true state. A setpoint in the heading frame is turned into NED when it
 arrives and again at each of MAVSDK's 20 Hz repeats, as PX4 does it.
+
+A few vehicles fly each tick together (`lanes`); when one has flown its ticks, or its flight is
+over, the next takes its place. What calls functions that have no vector form, or is rarely needed,
+stands in loops of its own between those that are compiled to vector instructions.
 """
 
 from __future__ import annotations
@@ -12,20 +16,68 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.attitude import heading_of
-from airl_mav.control.cascade import Filters, cascade_tick, filters
+from airl_mav.control.attitude import heading_of, rates_towards, reduced_attitude, weighted_turn
+from airl_mav.control.cascade import (
+    POSITION_TICKS,
+    Filters,
+    attitude_sp,
+    filters,
+    hand_over,
+    position_loop,
+    start,
+    torque_setpoint,
+)
 from airl_mav.control.demand import Demand
+from airl_mav.control.gains import Gains
+from airl_mav.control.memory import MEMORY_SIZE, SAT, WAIT
+from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.contact import NOTHING, clearance, touches
-from airl_mav.envs.fleet import STILL, Fleet, Rules, Vehicle, Verdict
+from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
+from airl_mav.envs.lanes import (
+    AIRFRAME,
+    AIRFRAME_SIZE,
+    ATTITUDE,
+    BATTERY,
+    COLLECTIVE,
+    DISTANCE,
+    ENERGY,
+    FELT,
+    FIRST,
+    FITS,
+    HALF_TURN,
+    LANES,
+    MEMORY,
+    MOTORS,
+    MOVED,
+    POSITION,
+    PUBLISHED,
+    PUBLISHED_THRUST,
+    PUBLISHED_YAW_RATE,
+    RATES,
+    REDUCED,
+    ROTOR,
+    ROTOR_LEFT,
+    ROWS,
+    TORQUE,
+    VELOCITY,
+    WANTED,
+    WIND,
+    YAW_RATE,
+    State,
+    load,
+    quat,
+    unload,
+    vec,
+)
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import felt, felt_share, flight_power_w
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
-from airl_mav.vehicle.rotor import lag, settle, wrench
+from airl_mav.vehicle.rotor import settle, wrench
 
 REPEAT_US = 50_000
 """MAVSDK repeats the newest setpoint at 20 Hz [µs]."""
@@ -34,6 +86,9 @@ _ROUNDING_M = 1e-6
 """Distances are this exact, and far more."""
 
 NAN3: Vec = (math.nan, math.nan, math.nan)
+
+_NOBODY = -1
+"""In an empty lane."""
 
 _FLYING = int(Verdict.FLYING)
 _SUCCESS = int(Verdict.SUCCESS)
@@ -66,15 +121,261 @@ def advance(
         vehicle: What all vehicles share.
         rules: What ends a flight.
         air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
-            next, after the last one the first again. None: calm, compiled without any wind.
+            next, after the last one the first again. None: calm.
     """
-    weights = filters(vehicle.gains, TICK_S)
-    for i in range(len(fleet.time_us)):
-        if fleet.verdict[i] == _FLYING:
-            if air is None:
-                _fly(fleet, arenas, i, ticks[i], vehicle, rules, None, weights)
+    weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
+    # Made here with sizes that are constants: so the compiler knows that no two rows overlap.
+    state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
+    who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
+    # Those whose position loops are due at the same ticks fly together: one loop runs for all.
+    todo, coming, odd, aloft = ticks.copy(), np.zeros(2, np.int64), 0, 0
+    while True:
+        for j in range(LANES):
+            for other in range(2):
+                if who[j] == _NOBODY:
+                    who[j] = _next(todo, fleet.verdict, fleet.memory, odd ^ other, coming)
+                    if who[j] != _NOBODY:
+                        left[j], todo[who[j]] = todo[who[j]], 0
+                        load(fleet, who[j], state, j)
+                        aloft += 1
+        if aloft == 0:
+            return
+        for j in range(LANES):
+            i = who[j]
+            if i != _NOBODY:
+                if fleet.time_us[i] >= fleet.repeat_us[i]:
+                    _repeat(fleet, i, state, j)
+                if air is not None:
+                    _blow(air[i], fleet.time_us[i], state, j)
+        _outer_loops(state, spare, who, aloft, vehicle.gains, weights)
+        _inner_loops(state, who, vehicle.gains, weights)
+        odd ^= 1
+        _move(state, vehicle, kept)
+        for j in range(LANES):
+            i = who[j]
+            if i != _NOBODY:
+                here, hit = vec(state, POSITION, j), NOTHING
+                fleet.time_us[i] += TICK_US
+                # Nothing is touched before both have moved as far as they were apart.
+                fleet.room[i] -= state[MOVED, j] + TICK_S * arenas.tour_speed[i]
+                if fleet.room[i] < _ROUNDING_M:
+                    fleet.room[i], hit = _contact(arenas, i, here, fleet.time_us[i], vehicle)
+                fleet.touched[i] = hit
+                goal = arenas.goal[i, 0], arenas.goal[i, 1]
+                fleet.verdict[i] = _verdict(
+                    here, goal, hit, state[BATTERY, j], fleet.time_us[i], rules
+                )
+                left[j] -= 1
+                if left[j] == 0 or fleet.verdict[i] != _FLYING:
+                    move_obstacles(arenas, i, fleet.time_us[i])
+                    unload(fleet, i, state, j)
+                    who[j] = _NOBODY
+                    aloft -= 1
+
+
+@kernel
+def _next(
+    todo: NDArray[np.int64],
+    verdict: NDArray[np.int64],
+    memory: NDArray[np.float64],
+    odd: int,
+    coming: NDArray[np.int64],
+) -> int:
+    """Return the next vehicle that has to fly and whose position loop is due now, or nobody.
+
+    Args:
+        todo: (n,) how many ticks each one has to fly.
+        verdict: (n,) of the fleet.
+        memory: (n, MEMORY_SIZE) of the fleet.
+        odd: 1: the next whose loop is due a tick later.
+        coming: (2,) where the search goes on, for both; updated.
+    """
+    while coming[odd] < len(todo):
+        i: int = coming[odd]
+        coming[odd] += 1
+        if todo[i] > 0 and verdict[i] == _FLYING and (memory[i, WAIT] != 0.0) == (odd == 1):
+            return i
+    return _NOBODY
+
+
+@kernel
+def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
+    """Turn the setpoint of vehicle i, in lane j, into NED by the present heading."""
+    c, s = heading_of(quat(state, ATTITUDE, j))
+    forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
+    fleet.velocity_ned[i, 0] = c * forward - s * right
+    fleet.velocity_ned[i, 1] = s * forward + c * right
+    fleet.velocity_ned[i, 2] = fleet.setpoint[i, 2]
+    fleet.repeat_us[i] += REPEAT_US
+    for axis in range(3):
+        state[WANTED + axis, j] = fleet.velocity_ned[i, axis]
+
+
+@kernel
+def _blow(air: NDArray[np.float64], time_us: int, state: State, j: int) -> None:
+    """Put the wind of a tick, of the rows `air` (k, 3) of a vehicle, into its lane j."""
+    row = time_us // TICK_US % len(air)
+    for axis in range(3):
+        state[WIND + axis, j] = air[row, axis]
+
+
+@kernel
+def _outer_loops(
+    state: State,
+    spare: NDArray[np.float64],
+    who: NDArray[np.int64],
+    aloft: int,
+    gains: Gains,
+    weights: Filters,
+) -> None:
+    """Run the first half of `cascade_tick` in every lane: to what the attitude loop flies.
+
+    Args:
+        state: Updated.
+        spare: (MEMORY_SIZE, LANES) room to work in.
+        who: (LANES,) which vehicle is in each lane, or nobody.
+        aloft: In how many lanes somebody is.
+        gains: Gains and limits.
+        weights: `filters(gains, TICK_S)`.
+    """
+    due = 0
+    for j in range(LANES):
+        memory = state[MEMORY:ROWS, j]
+        first = start(vec(state, VELOCITY, j), vec(state, RATES, j), memory, weights)
+        state[FIRST, j] = 1.0 if first else 0.0
+        due += who[j] != _NOBODY and memory[WAIT] == 0.0
+        _publish(state, j)
+    if due > 0:
+        # In all lanes, or none would be fast; those that are not due keep what they had.
+        if due < aloft:
+            spare[:] = state[MEMORY:ROWS]
+        for j in range(LANES):
+            demand = Demand(NAN3, vec(state, WANTED, j), math.nan, state[YAW_RATE, j])
+            p, v, q = vec(state, POSITION, j), vec(state, VELOCITY, j), quat(state, ATTITUDE, j)
+            position_loop(p, v, q, demand, state[MEMORY:ROWS, j], gains, weights, TICK_S)
+        for j in range(LANES):
+            if state[MEMORY + WAIT, j] != 0.0:
+                if due < aloft:
+                    state[MEMORY:ROWS, j] = spare[:, j]
             else:
-                _fly(fleet, arenas, i, ticks[i], vehicle, rules, air[i], weights)
+                state[MEMORY + WAIT, j] = POSITION_TICKS
+                if state[FIRST, j] != 0.0:
+                    _publish(state, j)
+
+
+@kernel
+def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Filters) -> None:
+    """Run the second half of `cascade_tick` in every lane: to the motor commands.
+
+    Arguments as of `_outer_loops`.
+    """
+    for j in range(LANES):
+        q, q_sp = quat(state, ATTITUDE, j), quat(state, PUBLISHED, j)
+        reduced, state[HALF_TURN, j] = reduced_attitude(q, q_sp)
+        for k in range(4):
+            state[REDUCED + k, j] = reduced[k]
+        state[MEMORY + WAIT, j] -= 1.0
+    for j in range(LANES):
+        state[HALF_TURN, j] = weighted_turn(state[HALF_TURN, j], gains)
+    for j in range(LANES):
+        memory, reduced = state[MEMORY:ROWS, j], quat(state, REDUCED, j)
+        yaw_rate = state[PUBLISHED_YAW_RATE, j]
+        wanted = rates_towards(
+            quat(state, ATTITUDE, j), reduced, state[HALF_TURN, j], yaw_rate, gains
+        )
+        first = state[FIRST, j] != 0.0
+        rates_sp, collective = hand_over(wanted, state[PUBLISHED_THRUST, j], first, memory)
+        omega = vec(state, RATES, j)
+        torque = torque_setpoint(omega, rates_sp, memory, gains, weights, TICK_S)
+        motors, fits = allocate(collective, torque, gains)
+        state[FITS, j], state[COLLECTIVE, j] = 1.0 if fits else 0.0, collective
+        for axis in range(3):
+            state[TORQUE + axis, j] = torque[axis]
+            memory[SAT + axis] = 0.0
+        for k in range(4):
+            state[MOTORS + k, j] = motors[k]
+    for j in range(LANES):
+        if state[FITS, j] == 0.0 and who[j] != _NOBODY:
+            motors, missing = desaturate(state[COLLECTIVE, j], vec(state, TORQUE, j), gains)
+            for axis in range(3):
+                state[MEMORY + SAT + axis, j] = missing[axis]
+            for k in range(4):
+                state[MOTORS + k, j] = motors[k]
+
+
+@kernel
+def _publish(state: State, j: int) -> None:
+    """Keep what the inner loops fly in this tick."""
+    q_sp, yaw_rate, thrust = attitude_sp(state[MEMORY:ROWS, j])
+    for k in range(4):
+        state[PUBLISHED + k, j] = q_sp[k]
+    state[PUBLISHED_YAW_RATE, j], state[PUBLISHED_THRUST, j] = yaw_rate, thrust
+
+
+@kernel
+def _move(state: State, vehicle: Vehicle, kept: float) -> None:
+    """Move the body in every lane by a tick, on its motor commands.
+
+    Args:
+        state: Updated.
+        vehicle: What all vehicles share.
+        kept: `felt_share` of a tick.
+    """
+    pack = vehicle.pack
+    for j in range(LANES):
+        p, v = vec(state, POSITION, j), vec(state, VELOCITY, j)
+        q, w = quat(state, ATTITUDE, j), vec(state, RATES, j)
+        airframe = airframe_of(state[AIRFRAME : AIRFRAME + AIRFRAME_SIZE, j])
+        motors, speeds = quat(state, MOTORS, j), quat(state, ROTOR, j)
+        s0 = settle(speeds[0], motors[0], airframe, state[ROTOR_LEFT, j])
+        s1 = settle(speeds[1], motors[1], airframe, state[ROTOR_LEFT, j])
+        s2 = settle(speeds[2], motors[2], airframe, state[ROTOR_LEFT, j])
+        s3 = settle(speeds[3], motors[3], airframe, state[ROTOR_LEFT, j])
+        thrust, torque = wrench(s0, s1, s2, s3, airframe)
+        lift = rotate(q, (0.0, 0.0, -thrust))
+        wind = vec(state, WIND, j)
+        drag = drag_force(v, wind, airframe)
+        force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
+        k = airframe.drag_angular
+        damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
+        # Of the state in which this tick's forces act, as the drag.
+        acceleration = vec(state, FELT, j)
+        power = flight_power_w(thrust, v, q, wind, acceleration, airframe, vehicle.power)
+        p_new, v_new, q_new, w_new = step(p, v, q, w, force, damped, airframe, TICK_S)
+        acceleration = felt(acceleration, v, v_new, kept, TICK_S, vehicle.power)
+        x, y, z = p_new[0] - p[0], p_new[1] - p[1], p_new[2] - p[2]
+        moved = math.sqrt(x**2 + y**2 + z**2)
+        rest_v = open_circuit(state[BATTERY, j], pack.empty_v, pack.full_v)
+        load_w = power + vehicle.computer_w
+        current = load_w / terminal_voltage(rest_v, pack.resistance_ohm, load_w)
+        state[BATTERY, j] = drain(state[BATTERY, j], current, pack.capacity_mah, TICK_S)
+        state[ENERGY, j] += TICK_S * power
+        state[MOVED, j] = moved
+        state[DISTANCE, j] += moved
+        for axis in range(3):
+            state[POSITION + axis, j] = p_new[axis]
+            state[VELOCITY + axis, j] = v_new[axis]
+            state[RATES + axis, j] = w_new[axis]
+            state[FELT + axis, j] = acceleration[axis]
+        for axis in range(4):
+            state[ATTITUDE + axis, j] = q_new[axis]
+        state[ROTOR, j], state[ROTOR + 1, j] = s0, s1
+        state[ROTOR + 2, j], state[ROTOR + 3, j] = s2, s3
+
+
+@kernel
+def _verdict(
+    here: Vec, goal: tuple[float, float], hit: int, battery: float, time_us: int, rules: Rules
+) -> int:
+    """Return what a tick has decided, FLYING mostly."""
+    # Never given the whole fleet: counting the references to its arrays takes longer than a tick.
+    if (here[0] - goal[0]) ** 2 + (here[1] - goal[1]) ** 2 < rules.goal_radius**2:
+        return _SUCCESS
+    if hit != NOTHING:
+        return _COLLISION
+    if battery <= 0.0:
+        return _BATTERY
+    return _TIMEOUT if time_us >= rules.time_limit_us else _FLYING
 
 
 @kernel
@@ -93,107 +394,3 @@ def _contact(
     return room, touches(
         position, radius, half_height, bounds, count, shape, center, half_size, yaw
     )
-
-
-@kernel
-def _fly(
-    fleet: Fleet,
-    arenas: ArenaBatch,
-    i: int,
-    ticks: int,
-    vehicle: Vehicle,
-    rules: Rules,
-    air: NDArray[np.float64] | None,
-    weights: Filters,
-) -> None:
-    airframe, gains, pack = airframe_of(fleet.airframe[i]), vehicle.gains, vehicle.pack
-    goal_north, goal_east = arenas.goal[i, 0], arenas.goal[i, 1]
-    battery = fleet.battery[i]
-    p = (fleet.position[i, 0], fleet.position[i, 1], fleet.position[i, 2])
-    v = (fleet.velocity[i, 0], fleet.velocity[i, 1], fleet.velocity[i, 2])
-    q = (
-        fleet.quaternion[i, 0],
-        fleet.quaternion[i, 1],
-        fleet.quaternion[i, 2],
-        fleet.quaternion[i, 3],
-    )
-    w = (fleet.omega[i, 0], fleet.omega[i, 1], fleet.omega[i, 2])
-    s0, s1, s2, s3 = fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3]
-    acceleration = (fleet.felt[i, 0], fleet.felt[i, 1], fleet.felt[i, 2])
-    time_us = fleet.time_us[i]
-    memory = fleet.memory[i]
-    distance, energy = fleet.distance[i], fleet.energy[i]
-    obstacles_move = TICK_S * arenas.tour_speed[i]
-    room = 0.0
-    wind = STILL
-    left, kept = lag(airframe, TICK_S), felt_share(vehicle.power, TICK_S)
-    for _ in range(ticks):
-        if time_us >= fleet.repeat_us[i]:
-            c, s = heading_of(q)
-            forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
-            fleet.velocity_ned[i, 0] = c * forward - s * right
-            fleet.velocity_ned[i, 1] = s * forward + c * right
-            fleet.velocity_ned[i, 2] = fleet.setpoint[i, 2]
-            fleet.repeat_us[i] += REPEAT_US
-        wanted = (fleet.velocity_ned[i, 0], fleet.velocity_ned[i, 1], fleet.velocity_ned[i, 2])
-        demand = Demand(NAN3, wanted, math.nan, fleet.setpoint[i, 3])
-        motors = cascade_tick(p, v, q, w, demand, memory, gains, weights, TICK_S).motors
-        s0 = settle(s0, motors[0], airframe, left)
-        s1 = settle(s1, motors[1], airframe, left)
-        s2 = settle(s2, motors[2], airframe, left)
-        s3 = settle(s3, motors[3], airframe, left)
-        thrust, torque = wrench(s0, s1, s2, s3, airframe)
-        lift = rotate(q, (0.0, 0.0, -thrust))
-        if air is not None:
-            row = time_us // TICK_US % len(air)
-            wind = (air[row, 0], air[row, 1], air[row, 2])
-        drag = drag_force(v, wind, airframe)
-        force = (lift[0] + drag[0], lift[1] + drag[1], lift[2] + drag[2])
-        k = airframe.drag_angular
-        damped = (torque[0] - k * w[0], torque[1] - k * w[1], torque[2] - k * w[2])
-        # Of the state in which this tick's forces act, as the drag; and so it is worked out beside
-        # the step, not after it, which is a tenth of the twin's speed.
-        power = flight_power_w(thrust, v, q, wind, acceleration, airframe, vehicle.power)
-        before, moved_from = v, p
-        p, v, q, w = step(p, v, q, w, force, damped, airframe, TICK_S)
-        acceleration = felt(acceleration, before, v, kept, TICK_S, vehicle.power)
-        energy += TICK_S * power
-        rest_v = open_circuit(battery, pack.empty_v, pack.full_v)
-        load = power + vehicle.computer_w
-        current = load / terminal_voltage(rest_v, pack.resistance_ohm, load)
-        battery = drain(battery, current, pack.capacity_mah, TICK_S)
-        moved = math.sqrt(
-            (p[0] - moved_from[0]) ** 2 + (p[1] - moved_from[1]) ** 2 + (p[2] - moved_from[2]) ** 2
-        )
-        distance += moved
-        time_us += TICK_US
-        # Nothing is touched before vehicle and obstacles have moved as far as they were apart.
-        room -= moved + obstacles_move
-        hit = NOTHING
-        if room < _ROUNDING_M:
-            room, hit = _contact(arenas, i, p, time_us, vehicle)
-        fleet.touched[i] = hit
-        if (p[0] - goal_north) ** 2 + (p[1] - goal_east) ** 2 < rules.goal_radius**2:
-            fleet.verdict[i] = _SUCCESS
-        elif hit != NOTHING:
-            fleet.verdict[i] = _COLLISION
-        elif battery <= 0.0:
-            fleet.verdict[i] = _BATTERY
-        elif time_us >= rules.time_limit_us:
-            fleet.verdict[i] = _TIMEOUT
-        else:
-            continue
-        break
-    move_obstacles(arenas, i, time_us)
-    for axis in range(3):
-        fleet.position[i, axis] = p[axis]
-        fleet.velocity[i, axis] = v[axis]
-        fleet.omega[i, axis] = w[axis]
-        fleet.felt[i, axis] = acceleration[axis]
-    for axis in range(4):
-        fleet.quaternion[i, axis] = q[axis]
-    fleet.rotor[i, 0], fleet.rotor[i, 1], fleet.rotor[i, 2], fleet.rotor[i, 3] = s0, s1, s2, s3
-    fleet.time_us[i] = time_us
-    fleet.distance[i] = distance
-    fleet.energy[i] = energy
-    fleet.battery[i] = battery

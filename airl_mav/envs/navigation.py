@@ -43,7 +43,7 @@ from airl_mav.faults.twin import check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
-from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload
@@ -52,6 +52,9 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import Camera, VehicleProfile
 from airl_mav.vehicle.spread import draw_airframe
+
+EVERYONE = slice(None)
+"""The rows of all n vehicles."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +140,7 @@ class Navigation(Stateful):
             layout=spec.layout,
             height_px=spec.image_height_px,
             width_px=spec.image_width_px,
+            projection=self.camera.projection,
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
             range_m=self.camera.range_m,
             frames=spec.frames,
@@ -238,23 +242,28 @@ class Navigation(Stateful):
             self._trace.begin(i, self.fleet)
         self._decision[i] = 0
         low, high = randomisation.extra_delay_ms
-        delay_rng = stream(seed, Stream.DELAY)
-        self._extra_us[i] = round(delay_rng.uniform(low, high) * US_PER_MS)
+        extra_ms = low if low == high else stream(seed, Stream.DELAY).uniform(low, high)
+        self._extra_us[i] = round(extra_ms * US_PER_MS)
         self._delays.begin(i, seed)
         self._telemetry.begin(i, seed)
         self.cameras.begin(i, seed)
         self._timing.begin(i)
         self._companions.begin(i)
 
-    def see(self) -> Observation:
-        """Return the present observations of all vehicles, with a leading axis (n,).
+    def see(self, slots: Sequence[int] | None = None) -> Observation:
+        """Return the present observations of all vehicles, or of those in `slots`.
 
-        Where latency is compensated, they are those of when the decision is expected to act.
+        With a leading axis (n,). Where latency is compensated, they are those of when the decision
+        is expected to act.
         """
-        image, state = self._companions.seen(self.cameras.image, self.kinematics())
-        known = self._companions
+        rows, known = EVERYONE if slots is None else slots, self._companions
+        if known.foresee:
+            image, state = known.foreseen(rows)
+        else:
+            image, state = self.cameras.image[rows], self.kinematics(rows)
+        goal = self._batch.goal[rows]
         return observe(
-            image, self.intrinsics, state, self._batch.goal, known.told(), known.earlier_mm()
+            image, self.intrinsics, state, goal, known.told(rows), known.earlier_mm(rows)
         )
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
@@ -262,14 +271,11 @@ class Navigation(Stateful):
 
         Of all vehicles, or of those in `slots`.
         """
-        seen = self.see()
-        if slots is not None:
-            seen = seen.rows(slots)
-        return encode_layout(self.observation, seen, shrink)
+        return encode_layout(self.observation, self.see(slots), shrink)
 
-    def kinematics(self) -> Kinematics:
+    def kinematics(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the state of all n as telemetry reports it: with the estimator's error."""
-        return self._telemetry.report(self.truth())
+        return self._telemetry.report(self.truth(rows), rows)
 
     def flights(self) -> Flights:
         """Return the status of all flights."""
@@ -286,10 +292,11 @@ class Navigation(Stateful):
             touched=fleet.touched.copy(),
         )
 
-    def truth(self) -> Kinematics:
+    def truth(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the true state of all n; a copy."""
         fleet = self.fleet
-        return Kinematics(fleet.position.copy(), fleet.velocity.copy(), fleet.quaternion.copy())
+        state = Kinematics(fleet.position, fleet.velocity, fleet.quaternion).rows(rows)
+        return Kinematics(*map(np.copy, (state.position, state.velocity, state.quaternion)))
 
     def whole_truth(self) -> WholeTruth:
         """Return all that the twin knows, the very arrays that it flies on: to look at only."""
@@ -343,7 +350,8 @@ class Navigation(Stateful):
                 "decision": self._decision,
                 "extra_us": self._extra_us,
             },
-            "fleet": self.fleet._asdict(),
+            # Its room is looked for anew.
+            "fleet": {k: v for k, v in self.fleet._asdict().items() if k != "room"},
             "delays": self._delays,
             "telemetry": self._telemetry,
             "cameras": self.cameras,
@@ -370,6 +378,7 @@ class Navigation(Stateful):
         spare = next((arena for arena in self.arenas if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.arenas]
         self._batch = batch_of([arena for arena in room if arena is not None])
+        self.fleet.room[:] = 0.0
 
     def _arena(self, seed: int, zone: int | None) -> Arena:
         stage = None if zone is None else self.stages[zone]

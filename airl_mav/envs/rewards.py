@@ -171,4 +171,5 @@ def costs(weights: Costs, last: NDArray[np.float64], step: Step) -> NDArray[np.f
     found: NDArray[np.float64] = weights.command_step * np.hypot(change[:, 0], change[:, 1])
     found += weights.turn_step * change[:, 2]
     found += weights.energy * (step.now.energy_j - step.before.energy_j) / J_PER_KJ
+    found += weights.failure * step.failure
     return found

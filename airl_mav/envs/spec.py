@@ -16,6 +16,7 @@ from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import STRIP_ROWS, Frames, LayoutName, Told
 from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
+from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 from airl_mav.profiles.vehicle import Camera, load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
@@ -56,14 +57,23 @@ class CameraChange(ProfileModel):
 
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
     height_px: int | None = quantity("image height", "px", ge=6, le=480, default=None)
+    projection: Projection | None = Field(
+        default=None, description="pinhole, or cylindrical for a field of view of up to 360 deg"
+    )
     horizontal_fov_deg: float | None = quantity(
-        "horizontal field of view", "deg", gt=10, lt=170, default=None
+        "horizontal field of view, less than 170 with a pinhole",
+        "deg",
+        gt=10,
+        le=CYLINDER_MOST_DEG,
+        default=None,
     )
     range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
 
     def of(self, camera: Camera) -> Camera:
-        """Return a vehicle's camera with the changes."""
-        return camera.model_copy(update=self.model_dump(exclude_none=True))
+        """Return a vehicle's camera with the changes. Raises FieldError where they do not fit."""
+        made = camera.model_copy(update=self.model_dump(exclude_none=True))
+        check_fov("camera.horizontal_fov_deg", made.projection, made.horizontal_fov_deg)
+        return made
 
 
 class Delay(ProfileModel):
@@ -157,6 +167,7 @@ class Costs(ProfileModel):
         le=1000,
         default=0.0,
     )
+    failure: float = quantity("of a collision or an empty battery", "1", ge=0, le=1000, default=0.0)
 
 
 class Curriculum(ProfileModel):
@@ -227,7 +238,8 @@ class EnvironmentSpec(ProfileModel):
         " FILE.py:NAME",
     )
     costs: Costs = Field(
-        default_factory=Costs, description="of unsteady commands and of energy, beside the reward"
+        default_factory=Costs,
+        description="of unsteady commands, energy and failures, beside the reward",
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")

@@ -36,6 +36,8 @@ class Winds(DrawnAhead):
 
     def begin(self, i: int, seed: int) -> Vector:
         """Start the episode of slot i; return its steady wind (3,) NED [m/s]."""
+        if self.calm:
+            return np.zeros(3)
         rng = sensors_and_gusts(np.random.default_rng(seed))[1]
         wind = Wind(wind_of_episode(self._settings, seed), rng)
         self._winds[i], self._seeds[i], self._blocks[i] = wind, seed, 0

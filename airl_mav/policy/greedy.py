@@ -53,7 +53,7 @@ class GreedyPolicy:
     def act(self, observation: Observation) -> Action:
         """Return the velocity for an observation."""
         s, bearing = self._settings, observation.goal_bearing
-        half_fov = math.atan2(0.5 * observation.intrinsics.width, observation.intrinsics.focal)
+        half_fov = 0.5 * observation.intrinsics.horizontal_fov_rad
         if abs(bearing) > half_fov:
             # The goal is out of view: turn to it on the spot.
             self.side = math.copysign(1.0, bearing)
@@ -105,13 +105,17 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     v, u = np.nonzero(seen)
     z = depth[seen].astype(np.float64)
     right, down = (u - k.cx) / k.focal * z, (v - k.cy) / k.focal * z
+    ahead = z
+    if k.cylindrical:
+        angle = (u - k.cx) / k.focal
+        ahead, right = np.cos(angle) * z, np.sin(angle) * z
     # Heading frame from body: R_y(pitch) R_x(roll).
     cr, sr = math.cos(observation.roll), math.sin(observation.roll)
     cp, sp = math.cos(observation.pitch), math.sin(observation.pitch)
     level_right = cr * right - sr * down
     tilted_down = sr * right + cr * down
-    forward = cp * z + sp * tilted_down
-    level_down = -sp * z + cp * tilted_down
+    forward = cp * ahead + sp * tilted_down
+    level_down = -sp * ahead + cp * tilted_down
     inside = np.abs(level_down) < band_m
     return np.stack([forward[inside], level_right[inside]], axis=1)
 

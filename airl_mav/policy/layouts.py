@@ -27,6 +27,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import heading_to_ned
 from airl_mav.policy.observation import InFlight, Observation
+from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
@@ -75,7 +76,17 @@ class ObservationSpec(ProfileModel):
     layout: LayoutName = Field(default="body", description="which arrays it takes")
     height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
-    horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
+    projection: Projection = Field(
+        default="pinhole",
+        description="how directions fall on the image: pinhole, or cylindrical for a field of view"
+        " of up to 360 deg",
+    )
+    horizontal_fov_deg: float = quantity(
+        "horizontal field of view, less than 170 with a pinhole",
+        "deg",
+        gt=10,
+        le=CYLINDER_MOST_DEG,
+    )
     range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
@@ -93,6 +104,7 @@ class ObservationSpec(ProfileModel):
             )
         if self.frames > 1 and self.layout == "paper":
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
+        check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         return self
 
     @property
@@ -144,7 +156,7 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
 def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     """Return why a camera cannot serve a layout, or None when it can.
 
-    Its image must be a whole multiple of the network's, its field of view the same.
+    Its image must be a whole multiple of the network's, its projection and field of view the same.
     """
     rows, columns = spec.camera_rows, spec.width_px
     if (
@@ -156,7 +168,9 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
             f"camera {camera.width}x{camera.height} px; accepted: {columns}x{rows} px "
             "or a whole multiple"
         )
-    fov_deg = math.degrees(2.0 * math.atan2(0.5 * camera.width, camera.focal))
+    if camera.projection != spec.projection:
+        return f"{camera.projection} camera; accepted: {spec.projection}"
+    fov_deg = math.degrees(camera.horizontal_fov_rad)
     if abs(fov_deg - spec.horizontal_fov_deg) > 0.1:
         return (
             f"camera with a horizontal field of view of {fov_deg:.1f} deg; "

@@ -112,10 +112,22 @@ class LearnedPolicy:
         Raises:
             ValueError: The network gives no number, or it remembers another number of flights.
         """
+        return decide(self.card.actions, self.outputs(encoded), self.card.epsilon, rng or self._rng)
+
+    def outputs(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return what the network says (n, k): a score for each discrete action, or the action.
+
+        A network with a memory remembers the call as a decision.
+
+        Args:
+            encoded: The arrays of the card's layout, each with n rows.
+
+        Raises:
+            ValueError: The network remembers another number of flights.
+        """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
-        outputs = self._remembering(encoded) if self.card.state else self._runtime.infer(encoded)
-        return decide(self.card.actions, outputs, self.card.epsilon, rng or self._rng)
+        return self._remembering(encoded) if self.card.state else self._runtime.infer(encoded)
 
     def _remembering(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs of a network with a memory, and remember what it gives."""

@@ -62,8 +62,9 @@ def _page(card: PolicyCard) -> Iterator[str]:
     yield from ("A policy of airl-mav that flies a quadcopter to a goal. In this folder:", "")
     yield from ("```sh", "airl-sitl --policy .", "airl evaluate . --episodes 100", "```", "")
     yield from ("| | |", "|---|---|")
+    image = "depth image" if seen.projection == "pinhole" else f"{seen.projection} depth image"
     yield (
-        f"| sees | depth image of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
+        f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
         f"deg wide, up to {seen.range_m:g} m; own velocity; goal (layout `{seen.layout}`) |"
     )
     yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"

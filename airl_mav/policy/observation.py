@@ -18,6 +18,9 @@ from airl_mav.camera.frame import MM_PER_M, Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
 
+Rows = int | slice | Sequence[int] | NDArray[np.int64] | None
+"""Which of n; None: the only one, as that of n = 1."""
+
 
 @dataclass(frozen=True)
 class Kinematics:
@@ -26,6 +29,10 @@ class Kinematics:
     position: Vector  # (..., 3) local NED [m]
     velocity: Vector  # (..., 3) NED [m/s]
     quaternion: Vector  # (..., 4) body FRD -> NED
+
+    def rows(self, index: Rows) -> Kinematics:
+        """Return that of vehicle `index` of n, or of several of them."""
+        return Kinematics(self.position[index], self.velocity[index], self.quaternion[index])
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,11 @@ class InFlight:
     def of_first_decisions(cls, n: int) -> InFlight:
         """Return that of n companions which have not decided yet."""
         return cls(np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+
+    def rows(self, index: Rows) -> InFlight:
+        """Return that of companion `index` of n, or of several of them."""
+        latency_s, age_s = np.asarray(self.latency_s), np.asarray(self.age_s)
+        return InFlight(self.command[index], latency_s[index], age_s[index])
 
 
 @dataclass(frozen=True)
@@ -66,19 +78,12 @@ class Observation:
     earlier_mm: tuple[NDArray[np.uint16], ...] = ()
     """The images (..., h, w) of the decisions before, as far as they are kept, the newest first."""
 
-    def rows(self, index: int | Sequence[int] | None) -> Observation:
-        """Return what vehicle `index` of n sees, or several of them.
-
-        With None: what one vehicle sees, as that of n = 1.
-        """
+    def rows(self, index: Rows) -> Observation:
+        """Return what vehicle `index` of n sees, or several of them."""
         names = ("depth_mm", "goal", "velocity", "roll", "pitch", "yaw")
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
         if (told := self.in_flight) is not None:
-            found["in_flight"] = InFlight(
-                told.command[index],
-                np.asarray(told.latency_s)[index],
-                np.asarray(told.age_s)[index],
-            )
+            found["in_flight"] = told.rows(index)
         found["earlier_mm"] = tuple(image[index] for image in self.earlier_mm)
         return replace(self, **found)
 

@@ -9,6 +9,7 @@ taken to stand still.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.profiles.vehicle import Camera
 
 LEAST_DEPTH_M = 0.05
-"""Points closer to the image plane than this are left out [m]: they have no pixel."""
+"""Points closer to the image plane, or a cylinder's axis, are left out [m]: they have no pixel."""
 
 _RANK = 1 << 16
 """Older images rank behind all depths of newer ones."""
@@ -55,9 +56,13 @@ class Reprojector:
         u = (np.arange(k.width, dtype=np.float32) - np.float32(k.cx)) / np.float32(k.focal)
         v = (np.arange(k.height, dtype=np.float32) - np.float32(k.cy)) / np.float32(k.focal)
         rays = np.ones((3, k.height, k.width), np.float32)
-        rays[1], rays[2] = u[None, :], v[:, None]
+        if k.cylindrical:
+            rays[0], rays[1] = np.cos(u)[None, :], np.sin(u)[None, :]
+        else:
+            rays[1] = u[None, :]
+        rays[2] = v[:, None]
         self._rays = rays.reshape(3, -1)
-        """(3, h w) what each pixel looks along: forward 1, right, down."""
+        """(3, h w) what each pixel looks along at a depth of 1: forward, right, down."""
 
     def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
         """Return the depth image (h, w) [mm] from a pose; 0 = no return.
@@ -90,17 +95,31 @@ class Reprojector:
         depth = mm * np.float32(1.0 / MM_PER_M)
         depth[empty] = self._range_m
         points = (turn @ self._rays) * depth
-        forward = points[0] + shift[0]
-        kept = forward > LEAST_DEPTH_M
-        scale = np.float32(k.focal) / np.maximum(forward, np.float32(LEAST_DEPTH_M))
-        column = np.rint((points[1] + shift[1]) * scale + np.float32(k.cx))
+        forward, right = points[0] + shift[0], points[1] + shift[1]
+        there = np.hypot(forward, right) if k.cylindrical else forward
+        kept = there > LEAST_DEPTH_M
+        scale = np.float32(k.focal) / np.maximum(there, np.float32(LEAST_DEPTH_M))
+        if k.cylindrical:
+            column = self._bearing_column(forward, right)
+        else:
+            column = np.rint(right * scale + np.float32(k.cx))
         row = np.rint((points[2] + shift[2]) * scale + np.float32(k.cy))
         kept &= (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
-        column, row, forward, empty = column[kept], row[kept], forward[kept], empty[kept]
+        column, row, there, empty = column[kept], row[kept], there[kept], empty[kept]
         pixels = (row * np.float32(k.width) + column).astype(np.intp)
-        carried_mm = np.rint(forward * np.float32(MM_PER_M)).astype(np.uint32)
-        carried_mm[empty | (forward > self._range_m)] = MAX_MM
+        carried_mm = np.rint(there * np.float32(MM_PER_M)).astype(np.uint32)
+        carried_mm[empty | (there > self._range_m)] = MAX_MM
         return pixels, carried_mm
+
+    def _bearing_column(self, forward: Floats, right: Floats) -> Floats:
+        """Return the columns (h w) of a cylinder on which points fall; their turns do not count."""
+        k = self._k
+        turn = np.float32(2.0 * math.pi * k.focal)
+        column = np.arctan2(right, forward) * np.float32(k.focal) + np.float32(k.cx)
+        # What is half a pixel left of the first column, on the seam, is in the last one.
+        column -= turn * np.floor((column + np.float32(0.5)) / turn)
+        found: Floats = np.rint(column)
+        return found
 
     def _ground_mm(self, pose: CameraPose) -> Image:
         """Return the depth (h w) [mm] of level ground at the height of the take-off."""

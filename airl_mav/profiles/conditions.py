@@ -78,6 +78,14 @@ class SensorNoise(ProfileModel):
         le=0.9,
         default=0.0,
     )
+    stereo_noise: float = quantity(
+        "disparity noise of a stereo camera (table `camera.stereo` of the vehicle's profile), times"
+        " this; 0: an ideal camera, without its holes and steps, too",
+        "1",
+        ge=0,
+        le=10,
+        default=1.0,
+    )
     depth_dropout: float = quantity(
         "share of pixels without a return, drawn anew each frame", "1", ge=0, le=0.9, default=0.0
     )

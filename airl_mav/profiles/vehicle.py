@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    Strict,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
+from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 
 class Body(ProfileModel):
@@ -156,17 +163,62 @@ class Regression(ProfileModel):
     b9_hover: float = quantity("hover", "W", ge=0, le=100_000)
 
 
-class Camera(ProfileModel):
-    """The forward depth camera."""
+class Stereo(ProfileModel):
+    """How a depth camera matches the images of two imagers; see `camera.stereo`."""
 
+    baseline_m: float = quantity("distance between the imagers", "m", ge=0.01, le=1)
+    focal_px: float = quantity(
+        "focal length of the imagers, at the resolution that is matched", "px", ge=10, le=5000
+    )
+    noise_px: float = quantity("disparity noise, sd of a pixel", "px", ge=0, le=5)
+    step_px: float = quantity("step of the disparity; 0: none", "px", ge=0, le=1)
+    most_px: float = quantity(
+        "greatest disparity that is searched: sets the least depth", "px", ge=1, le=1000
+    )
+
+
+class Camera(ProfileModel):
+    """The depth camera, which looks ahead or all round."""
+
+    projection: Projection = Field(
+        default="pinhole",
+        description="pinhole, or cylindrical for a field of view of up to 360 deg",
+    )
     width_px: int = quantity("image width", "px", ge=8, le=640)
     height_px: int = quantity("image height", "px", ge=6, le=480)
-    horizontal_fov_deg: float = quantity("horizontal field of view", "deg", gt=10, lt=170)
+    horizontal_fov_deg: float = quantity(
+        "horizontal field of view, less than 170 with a pinhole",
+        "deg",
+        gt=10,
+        le=CYLINDER_MOST_DEG,
+    )
     range_m: float = quantity("farthest depth returned", "m", gt=0.5, le=65)
     rate_hz: float = quantity("frames a second", "Hz", ge=1, le=125)
     forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
+    stereo: Stereo | None = Field(
+        default=None, description="how depth is matched; left out: depth without error"
+    )
+
+    @model_validator(mode="after")
+    def _projects(self) -> Camera:
+        check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        if self.stereo is not None and self.projection != "pinhole":
+            raise FieldError(
+                "camera.stereo", self.projection, "left out where the projection is not pinhole"
+            )
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Profiles that say neither projection nor stereo matching keep their digests.
+        data: dict[str, Any] = dump(self)
+        if self.projection == "pinhole":
+            data.pop("projection", None)
+        if self.stereo is None:
+            data.pop("stereo", None)
+        return data
 
     @property
     def period_us(self) -> int:

@@ -116,12 +116,14 @@ def _write_random_network(
         raise FieldError("runtime", request.runtime, "onnx with a random network")
     paper = request.image == PAPER_IMAGE
     width_px, height_px = (int(size) for size in request.image.split("x"))
+    tried = []
     for vehicle in vehicles:
         camera = vehicles[vehicle].camera
         fields = {
             "layout": "paper" if paper else "body",
             "width_px": width_px,
             "height_px": height_px,
+            "projection": camera.projection,
             "horizontal_fov_deg": camera.horizontal_fov_deg,
             "range_m": camera.range_m,
         }
@@ -129,10 +131,9 @@ def _write_random_network(
             spec = validated(ObservationSpec, fields)
         except FieldError as error:
             raise FieldError("image", request.image, problem=error.line(sign=" = ")) from None
-        mismatch = camera_mismatch(spec, Intrinsics.of(camera))
-        if mismatch is None:
-            break
+        tried.append((vehicle, spec, camera_mismatch(spec, Intrinsics.of(camera))))
     # At level bare the observations are made up: any camera will do.
+    vehicle, spec, mismatch = next((each for each in tried if each[2] is None), tried[0])
     if mismatch is not None and request.level != "bare":
         problem = f"vehicle {vehicle}: {mismatch} (or level bare)"
         raise FieldError("image", request.image, problem=problem)

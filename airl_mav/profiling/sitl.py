@@ -39,7 +39,7 @@ class DecisionEstimate(LiveObserver):
 
     def __init__(self, bar: Bar, period_s: float, before: int) -> None:
         """Begin with the decisions of earlier flights; one more is made every period."""
-        super().__init__(Progress(), (), 1)
+        super().__init__(Progress(), Path(), (), 1)
         self._decisions, self._period_us, self._before = bar, period_s * US_PER_S, before
         self._navigating_us: int | None = None
 

@@ -20,16 +20,21 @@ from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.layouts import LayoutName, ObservationSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 
 FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 """How a policy is flown: fields of the request, of a card and of an environment's episodes."""
 
+SEEN = ("layout", "frames", "projection", "horizontal_fov_deg", "range_m")
+"""What a policy sees but for the image's size: fields of the request and of a card."""
+
 DEFAULTS: dict[str, Any] = {
     "layout": "body",
     "image": "32x24",
     "frames": 1,
+    "projection": "pinhole",
     "horizontal_fov_deg": 90.0,
     "range_m": 20.0,
     "actions": "arc-25",
@@ -91,6 +96,9 @@ class ExportRequest(BaseModel):
         default=None,
         description="images that the network sees, of this decision and those before it; by default"
         " as the .zip says, or 1",
+    )
+    projection: Projection | None = Field(
+        default=None, description="the camera's: pinhole or cylindrical; by default pinhole"
     )
     horizontal_fov_deg: float | None = Field(
         default=None, description="horizontal field of view of the camera, deg; by default 90"
@@ -175,7 +183,7 @@ class ExportRequest(BaseModel):
         size = re.fullmatch(r"(\d{1,4})x(\d{1,4})", image)
         if size is None:
             raise FieldError("image", image, "WIDTHxHEIGHT in px, as 32x24")
-        seen = {name: known[name] for name in ("layout", "frames", "horizontal_fov_deg", "range_m")}
+        seen = {name: known[name] for name in SEEN}
         seen |= {"width_px": int(size[1]), "height_px": int(size[2])}
         speed = {"set": known["actions"], "max_speed_m_s": known["max_speed_m_s"]}
         facts = {name: known[name] for name in (*FLOWN, "decisions", "compensate")} | {
@@ -219,6 +227,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "layout": spec.layout,
         "image": f"{spec.image_width_px}x{spec.image_height_px}",
         "frames": spec.frames,
+        "projection": camera.projection,
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "range_m": camera.range_m,
         "actions": spec.actions,

@@ -39,10 +39,18 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
         whose: Whose camera `wanted` is: "vehicle quad".
 
     Raises:
-        FieldError: There is no such camera, or it sees too little of what is wanted.
+        FieldError: There is no such camera, it sees too little of what is wanted, or it is no
+            cylinder where one is wanted.
     """
     if "://" in name:
         return open_camera(name, clock)
+    if wanted.cylindrical:
+        raise FieldError(
+            "camera",
+            name,
+            problem=f"drivers give images of a pinhole, the camera of {whose} is cylindrical;"
+            " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
+        )
     camera = _driver(name)
     fitting = Fitting(camera.lens, wanted)
     try:

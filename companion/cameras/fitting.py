@@ -52,7 +52,7 @@ class Lens:
 
     @classmethod
     def of(cls, k: Intrinsics) -> Lens:
-        """Return the lens of a profile's camera."""
+        """Return the lens of a profile's camera, a pinhole."""
         return cls(k.width, k.height, k.focal, k.focal, k.cx, k.cy)
 
 
@@ -60,7 +60,7 @@ class Fitting:
     """From the images of one camera to those of another that looks the same way."""
 
     def __init__(self, lens: Lens, wanted: Intrinsics) -> None:
-        """Find where each pixel of the wanted camera lies in the images of the lens."""
+        """Find where each pixel of the wanted camera, a pinhole, lies in the images of the lens."""
         self.wanted = wanted
         """What `fit` returns images of."""
         points = math.ceil(max(lens.fx, lens.fy) / wanted.focal)

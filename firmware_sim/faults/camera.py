@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
-from airl_mav.camera.noise import noisy_frame
+from airl_mav.camera.noise import DepthNoise, noisy_frame
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.faults.kinds import NOISE_SEED
@@ -67,7 +67,7 @@ class FailingCamera:
             if kind == "delay":
                 delay_us += round(each.fault.amount * US_PER_S)
             elif kind == "noise":
-                noise = SensorNoise(depth_noise=each.fault.amount)
+                noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 seed = NOISE_SEED * (each.number + 1) + self._seed
                 depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
                 frame = replace(frame, depth_mm=depth)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.noise import is_noisy, noisy_frame
+from airl_mav.camera.noise import noise_of, noisy_frame
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
@@ -39,10 +39,10 @@ class DepthCamera:
             camera: The camera.
             arena: What it sees.
             start_us: When the first frame is due [µs].
-            noise: How noisy its images are; None: not at all.
+            noise: Conditions that its images are taken in; None: the usual ones.
             seed: Of that noise.
         """
-        self._noise = noise if noise is not None and is_noisy(noise) else None
+        self._noise = noise_of(camera, noise or SensorNoise())
         self._seed = seed
         self._intrinsics = Intrinsics.of(camera)
         self._mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)

@@ -20,6 +20,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
+from airl_mav.profiles.vehicle import load_vehicle
 from companion.camera import MESSAGES_PER_LOOK, ZmqFrameSource
 from firmware_sim.plant.camera_server import CameraServer, DepthCamera
 from tests.support.flight_rig import quad
@@ -150,6 +151,28 @@ def test_frame_arrives_whole(transport: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(received.frame.depth_mm, frame(9).depth_mm)
         assert source.latest() is received
         assert source.wait(9, 0.0) is None
+    finally:
+        source.close()
+        server.close()
+
+
+def test_a_panorama_arrives_whole() -> None:
+    """Through ZeroMQ: the image of all sides, and that it is one."""
+    profile = load_vehicle("quad-panorama").camera
+    sent = take(DepthCamera(profile, room(12.0, pillar_at=-6.0)), yaw=0.4)
+    server = CameraServer(LOOPBACK)
+    source = ZmqFrameSource(server.endpoint, SimClock())
+    try:
+        received = None
+        for _ in range(1000):
+            server.publish(sent)
+            if (received := source.wait(-1, 0.02)) is not None:
+                break
+        assert received is not None
+        assert received.frame.intrinsics == sent.intrinsics == Intrinsics.of(profile)
+        np.testing.assert_array_equal(received.frame.depth_mm, sent.depth_mm)
+        assert np.all(sent.depth_mm[19] > 0)  # walls all round, and the pillar behind
+        assert 4_990 <= int(sent.depth_mm[19].min()) <= 5_020
     finally:
         source.close()
         server.close()

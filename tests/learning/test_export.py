@@ -210,6 +210,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
         "layout": "body",
         "height_px": 24,
         "width_px": 32,
+        "projection": "pinhole",
         "horizontal_fov_deg": 90.0,
         "range_m": 20.0,
         "frames": 1,

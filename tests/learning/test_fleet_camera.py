@@ -18,9 +18,11 @@ from airl_mav.envs.cameras import Lens, lens_of, render_images
 from airl_mav.envs.fleet import Fleet, new_fleet
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import load_vehicle
 
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
+PANORAMA = Intrinsics.of(load_vehicle("quad-panorama").camera)
 MOUNT = Mount((0.12, 0.03, -0.02), math.radians(8.0))
 
 
@@ -41,19 +43,24 @@ def scattered(rng: np.random.Generator) -> Fleet:
     return fleet
 
 
-def expected(world: Arena, fleet: Fleet, i: int, range_m: float) -> np.ndarray:
+def expected(
+    world: Arena, fleet: Fleet, i: int, range_m: float, camera: Intrinsics = CAMERA
+) -> np.ndarray:
     pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
     centers = world.centers_at(int(fleet.time_us[i]))
-    return depth_to_z16(render(world, centers, CAMERA, range_m, *pose))
+    return depth_to_z16(render(world, centers, camera, range_m, *pose))
 
 
+@pytest.mark.parametrize("camera", [CAMERA, PANORAMA], ids=["pinhole", "cylindrical"])
 @pytest.mark.parametrize("range_m", [6.0, 20.0, 100.0])
-def test_sees_what_the_rehearsal_s_camera_sees(worlds: list[Arena], range_m: float) -> None:
+def test_sees_what_the_rehearsal_s_camera_sees(
+    worlds: list[Arena], range_m: float, camera: Intrinsics
+) -> None:
     fleet, arenas = scattered(np.random.default_rng(1)), batch_of(worlds)
-    out = np.full((N, 48, 64), 7, np.uint16)
-    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(CAMERA, range_m), out)
+    out = np.full((N, camera.height, camera.width), 7, np.uint16)
+    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(camera, range_m), out)
     for i, world in enumerate(worlds):
-        assert np.array_equal(out[i], expected(world, fleet, i, range_m))
+        assert np.array_equal(out[i], expected(world, fleet, i, range_m, camera))
     assert len(np.unique(out)) > 1000  # it is a picture
 
 

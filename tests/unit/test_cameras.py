@@ -278,3 +278,14 @@ def test_a_camera_that_cannot_be_opened_is_one_line(name: str, told: str, tmp_pa
         open_named_camera(name.format(tmp_path), SimClock(), WANTED, "vehicle quad")
     assert caught.value.field == "camera"
     assert "\n" not in str(caught.value)
+
+
+def test_a_driver_is_refused_where_a_cylinder_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN)
+    wanted = Intrinsics.of(load_vehicle("quad-panorama").camera)
+    told = "drivers give images of a pinhole, the camera of vehicle quad-panorama is cylindrical"
+    with pytest.raises(FieldError, match=told) as caught:
+        open_named_camera(
+            f"{tmp_path}/mine.py:Unplugged", SimClock(), wanted, "vehicle quad-panorama"
+        )
+    assert caught.value.field == "camera"

@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 from airl_mav.camera.frame import LEAST_PX, MAX_MM, MOST_PX, Frame, FrameError, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.profiles.projection import PROJECTIONS
 
 lengths = st.floats(-MOST_PX, MOST_PX)
 focals = st.floats(LEAST_PX, MOST_PX)
@@ -21,7 +22,10 @@ focals = st.floats(LEAST_PX, MOST_PX)
 @st.composite
 def frames(draw: st.DrawFn) -> Frame:
     width, height = draw(st.integers(1, 12)), draw(st.integers(1, 12))
-    k = Intrinsics(width, height, draw(focals), draw(lengths), draw(lengths))
+    projection, focal = draw(st.sampled_from(PROJECTIONS)), draw(focals)
+    if projection == "cylindrical":
+        focal = max(focal, width / (2.0 * math.pi))
+    k = Intrinsics(width, height, focal, draw(lengths), draw(lengths), projection)
     depth = draw(arrays(np.uint16, (height, width)))
     sequence = draw(st.integers(0, 2**64 - 1))
     return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), depth, k)
@@ -44,6 +48,26 @@ def test_wire_layout() -> None:
     assert struct.unpack_from("<QqHH", wire, 4) == (7, 123_456, 3, 2)
     assert struct.unpack_from("<ddd", wire, 24) == (1.5, 1.0, 0.5)
     assert wire[48:] == bytes([1, 0, 0, 1, 255, 255, 0, 0, 2, 0, 3, 0])
+
+
+def test_a_cylinder_says_so_in_its_first_bytes_and_is_laid_out_alike() -> None:
+    depth = np.array([[1, 256, 65535], [0, 2, 3]], np.uint16)
+    pinhole = Frame(7, 123_456, depth, Intrinsics(3, 2, 1.5, 1.0, 0.5)).to_bytes()
+    wire = Frame(7, 123_456, depth, Intrinsics(3, 2, 1.5, 1.0, 0.5, "cylindrical")).to_bytes()
+    assert wire[:4] == b"ADC1"
+    assert wire[4:] == pinhole[4:]
+    assert Frame.from_bytes(wire).intrinsics.projection == "cylindrical"
+    assert Frame.from_bytes(pinhole).intrinsics.projection == "pinhole"
+
+
+@pytest.mark.parametrize("width", [128, 40, 7])
+def test_a_full_turn_is_the_widest_cylinder(width: int) -> None:
+    full = Intrinsics.from_fov(width, 2, 2.0 * math.pi, "cylindrical")
+    pixels = np.zeros((2, width), np.uint16)
+    assert Frame.from_bytes(Frame(0, 0, pixels, full).to_bytes()).intrinsics == full
+    wider = Intrinsics(width, 2, 0.999 * full.focal, full.cx, full.cy, "cylindrical")
+    with pytest.raises(FrameError, match="more than one turn"):
+        Frame.from_bytes(Frame(0, 0, pixels, wider).to_bytes())
 
 
 def test_pixels_that_are_not_contiguous_go_out_in_order() -> None:

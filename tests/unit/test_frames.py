@@ -251,3 +251,24 @@ def test_kernels_agree(a: np.ndarray, b: np.ndarray, v: np.ndarray) -> None:
 def test_small_rotation_vectors(size: float) -> None:
     q = kernels.exponential((0.0, size, 0.0))
     np.testing.assert_allclose(q, [1.0, 0.0, size / 2, 0.0], rtol=1e-12, atol=1e-13)
+
+
+@given(st.floats(-1.5, 1.5), vectors)
+def test_a_camera_looks_ahead_and_up_as_it_is_mounted(pitch_up: float, v: np.ndarray) -> None:
+    q = frames.quat_flu_from_optical(pitch_up)
+    # Optical is right, down, forward. The nose goes up by a negative turn about the left axis.
+    level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    expected = Rotation.from_euler("Y", -pitch_up).apply(level @ v)
+    np.testing.assert_allclose(to_scipy(q).apply(v), expected, atol=1e-9)
+    ahead = to_scipy(q).apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(ahead, [math.cos(pitch_up), 0.0, math.sin(pitch_up)], atol=1e-12)
+
+
+@given(vectors)
+def test_an_attitude_from_a_direction_points_there_and_is_level(v: np.ndarray) -> None:
+    length = np.linalg.norm(v)
+    if length < 1e-6:
+        return
+    turned = to_scipy(frames.quat_from_direction(v))
+    np.testing.assert_allclose(turned.apply([1.0, 0.0, 0.0]), v / length, atol=1e-9)
+    assert turned.apply([0.0, 1.0, 0.0])[2] == pytest.approx(0.0, abs=1e-9)

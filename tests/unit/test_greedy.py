@@ -65,13 +65,14 @@ def look(
     yaw: float = 0.0,
     pitch: float = 0.0,
     roll: float = 0.0,
+    lens: Intrinsics = LENS,
 ) -> Observation:
     """Render what a camera at the centre of mass sees and encode it."""
     q = scalar_first(Rotation.from_euler("ZYX", [yaw, pitch, roll]))
     position = np.array([*at, -ALTITUDE_M])
-    depth = render(scene, scene.obstacles.center, LENS, RANGE_M, position, q)
+    depth = render(scene, scene.obstacles.center, lens, RANGE_M, position, q)
     # Millimetres, as a frame carries them.
-    frame = Frame(0, 0, np.rint(depth * 1000.0).astype(np.uint16), LENS)
+    frame = Frame(0, 0, np.rint(depth * 1000.0).astype(np.uint16), lens)
     return encode(frame, Kinematics(position, np.zeros(3), q), goal)
 
 
@@ -162,6 +163,28 @@ def test_a_box_in_front_is_found_where_it_stands(yaw: float, pitch: float, roll:
     pixel = 7.5 / LENS.focal / math.cos(0.4)
     assert -1.5 - 0.01 <= world[:, 1].min() <= -1.5 + 2 * pixel
     assert 1.5 - 2 * pixel <= world[:, 1].max() <= 1.5 + 0.01
+
+
+@pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (0.3, -0.2)])
+@pytest.mark.parametrize(("north", "east"), [(8.0, 0.0), (-8.0, 0.0), (0.0, 8.0), (-5.0, -5.0)])
+def test_all_round_a_box_is_found_where_it_stands(
+    north: float, east: float, pitch: float, roll: float
+) -> None:
+    lens = Intrinsics.from_fov(128, 40, 2.0 * math.pi, "cylindrical")
+    box = arena((north, east, 1.0, 1.5))
+    points = near_points(look(box, (30.0, 0.0), pitch=pitch, roll=roll, lens=lens), S.band_m)
+    at = np.array([north, east])
+    near = np.all(np.abs(points - at) <= np.array([1.0, 1.5]) + 0.01, axis=1)
+    assert near.all()
+    assert len(points) > 8
+
+
+def test_all_round_a_goal_behind_is_flown_to_at_once() -> None:
+    lens = Intrinsics.from_fov(128, 40, 2.0 * math.pi, "cylindrical")
+    action = GreedyPolicy().act(look(arena(), (-12.0, 1.0), lens=lens))
+    assert abs(course_of(action)) > math.radians(90.0)
+    assert math.hypot(action.forward_m_s, action.right_m_s) > 1.0
+    assert action.yaw_rate_rad_s > 0.0  # and turns to it meanwhile
 
 
 def test_what_is_above_or_below_flight_height_is_left_out() -> None:

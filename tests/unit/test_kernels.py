@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
-from airl_mav.core import cache, kernels
+from airl_mav.core import cache, compiling, kernels
 from tests.support.processes import run_alone
 
 FILES = {
@@ -51,7 +54,7 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
         file = tmp_path / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
-    for module in (cache, kernels):
+    for module in (cache, compiling, kernels):
         shutil.copy(str(module.__file__), tmp_path / "airl_mav/core")
 
     def run() -> list[str]:
@@ -64,3 +67,37 @@ def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -
     # A constant, two imports away from the kernel that it is compiled into.
     (tmp_path / "airl_mav/size.py").write_text("SIZE = 3.0\n", encoding="utf-8")
     assert run() == ["27.0", "4.0", "four"]
+
+
+HEARD = """
+from airl_mav.core.compiling import heard_compiling
+from airl_mav.core.kernels import kernel
+import held
+
+with heard_compiling(lambda begins: print(begins, end=" ")):
+    held.outer(1.0)
+print("done")
+"""
+
+
+def test_who_waits_is_told_of_compiling_and_of_none_from_the_cache(tmp_path: Path) -> None:
+    (tmp_path / "held.py").write_text(
+        "from airl_mav.core.kernels import kernel\n\n"
+        "@kernel\ndef inner(x: float) -> float:\n    return x + 1.0\n\n"
+        "@kernel\ndef outer(x: float) -> float:\n    return 2.0 * inner(x)\n"
+    )
+    root = str(Path(kernels.__file__).parents[2])
+    told = []
+    for _ in range(2):
+        ran = subprocess.run(
+            [sys.executable, "-c", HEARD],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{tmp_path}"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ran.returncode == 0, ran.stderr
+        told.append(ran.stdout.split())
+    # The inner one is part of the outer one's compiling.
+    assert told == [["True", "False", "done"], ["done"]]

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.errors import FieldError
 from airl_mav.envs import encoding
 from airl_mav.policy.layouts import (
     STRIP_ROWS,
@@ -36,6 +37,10 @@ def spec(layout: str = "body", height: int = 24, width: int = 32, **more: Any) -
     return ObservationSpec.model_validate(
         known | {"horizontal_fov_deg": 90.0, "range_m": 20.0} | more
     )
+
+
+def round_lens(width: int, height: int, fov_deg: float = 360.0) -> Intrinsics:
+    return Intrinsics.from_fov(width, height, math.radians(fov_deg), "cylindrical")
 
 
 def lens(width: int, height: int, fov_deg: float = 90.0) -> Intrinsics:
@@ -329,6 +334,17 @@ def test_an_ablated_input_is_zero_and_the_others_are_as_they_were(key: str) -> N
 
 # --- cameras
 
+ROUND: dict[str, Any] = {"projection": "cylindrical", "horizontal_fov_deg": 360.0}
+
+
+def test_only_a_cylinder_sees_all_round() -> None:
+    assert spec(**ROUND).projection == "cylindrical"
+    assert spec().projection == "pinhole"
+    with pytest.raises(FieldError, match=r"horizontal_fov_deg 360.*< 170 deg with .*pinhole"):
+        spec(horizontal_fov_deg=360.0)
+    with pytest.raises(ValidationError, match="pinhole"):
+        spec(projection="fisheye")
+
 
 @pytest.mark.parametrize(
     ("layout", "camera"),
@@ -339,6 +355,8 @@ def test_an_ablated_input_is_zero_and_the_others_are_as_they_were(key: str) -> N
         (spec("paper", 34), lens(32, 24)),
         (spec("paper", 154, 256), lens(256, 144)),
         (spec(horizontal_fov_deg=86.95), lens(64, 48, 87.0)),
+        (spec("body", 20, 64, **ROUND), round_lens(128, 40)),
+        (spec(**(ROUND | {"horizontal_fov_deg": 270.0})), round_lens(64, 48, 270.0)),
     ],
 )
 def test_cameras_that_serve(layout: ObservationSpec, camera: Intrinsics) -> None:
@@ -355,6 +373,9 @@ def test_cameras_that_serve(layout: ObservationSpec, camera: Intrinsics) -> None
         (spec("paper", 34), lens(32, 34), ["32x34", "32x24"]),
         (spec(), lens(64, 48, 89.8), ["89.8 deg", "accepted: 90.0 deg"]),
         (spec(), lens(64, 48, 69.0), ["69.0 deg"]),
+        (spec(), round_lens(64, 48, 90.0), ["cylindrical camera; accepted: pinhole"]),
+        (spec(**ROUND), lens(64, 48), ["pinhole camera; accepted: cylindrical"]),
+        (spec(**ROUND), round_lens(64, 48, 270.0), ["270.0 deg", "accepted: 360.0 deg"]),
     ],
 )
 def test_cameras_that_do_not(layout: ObservationSpec, camera: Intrinsics, words: list[str]) -> None:

@@ -72,3 +72,12 @@ def test_a_policy_without_results_has_none_on_its_page(folder: Path) -> None:
     assert "model-index" not in page
     assert "## Results" not in page
     assert yaml.safe_load(page.split("---\n")[1])["library_name"] == "airl-mav"
+
+
+def test_a_page_says_that_a_camera_sees_all_round() -> None:
+    card = read_card(profiles_dir() / "policies/no-obstacles")
+    assert "| sees | depth image of 32x24 px, 90 deg wide" in model_card(card)
+    around = {"projection": "cylindrical", "horizontal_fov_deg": 360.0}
+    seen = card.observation.model_copy(update=around)
+    page = model_card(card.model_copy(update={"observation": seen}))
+    assert "| sees | cylindrical depth image of 32x24 px, 360 deg wide" in page

@@ -134,16 +134,26 @@ def arena_of(name: str, seed: int) -> Arena:
     return generate(spec, seed, name=name, vehicle_width_m=QUAD.body.width_m)
 
 
-def sight(arena: Arena, north: float, east: float, heading: float, pitch: float = 0.0) -> Sight:
+def sight(
+    arena: Arena,
+    north: float,
+    east: float,
+    heading: float,
+    pitch: float = 0.0,
+    lens: Intrinsics = LENS,
+) -> Sight:
     """Return what a level camera, or one that looks down a little, sees 2.5 m above the ground."""
     position = np.array([north, east, -2.5])
     quaternion = quat_from_euler(0.0, pitch, heading)
     centers = arena.centers_at(0)
-    depth = render(arena, centers, LENS, RANGE_M, position, quaternion)
+    depth = render(arena, centers, lens, RANGE_M, position, quaternion)
     return Sight(depth_to_z16(depth), CameraPose(position, quat_to_matrix(quaternion)))
 
 
 REPROJECTOR = Reprojector(QUAD.camera, LENS)
+
+PANORAMA = load_vehicle("quad-panorama").camera
+ROUND = Intrinsics.of(PANORAMA)
 
 
 def test_from_where_it_was_taken_an_image_is_as_it_is() -> None:
@@ -234,6 +244,41 @@ def test_the_newest_image_decides_and_older_ones_fill_what_it_did_not_see() -> N
     # What is nearer in an older image does not stand before the newest.
     stale = Sight(np.full_like(newest.depth_mm, 500), newest.pose)
     assert np.array_equal(REPROJECTOR.image([newest, stale], newest.pose), newest.depth_mm)
+
+
+def test_all_round_an_image_is_as_it_is_from_where_it_was_taken() -> None:
+    seen = sight(arena_of("static-obstacles", 5), 1.0, -2.0, 0.6, -0.1, ROUND)
+    assert (seen.depth_mm == 0).any()
+    assert np.array_equal(Reprojector(PANORAMA, ROUND).image([seen], seen.pose), seen.depth_mm)
+
+
+@pytest.mark.parametrize("columns", [1, 40, 64, 127])
+def test_all_round_a_turn_shifts_the_image(columns: int) -> None:
+    """What leaves at one end comes in at the other."""
+    arena = arena_of("static-obstacles", 5)
+    here = sight(arena, 1.0, -2.0, 0.6, lens=ROUND)
+    turned = sight(arena, 1.0, -2.0, 0.6 + columns / ROUND.focal, lens=ROUND)
+    found = Reprojector(PANORAMA, ROUND).image([here], turned.pose)
+    np.testing.assert_array_equal(found, np.roll(here.depth_mm, -columns, axis=1))
+
+
+def test_all_round_an_image_is_carried_forward_on_every_side() -> None:
+    """1.2 m ahead and turned: as much of each quarter of the image is right, the rear's, too."""
+    quarters: list[list[np.ndarray]] = [[], [], [], []]
+    for seed in range(8):
+        arena = arena_of("static-obstacles", seed)
+        heading = 2.0 * math.pi * seed / 8
+        before = sight(arena, 0.0, 0.0, heading, lens=ROUND)
+        there = sight(arena, *away(1.2, heading), heading + 0.35, -0.1, ROUND)
+        true = there.depth_mm.astype(float)
+        found = Reprojector(PANORAMA, ROUND).image([before], there.pose).astype(float)
+        right = np.abs(found - true) <= 0.1 * true
+        close = (true > 0) & (true < 500.0 * RANGE_M)
+        for quarter in range(4):
+            part = np.s_[:, 32 * quarter : 32 * quarter + 32]
+            quarters[quarter].append(right[part][close[part]])
+    for each in quarters:
+        assert np.concatenate(each).mean() > 0.7
 
 
 # --- latency

@@ -18,11 +18,18 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
 from airl_mav.profiles.loading import Kind, list_profiles, load_profile, profiles_dir
 from airl_mav.profiles.parameters import SPECS, ParameterSpec, flown_values
-from airl_mav.profiles.vehicle import Momentum, Regression, VehicleProfile
+from airl_mav.profiles.vehicle import (
+    Camera,
+    Momentum,
+    Regression,
+    VehicleProfile,
+    load_vehicle,
+)
 from firmware_sim.autopilot.parameter_store import Parameters
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -627,3 +634,29 @@ def test_a_wrong_power_model_is_refused_by_its_own_fields(
 def test_a_wrong_coefficient_is_refused_by_its_own_range(tmp_path: Path) -> None:
     text = f'base = "quad"\n{OLD_POWER}'.replace("433.9", "-1.0")
     assert refusal(tmp_path, text) == "power.b9_hover = -1: accepted: 0 <= value <= 100000 W"
+
+
+def test_a_camera_that_sees_all_round_is_a_cylinder(tmp_path: Path) -> None:
+    camera = load_vehicle("quad-panorama").camera
+    assert (camera.projection, camera.horizontal_fov_deg) == ("cylindrical", 360.0)
+    assert Intrinsics.of(camera).horizontal_fov_rad == pytest.approx(2.0 * math.pi)
+    # As far up and down as its source says.
+    assert math.degrees(math.atan2(20.0, Intrinsics.of(camera).focal)) == pytest.approx(44.5, 0.01)
+    for projection, fov, accepted in (
+        ("pinhole", 170, "< 170 deg"),
+        ("cylindrical", 361, "<= 360"),
+    ):
+        file = tmp_path / "round.toml"
+        table = f'[camera]\nprojection = "{projection}"\nhorizontal_fov_deg = {fov}.0\n'
+        file.write_text(f'base = "quad"\n{table}')
+        with pytest.raises(UsageError, match=rf"camera.horizontal_fov_deg = {fov}.*{accepted}"):
+            load_vehicle(str(file))
+
+
+def test_a_pinhole_is_written_down_as_it_was_before_there_were_others() -> None:
+    camera = load_vehicle("quad").camera
+    assert camera.projection == "pinhole"
+    assert "projection" not in camera.model_dump()
+    assert Camera.model_validate(camera.model_dump()) == camera
+    round_ = load_vehicle("quad-panorama").camera
+    assert Camera.model_validate_json(round_.model_dump_json()) == round_

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,10 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import (
     ned_to_enu,
     quat_from_euler,
+    quat_multiply,
     quat_to_matrix,
 )
+from airl_mav.profiles.projection import PROJECTIONS, Projection
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 RIGHT_ANGLE = Intrinsics.from_fov(33, 25, math.pi / 2)  # odd: the centre pixel is the optical axis
@@ -90,7 +92,9 @@ class Rays:
     def __init__(self, scene: Scene) -> None:
         k = scene.intrinsics
         v, u = np.mgrid[: k.height, : k.width]
-        camera = np.stack([np.ones(u.shape), (u - k.cx) / k.focal, (v - k.cy) / k.focal], -1)
+        x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
+        ahead, right = (np.cos(x), np.sin(x)) if k.projection == "cylindrical" else (x**0, x)
+        camera = np.stack([ahead, right, y], -1)
         attitude = Rotation.from_quat(np.roll(scene.quaternion, -1)).as_matrix()
         self.d = camera.reshape(-1, 3) @ attitude.T
         self.o = np.array([*scene.position[:2], min(scene.position[2], -MIN_DEPTH_M)])
@@ -208,12 +212,22 @@ def random_scene(rng: np.random.Generator) -> Scene:
     return Scene(bounds, Obstacles(shape, center, half, yaw), position, quaternion, k, max_range)
 
 
+def all_round(scene: Scene, rng: np.random.Generator) -> Scene:
+    """Return a scene seen by a cylinder, every other time one of a full turn."""
+    k = scene.intrinsics
+    fov = 2.0 * math.pi if rng.random() < 0.5 else rng.uniform(0.4, 2.0 * math.pi)
+    return replace(scene, intrinsics=Intrinsics.from_fov(2 * k.width, k.height, fov, "cylindrical"))
+
+
 @pytest.mark.parametrize("seed", range(10))
-def test_agrees_with_brute_force(seed: int) -> None:
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_agrees_with_brute_force(projection: Projection, seed: int) -> None:
     rng = np.random.default_rng(seed)
     returns = escapes = inside = 0
     for number in range(100):
         scene = random_scene(rng)
+        if projection == "cylindrical":
+            scene = all_round(scene, rng)
         depth, expected = scene.render(), brute_force(scene)[0]
         error = float(np.max(np.abs(depth - expected)))
         assert error < 1e-4, f"scene {number}: {error} m, {scene}"
@@ -476,6 +490,7 @@ def test_writes_into_the_image_of_a_batch() -> None:
         k.focal,
         k.cx,
         k.cy,
+        k.cylindrical,
         scene.max_range,
         scene.bounds.as_array(),
         o.shape,
@@ -506,3 +521,85 @@ def test_camera_pose_agrees_with_scipy() -> None:
 def test_mount_pitched_up_looks_up() -> None:
     _, q = camera_pose((0.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), Mount((0.1, 0.0, 0.0), 0.4))
     assert quat_to_matrix(np.array(q))[2, 0] == pytest.approx(-math.sin(0.4))  # down is positive
+
+
+# --- all round -----------------------------------------------------------------------------------
+
+PANORAMA = Intrinsics.from_fov(72, 41, 2.0 * math.pi, "cylindrical")  # 5 degrees a column
+STRAIGHT_AHEAD = 35.5
+"""Column of the optical axis, between two pixels."""
+
+
+def all_round_from(
+    *bodies: Body, quaternion: np.ndarray = LEVEL, intrinsics: Intrinsics = PANORAMA
+) -> np.ndarray:
+    """Render bodies around a camera 2 m above the middle of a room of 40 m."""
+    scene = Scene(
+        Bounds(-20.0, 20.0, -20.0, 20.0, 5.0),
+        obstacles(*bodies),
+        np.array([0.0, 0.0, -2.0]),
+        quaternion,
+        intrinsics,
+        100.0,
+    )
+    return scene.render()
+
+
+@pytest.mark.parametrize("degrees", range(-180, 180, 15))
+def test_a_pillar_is_seen_at_its_bearing(degrees: int) -> None:
+    """Also behind the camera, where it is half at either end of the image."""
+    bearing = math.radians(degrees)
+    center = (8.0 * math.cos(bearing), 8.0 * math.sin(bearing), -2.0)
+    found = all_round_from((Shape.CYLINDER, center, (1.0, 1.0, 1.5), 0.0))
+    empty = all_round_from()
+    changed = np.flatnonzero((found != empty).any(axis=0))
+    angles = np.radians((np.arange(72) - STRAIGHT_AHEAD) * 5.0)
+    off = np.remainder(angles - bearing + math.pi, 2.0 * math.pi) - math.pi
+    half = math.asin(1.0 / 8.0)  # of a circle of 1 m, 8 m away
+    np.testing.assert_array_equal(changed, np.flatnonzero(np.abs(off) < half))
+    # The near side of a circle along a ray; depth is that in the horizontal plane.
+    near = 8.0 * np.cos(off[changed]) - np.sqrt(1.0 - (8.0 * np.sin(off[changed])) ** 2)
+    np.testing.assert_allclose(found[20, changed], near, atol=1e-5)
+
+
+def test_the_seam_is_where_the_image_s_ends_meet() -> None:
+    """A turn of a column to the right moves the image by one, and what leaves comes in again."""
+    bodies = [
+        (Shape.BOX, (-9.0, 0.3, -1.5), (0.7, 1.8, 1.5), 0.4),
+        (Shape.SPHERE, (4.0, 5.0, -2.5), (1.2, 1.2, 1.2), 0.0),
+        (Shape.CYLINDER, (-3.0, -2.5, -1.0), (0.5, 0.5, 1.0), 0.0),
+    ]
+    straight = all_round_from(*bodies)
+    for columns in (1, 20, 36, 71):
+        turned = quat_from_euler(0.0, 0.0, math.radians(5.0 * columns))
+        seen = all_round_from(*bodies, quaternion=turned)
+        np.testing.assert_allclose(seen, np.roll(straight, -columns, axis=1), atol=1e-4)
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.3, -0.2), (-0.5, 0.6)])
+def test_along_the_same_directions_a_cylinder_sees_what_a_pinhole_sees(
+    tilt: tuple[float, float],
+) -> None:
+    """The two models are of one arena: turned to a column, a pinhole's middle one is the same."""
+    scene = random_scene(np.random.default_rng(11))
+    body = quat_from_euler(*tilt, 0.7)
+    center = np.array([0.0, 0.0, -2.0])
+    k = PANORAMA
+    pinhole = Intrinsics(1, k.height, k.focal, 0.0, k.cy)
+    scene = replace(scene, position=center, max_range=60.0)
+    image = replace(scene, quaternion=body, intrinsics=k).render()
+    returns = 0
+    for column in range(k.width):
+        turn = quat_from_euler(0.0, 0.0, (column - k.cx) / k.focal)
+        there = replace(scene, quaternion=quat_multiply(body, turn), intrinsics=pinhole).render()
+        np.testing.assert_allclose(image[:, [column]], there, rtol=1e-5, atol=1e-5)
+        returns += int(np.count_nonzero(there))
+    assert returns > 500
+
+
+def test_a_body_above_or_below_is_seen_by_all_columns() -> None:
+    overhead = all_round_from((Shape.BOX, (0.0, 0.0, -6.0), (8.0, 8.0, 0.5), 0.3))
+    # The lowest corner-free circle: its lower face 3.5 m above, cut by the rows that reach it.
+    slope = -(np.arange(41) - 20.0) / PANORAMA.focal
+    for row in np.flatnonzero(slope > 3.5 / 8.0):
+        np.testing.assert_allclose(overhead[row], 3.5 / slope[row], rtol=1e-5)

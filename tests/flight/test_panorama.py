@@ -1,0 +1,88 @@
+"""A vehicle that sees all round, in lockstep: what its companion gets is what the twin renders."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import Mount
+from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.cameras import lens_of, render_images
+from airl_mav.envs.evaluation import SinglePilots, fly_seeds
+from airl_mav.envs.fleet import Verdict, new_fleet
+from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.spec import spec_of
+from airl_mav.lockstep.flight import fly
+from airl_mav.policy.actions import Action
+from airl_mav.policy.greedy import GreedyPolicy
+from airl_mav.policy.observation import Observation
+from firmware_sim.plant.camera_server import DepthCamera
+from tests.support.lockstep_kit import demo_scenario
+
+SEED = 3
+
+
+class Watching:
+    """The reactive policy, and what it was shown."""
+
+    def __init__(self, seen: list[Observation]) -> None:
+        self._policy, self._seen = GreedyPolicy(), seen
+
+    def act(self, observation: Observation) -> Action:
+        self._seen.append(observation)
+        return self._policy.act(observation)
+
+
+def test_the_companion_gets_the_images_that_the_twin_renders(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    real = DepthCamera.capture
+
+    def capture(
+        self: DepthCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
+    ) -> Frame:
+        poses[time_us] = np.array(position), np.array(quaternion)
+        return real(self, time_us, position, quaternion)
+
+    monkeypatch.setattr(DepthCamera, "capture", capture)
+    scenario = demo_scenario(
+        vehicle="quad-panorama", arena="dynamic-obstacles", policy="greedy", time_limit_s=20.0
+    )
+    seen: list[Observation] = []
+    flown = fly(scenario, Watching(seen), 0, SEED)
+    captures = flown.latency["capture_us"]
+    assert len(seen) == len(captures) > 5
+    camera = scenario.vehicle.camera
+    lens = Intrinsics.of(camera)
+    assert all(each.intrinsics == lens for each in seen)
+    arena = scenario.arena_of(SEED)
+    mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
+    fleet, arenas = new_fleet(1), batch_of([arena])
+    twin = np.zeros((1, camera.height_px, camera.width_px), np.uint16)
+    for each, capture_us in zip(seen, captures.tolist(), strict=True):
+        fleet.position[0], fleet.quaternion[0] = poses[capture_us]
+        fleet.time_us[0] = capture_us - flown.record.started_us
+        render_images(
+            fleet, arenas, np.ones(1, np.bool_), mount, lens_of(lens, camera.range_m), twin
+        )
+        assert each.depth_mm.tobytes() == twin[0].tobytes()
+    # It is a picture, of all sides, and another one each time.
+    assert len(np.unique(twin)) > 500
+    assert np.all((twin[0, :, :] > 0).any(axis=0))
+    assert len({each.depth_mm.tobytes() for each in seen}) == len(seen)
+
+
+@pytest.mark.parametrize("compensate", [False, True])
+def test_the_twin_flies_it_too(*, compensate: bool) -> None:
+    """Compensated it sees each image carried forward: also that of what lies behind."""
+    spec = {"vehicle": "quad-panorama", "arena": "no-obstacles", "compensate": compensate}
+    spec |= {"image_width_px": 64, "image_height_px": 20}
+    navigation = Navigation(spec_of(None, spec), 1)
+    assert navigation.observation.projection == "cylindrical"
+    ((_, flown),) = fly_seeds(navigation, SinglePilots(GreedyPolicy, 5.0), [SEED])
+    assert flown.verdict == Verdict.SUCCESS
