@@ -335,7 +335,8 @@ class CameraLimits:
 def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -> bool:
     """Return whether a camera must see the ground, taken to be as high as the start.
 
-    It must where the ray through the middle of the bottom row meets it within `GROUND_M`.
+    It must where the ray through the middle of the bottom row meets it within `GROUND_M`. Ahead, a
+    cylinder's rows lie as a pinhole's do.
     """
     lens = frame.intrinsics
     w, x, y, z = state.quaternion

@@ -7,17 +7,19 @@ this process hangs; `watchdog.py` is there for that.
 
 from __future__ import annotations
 
+import json
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from mavsdk import ComponentType
 from mavsdk.plugins.action import Action, ActionError
+from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
-from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError
+from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
@@ -88,6 +90,7 @@ class MavsdkLink:
         self._action: Any = None
         self._offboard: Any = None
         self._texts: Any = None
+        self._direct: Any = None
         self.dialect: Dialect = PX4
         """Dialect of the flight controller; PX4's before `connect`."""
         self._asked = False
@@ -143,7 +146,7 @@ class MavsdkLink:
                     break
                 except TelemetryError as error:
                     if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
-                        raise LinkError(f"telemetry failed: {_reason(error)}") from None
+                        raise LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
@@ -183,10 +186,11 @@ class MavsdkLink:
         self._mavsdk.destroy()
 
     def _release_plugins(self) -> None:
-        for plugin in (self._texts, self._offboard, self._action, self._telemetry):
+        own = self._direct, self._texts, self._offboard, self._action, self._telemetry
+        for plugin in own:
             if plugin is not None:
                 plugin.destroy()
-        self._texts = self._offboard = self._action = self._telemetry = None
+        self._direct = self._texts = self._offboard = self._action = self._telemetry = None
 
     @property
     def connected(self) -> bool:
@@ -316,6 +320,22 @@ class MavsdkLink:
             self._texts = ServerUtility(self._system)
         self._texts.send_status_text(StatusTextType.INFO, text[:TEXT_CHARACTERS])
 
+    def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
+        """Send a MAVLink message by its name and fields; return whether it was sent."""
+        if self._direct is None:
+            self._direct = MavlinkDirect(self._system)
+        try:
+            self._direct.send_message(MavlinkMessage(name, fields_json=json.dumps(dict(fields))))
+        except MavlinkDirectError:
+            return False
+        return True
+
+    def _hear_messages(self, name: str, heard: Callable[[Any, Any], None]) -> None:
+        """Call with every message of that name, from a thread of MAVSDK's."""
+        if self._direct is None:
+            self._direct = MavlinkDirect(self._system)
+        self._direct.subscribe_message(name, heard)
+
     def set_velocity_body(self, setpoint: BodyVelocity) -> None:
         """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
         self.setpoints_sent += 1
@@ -374,6 +394,16 @@ class MavsdkLink:
 def _known(value: float) -> float | None:
     """Return what MAVSDK tells, or None for its NaN."""
     return float(value) if math.isfinite(value) else None
+
+
+def _refusal(error: TelemetryError) -> str:
+    """Say why a stream was not granted."""
+    if error.args[0] != TelemetryResult.TIMEOUT:
+        return _reason(error)
+    return (
+        "the flight controller is heard, but answers nothing: it wants signed messages"
+        " (--signing-key), or hears nothing"
+    )
 
 
 def _reason(error: Exception) -> str:

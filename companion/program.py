@@ -33,6 +33,7 @@ from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
+from companion.presence import present
 from companion.signing_proxy import signed
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def fly_alone(
         waiting()
         link.connect(asked.connect_timeout, stop)
         check_camera(mission.policy, frames, stop, mission.compensator)
-        with recorded(asked, mission, link, clock) as box:
+        with present(link, clock), recorded(asked, mission, link, clock) as box:
             result = fly_mission(
                 *(link, frames, mission.policy, mission.goal, clock, stop, abandon, begin),
                 pilot_settings=mission.pilot,

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
-from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.clock_offset import Exchanges
 from companion.mavsdk_link import MavsdkLink
+from companion.periodic import every
 
 MESSAGE = "TIMESYNC"
 
@@ -31,7 +30,6 @@ LAST_ANSWER_S = 0.2
 class TimesyncLink(MavsdkLink):
     """A link that also exchanges TIMESYNC with the flight controller."""
 
-    _direct: Any = None
     _system_id: int
     _pending: set[int]
     """Times at which the unanswered requests were sent [µs]."""
@@ -42,14 +40,7 @@ class TimesyncLink(MavsdkLink):
         super().connect(timeout_s, stop)
         self._pending, self._answered = set(), []
         self._system_id = self._system.get_system_id()
-        self._direct = MavlinkDirect(self._system)
-        self._direct.subscribe_message(MESSAGE, self._hear)
-
-    def close(self) -> None:
-        """Release MAVSDK."""
-        if self._direct is not None:
-            self._direct.destroy()
-        super().close()
+        self._hear_messages(MESSAGE, self._hear)
 
     def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
         """Send so many requests, one per interval [s], and wait for the answers.
@@ -65,26 +56,9 @@ class TimesyncLink(MavsdkLink):
             self._clock.sleep_until(asked_us, stop)
         self._clock.sleep_until(self._clock.time_us() + int(LAST_ANSWER_S * US_PER_S), stop)
 
-    @contextmanager
-    def exchanging(self, interval_s: float) -> Iterator[None]:
+    def exchanging(self, interval_s: float) -> AbstractContextManager[None]:
         """Send requests at an interval [s] from a thread, for as long as the context lasts."""
-        ended = threading.Event()
-
-        def ask_on() -> None:
-            due_us = self._clock.time_us()
-            while not ended.is_set():
-                self._ask()
-                # What was missed while the thread was held up is not made up for in a burst.
-                due_us = max(due_us + int(interval_s * US_PER_S), self._clock.time_us())
-                self._clock.sleep_until(due_us, ended)
-
-        thread = threading.Thread(target=ask_on, name="timesync", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
+        return every(int(interval_s * US_PER_S), self._ask, self._clock, "timesync")
 
     def take_exchanges(self) -> Exchanges:
         """Return the answered requests since the last call, in the order of the answers."""
@@ -96,11 +70,8 @@ class TimesyncLink(MavsdkLink):
 
     def _ask(self) -> None:
         sent_us = self._clock.time_us()
-        fields = {"tc1": 0, "ts1": sent_us * NS_PER_US}
         self._pending.add(sent_us)
-        try:
-            self._direct.send_message(MavlinkMessage(MESSAGE, fields_json=json.dumps(fields)))
-        except MavlinkDirectError:
+        if not self.send_message(MESSAGE, {"tc1": 0, "ts1": sent_us * NS_PER_US}):
             # Treated as lost.
             self._pending.discard(sent_us)
 

@@ -15,13 +15,17 @@ from companion.conducted import Abandoned
 from companion.ground_check import check_on_ground
 from companion.interfaces import LinkError
 from companion.program import Mission, fly_alone, prepare
+from companion.systemd import service
 
 
 class CompanionOptions(StandAloneCompanion):
     """Fly a policy from take-off to a goal, through MAVSDK.
 
+    A first word that ends in .toml is a file of options, which those of the command line override.
+
     Examples:
         airl-companion --goal 20 5
+        airl-companion companion.toml --goal 20 5
         airl-companion --connect serial:///dev/ttyAMA0:921600 --camera tcp://192.168.1.10:5600
         airl-companion --check --camera realsense --policy policies/mine
         airl-companion --lockstep --goal 20 5     (with airl-firmware --lockstep)
@@ -52,19 +56,23 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
     def waiting() -> None:
         console.print(f"waiting for a {what} on {options.connect}", markup=False)
+        manager.tell(READY="1", STATUS=f"waiting for a {what} on {options.connect}")
 
     def progress(phase: str, time_us: int) -> None:
         console.print(f"{time_us / 1e6:8.2f} s  {phase}")
+        manager.tell(STATUS=phase)
 
     sha256: dict[str, str] = {}
     try:
-        if options.lockstep:
-            # Imported here: a companion on a drone needs nothing of it.
-            from airl_mav.lockstep.token_companion import fly_in_lockstep
+        with service() as manager:
+            if options.lockstep:
+                # Imported here: a companion on a drone needs nothing of it.
+                from airl_mav.lockstep.token_companion import fly_in_lockstep
 
-            result, sha256 = fly_in_lockstep(options, mission, stop, abandon, waiting, progress)
-        else:
-            result = fly_alone(options, mission, stop, abandon, waiting, progress)
+                result, sha256 = fly_in_lockstep(options, mission, stop, abandon, waiting, progress)
+            else:
+                result = fly_alone(options, mission, stop, abandon, waiting, progress)
+            manager.tell(STATUS=result.reason)
     except (LinkError, Abandoned) as error:
         console.print(f"error: {error}", style="red", markup=False)
         return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
@@ -238,3 +239,11 @@ def test_the_program_tells_the_ground_station_and_waits_for_the_switch(tmp_path:
                 assert program.wait(120.0) == 0, program.text()
             wait_until(lambda: ground.heard("airl: goal reached"), "the last text")
             assert ground.armed
+            computer = ground.latest["ONBOARD_COMPUTER_STATUS"]
+            told = [load for load in computer.cpu_cores if load != 255]
+            assert len(told) == min(8, psutil.cpu_count())
+            assert max(told) <= 100
+            assert computer.ram_total == psutil.virtual_memory().total // 2**20
+            assert 0 < computer.ram_usage < computer.ram_total
+            # MAVSDK's component of a companion computer.
+            assert computer.get_srcComponent() == dialect.MAV_COMP_ID_PATHPLANNER

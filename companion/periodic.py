@@ -1,0 +1,39 @@
+"""A thread that does something again and again, for as long as a context lasts."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from airl_mav.core.clock import Clock
+
+
+@contextmanager
+def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) -> Iterator[None]:
+    """Call `act` from a thread of that name, at once and then once a period.
+
+    What was missed while the thread was held up is not made up for in a burst.
+
+    Args:
+        period_us: Time from one call to the next [µs].
+        act: Called from the thread; must not raise.
+        clock: Whose time that is.
+        name: Of the thread.
+    """
+    ended = threading.Event()
+
+    def go_on() -> None:
+        due_us = clock.time_us()
+        while not ended.is_set():
+            act()
+            due_us = max(due_us + period_us, clock.time_us())
+            clock.sleep_until(due_us, ended)
+
+    thread = threading.Thread(target=go_on, name=name, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
