@@ -58,5 +58,5 @@ def run(options: DegradeOptions, console: Console | None = None) -> int:
     experiment = declare_degradation(
         scenario, options.latencies, options.policies, compensated=options.compensated
     )
-    code, _ = fly_and_show(experiment, options.out, console or Console(), options)
+    code, _ = fly_and_show(experiment, options.out, console, options, options)
     return code

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,14 +12,15 @@ from rich.console import Console
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, RENAMED, scenario_of
+from airl_mav.cli.telling import Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.errors import FieldError
-from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
 from airl_mav.experiments.experiment import known_seeds
 from airl_mav.experiments.fly import fly_scenario, run_name
-from airl_mav.experiments.live import EXIT_CODES, fly_live
+from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.flight.record import run_sha256
+from airl_mav.flight.requirements import Requirement
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_report import show_report, verdict_of
 
@@ -73,7 +75,7 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
     Exit status: 0 all episodes flown, 1 processes or workers were lost, 3 to 5 as of the verdict,
     130 Ctrl-C.
     """
-    console = console or Console()
+    voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     each_fault = options.each_fault
     cells = evaluation_cells(scenario, options.policies, options.arena, each_fault=each_fault)
@@ -88,34 +90,46 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
         check_plain(cells)
     if len(cells) > 1:
         experiment = matrix(scenario, options.policies, options.arena, each_fault=each_fault)
-        code, flown = fly_and_show(experiment, options.out, console, options)
-        for run in flown.cells if options.on_card else ():
+        code, compared = fly_and_show(experiment, options.out, console, options, options)
+        for run in compared.cells if options.on_card else ():
             if run.complete:
                 write_on_card(run.cell, run.episodes)
         return code
     (cell,) = cells
     requirements = requirements_of(options, reference=False)
-    with RichProgress(console) as progress:
+    with voice:
+        progress = voice.progress
         for warning in known_seeds(cells):
             progress.note(warning, "yellow")
         if view is None:
-            run_ = fly_scenario(cell.scenario, options.out, progress)
+            flown = fly_scenario(cell.scenario, options.out, progress)
         else:
             # One flight after the other, in the order in which they are watched.
             name = run_name(cell.scenario)
-            run_ = fly_live(cell.scenario, options.out, progress, name=name, view=view)
-    if options.on_card and run_.ended == "complete":
-        write_on_card(cell, run_.episodes)
-    code = EXIT_CODES[run_.ended]
-    if run_.episodes:
-        loaded = load(run_.path)
-        verdict = verdict_of(loaded, requirements)
-        show_report(loaded, verdict, console)
-        if run_.ended == "complete":
-            leave(options, verdict, "airl evaluate")
-            code = verdict.exit_code
-    else:
-        console.print(f"no episode was finished; {run_.path}", soft_wrap=True)
-    if run_.ended == "complete" and (sha256 := run_sha256(run_.episodes)) is not None:
-        console.print(f"sha256 of the flights  {sha256}", soft_wrap=True, highlight=False)
+            flown = fly_live(cell.scenario, options.out, progress, name=name, view=view)
+        if options.on_card and flown.ended == "complete":
+            write_on_card(cell, flown.episodes)
+        return _show(flown, options, requirements, voice)
+
+
+def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
+    """Print the tables and write the report of one run; return the exit status."""
+    code = EXIT_CODES[flown.ended]
+    if not flown.episodes:
+        voice.console.print(f"no episode was finished; {flown.path}", soft_wrap=True)
+        voice.finish(code, flown.ended, flown.path)
+        return code
+    loaded = load(flown.path)
+    verdict = verdict_of(loaded, requirements)
+    page = show_report(loaded, verdict, voice.console, voice.progress)
+    more: list[str] = []
+    if flown.ended == "complete":
+        leave(gate, verdict, "airl evaluate")
+        code = verdict.exit_code
+        if (sha256 := run_sha256(flown.episodes)) is not None:
+            more = [f"sha256 of the flights  {sha256}"]
+    for line in more:
+        voice.console.print(line, soft_wrap=True, highlight=False)
+    runs = {flown.path.name: loaded}
+    voice.finish(code, flown.ended, flown.path, verdict=verdict, page=page, runs=runs, more=more)
     return code

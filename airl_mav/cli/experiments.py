@@ -9,8 +9,9 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.gate import Gate, leave, requirements_of
+from airl_mav.cli.telling import Telling, Voice
 from airl_mav.core.fields import quantity
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.experiment import Experiment, ExperimentRun, run_experiment
 from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE
 from airl_mav.experiments.live import EXIT_CODES
@@ -20,6 +21,10 @@ from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import GREATEST_EPISODES, Decisions, Flights, Lateness, LevelName
 
 NOTHING_REQUIRED = Gate()
+FOR_PEOPLE = Telling()
+
+COMMANDS = {"matrix": "airl evaluate", "degradation": "airl degrade"}
+"""Kinds of comparisons whose commands are not called as they are."""
 
 
 def episodes(description: str, default: int, least: int = 1) -> Any:
@@ -27,7 +32,7 @@ def episodes(description: str, default: int, least: int = 1) -> Any:
     return quantity(description, "1", ge=least, le=GREATEST_EPISODES, default=default)
 
 
-class ExperimentOptions(Flights, Lateness, Decisions, Aircraft):
+class ExperimentOptions(Telling, Flights, Lateness, Decisions, Aircraft):
     """What all of them can be asked for; the level is that of the most flights a second."""
 
     level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
@@ -54,9 +59,20 @@ class OnboardOptions(Gate, ExperimentOptions):
 
 
 def fly_and_show(
-    experiment: Experiment, out: Path | None, console: Console, gate: Gate = NOTHING_REQUIRED
+    experiment: Experiment,
+    out: Path | None,
+    console: Console | None,
+    gate: Gate = NOTHING_REQUIRED,
+    telling: Telling = FOR_PEOPLE,
 ) -> tuple[int, ExperimentRun]:
     """Fly what is left of an experiment and show the comparison of what is there.
+
+    Args:
+        experiment: What is flown.
+        out: Its folder; None: a new one.
+        console: Where it is shown; None: standard output.
+        gate: What is required.
+        telling: For whom it is shown.
 
     Returns:
         Exit status, 0 all episodes flown, 1 processes or workers were lost, 3 to 5 as of the
@@ -65,15 +81,21 @@ def fly_and_show(
     Raises:
         UsageError: The input cannot be used.
     """
+    voice = Voice(telling, COMMANDS.get(experiment.kind, f"airl {experiment.kind}"), console)
     requirements = requirements_of(gate)
-    with RichProgress(console) as progress:
-        flown = run_experiment(experiment, out, progress)
-    code = EXIT_CODES[flown.ended]
-    if len(flown.cells) > 1 or flown.ended == "complete":
+    with voice:
+        flown = run_experiment(experiment, out, voice.progress)
+        code = EXIT_CODES[flown.ended]
+        if len(flown.cells) < 2 and flown.ended != "complete":
+            voice.finish(code, flown.ended, flown.path)
+            return code, flown
+        voice.progress.status(DRAWING)
         comparison, loaded, page = flown.compare(requirements)
-        print_comparison(comparison, loaded, console, page)
+        voice.progress.status(None)
+        print_comparison(comparison, loaded, voice.console, page)
+        verdict = load_verdict(flown.path)
         if flown.ended == "complete":
-            verdict = load_verdict(flown.path)
             leave(gate, verdict, f"airl {experiment.kind}")
             code = verdict.exit_code
+        voice.finish(code, flown.ended, flown.path, verdict=verdict, page=page, runs=loaded)
     return code, flown

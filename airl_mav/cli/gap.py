@@ -9,8 +9,8 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import OnboardOptions, episodes, fly_and_show
 from airl_mav.cli.options import scenario_of
-from airl_mav.experiments.gap import DEFAULT_MITIGATED, declare_gap
-from airl_mav.scenario.model import DEFAULT_ARENA, DEFAULT_POLICY
+from airl_mav.experiments.gap import DEFAULT_MITIGATED, DEFAULT_UNMITIGATED, declare_gap
+from airl_mav.scenario.model import DEFAULT_ARENA
 
 
 class GapOptions(OnboardOptions):
@@ -28,7 +28,7 @@ class GapOptions(OnboardOptions):
     """
 
     policy: str = Field(
-        default=DEFAULT_POLICY,
+        default=DEFAULT_UNMITIGATED,
         description="policy without mitigation: a name, or a path to a folder with policy.onnx and"
         " card.json",
     )
@@ -62,5 +62,5 @@ def run(options: GapOptions, console: Console | None = None) -> int:
         reference_workload=options.reference_workload,
         arenas=options.arena,
     )
-    code, _ = fly_and_show(experiment, options.out, console or Console(), options)
+    code, _ = fly_and_show(experiment, options.out, console, options, options)
     return code

@@ -65,5 +65,5 @@ def run(options: LadderOptions, console: Console | None = None) -> int:
     experiment = declare_ladder(
         scenario_of(options, arena=arena), options.levels, sitl_episodes=options.sitl_episodes
     )
-    code, _ = fly_and_show(experiment, options.out, console or Console())
+    code, _ = fly_and_show(experiment, options.out, console, telling=options)
     return code

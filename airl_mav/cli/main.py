@@ -32,6 +32,7 @@ SUBCOMMANDS: dict[str, str] = {
     "export": "turn a stable-baselines3 model into a policy folder",
     "sweep": "train and evaluate many networks: the architecture search",
     "view": "replay the flights of a run in a browser",
+    "export-log": "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
     "report": "a run's tables and page again, or a comparison of several runs",
     "refly": "rehearse a flight that was recorded, and compare the two",
     "arena": "look at an arena, or at what its profile draws",
@@ -41,7 +42,7 @@ SUBCOMMANDS: dict[str, str] = {
 }
 """Subcommands, and what each is for; module `airl_mav.cli.<name>`."""
 
-MODULES = {"list": "airl_mav.cli.listing"}
+MODULES = {"export-log": "airl_mav.cli.export_log", "list": "airl_mav.cli.listing"}
 """Where a subcommand's module is not called as the subcommand is."""
 
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import Annotated, Any, NoReturn, TypeVar, get_args
 
 import tyro
 from pydantic import BaseModel
@@ -49,6 +49,9 @@ REPEATED = "repeated"
 PREFIXED = ("limits", "payload", "sensors", "spread", "wind")
 """Tables whose options carry the table's name; those of the others are unique by themselves."""
 
+CALLED = {"json_lines": "json"}
+"""Fields whose option has another name: pydantic's models have their own `json`."""
+
 SINGULAR = {"faults": "fault"}
 """Lists whose option, given once for each item, is called by one of them."""
 
@@ -74,7 +77,8 @@ def read_options(
 ) -> Options:
     """Read a command line into its model.
 
-    A first word that ends in .toml is a scenario file: its values are the defaults of the options.
+    A first word that ends in .toml is a file of options, as a scenario is one: its values are their
+    defaults.
 
     Args:
         model: What the command can be asked for; its docstring is the help.
@@ -160,7 +164,7 @@ def option_of(field: str) -> str:
     listed, _, _ = field.partition(".")
     if listed in SINGULAR:
         return f"--{SINGULAR[listed]}"
-    full = f"{table}.{name}" if table in PREFIXED else name
+    full = f"{table}.{name}" if table in PREFIXED else CALLED.get(name, name)
     return "--" + full.replace("_", "-")
 
 
@@ -224,7 +228,7 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
             kind = inner if prefix else Annotated[(inner, tyro.conf.OmitArgPrefixes)]
             fields.append((name, kind, dataclasses.field(default_factory=inner)))
             continue
-        marks: list[Any] = [tyro.conf.arg(help=_help(field))]
+        marks: list[Any] = [tyro.conf.arg(help=_help(field), name=CALLED.get(name))]
         if POSITIONAL in field.metadata:
             marks = [
                 tyro.conf.Positional,
@@ -248,6 +252,8 @@ def _arguments(model: type[BaseModel], held: Mapping[str, Any]) -> type[Any]:
 def _default(field: FieldInfo, held: Any) -> Any:
     """Return what an option is when it is not given: as the file says, else as the model says."""
     if held is not None:
+        if isinstance(held, str) and Path in (field.annotation, *get_args(field.annotation)):
+            return Path(held)
         return tuple(held) if isinstance(held, list) else held
     return tyro.MISSING if field.is_required() else field.get_default(call_default_factory=True)
 
@@ -344,6 +350,7 @@ def _fail(message: str) -> None:
 
 EXTRAS = {
     "black-box": ("mcap",),
+    "export": ("foxglove", "mcap"),
     "profile": ("onnx",),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),

@@ -12,9 +12,10 @@ from rich.console import Console
 
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import RENAMED, run_command, scenario_of
+from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.core.progress import RichProgress
+from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
 
 
-class SitlOptions(Gate, Viewing, Scenario):
+class SitlOptions(Gate, Viewing, Telling, Scenario):
     """Rehearse a policy: firmware and companion as two processes, seeded episodes, a report.
 
     A first word that ends in .toml is a scenario file, whose values the options override; a run
@@ -56,38 +57,46 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     Exit status: 0 all episodes flown, 1 an episode was lost too often, 3 to 5 as of the verdict,
     130 Ctrl-C.
     """
-    console = console or Console()
+    voice = Voice(options, "airl-sitl", console)
     requirements = requirements_of(options, reference=False)
     view = view_of(options)
     scenario = resolve(scenario_of(options))
-    with RichProgress(console) as progress:
+    with voice:
         flown = fly_live(
             scenario,
             options.out,
-            progress,
-            announce=partial(_announce, scenario, console),
+            voice.progress,
+            announce=partial(_announce, scenario, voice.console),
             view=view,
         )
-    judged = conclude(flown, options, requirements, console)
+        judged = conclude(flown, options, requirements, voice)
     return EXIT_CODES[flown.ended] or judged
 
 
-def conclude(
-    flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], console: Console
-) -> int:
+def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
     """Print the tables and write the report of what was flown; return the verdict's exit status."""
     if not flown.episodes:
-        _say(console, f"no episode was finished; logs in {flown.path}")
+        _say(voice.console, f"no episode was finished; logs in {flown.path}")
+        voice.finish(EXIT_CODES[flown.ended], flown.ended, flown.path)
         return 0
+    voice.progress.status(DRAWING)
     # Imported here: the figures take seconds to load, which no flight has to wait for.
     from airl_mav.rehearsal.run_folder import load
     from airl_mav.report.run_report import show_report, verdict_of
 
     run = load(flown.path)
     verdict = verdict_of(run, requirements)
-    show_report(run, verdict, console)
+    page = show_report(run, verdict, voice.console, voice.progress)
     if flown.ended == "complete":
         leave(gate, verdict, "airl-sitl")
+    voice.finish(
+        EXIT_CODES[flown.ended] or verdict.exit_code,
+        flown.ended,
+        flown.path,
+        verdict=verdict,
+        page=page,
+        runs={flown.path.name: run},
+    )
     return verdict.exit_code
 
 

@@ -12,13 +12,14 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.cli.telling import Telling, Voice
+from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED
-from airl_mav.core.progress import RichProgress
-from airl_mav.training.progress import TrainingBar
+from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
 
 
-class TrainOptions(TrainRequest):
+class TrainOptions(Telling, TrainRequest):
     """Train a policy; the best weights are exported as policy.onnx with their card.
 
     Examples:
@@ -47,8 +48,8 @@ def run(
     """
     from airl_mav.envs.delay import injections_of, speed_bound
 
-    console = console or Console()
-    show = partial(console.print, soft_wrap=True, highlight=False)
+    voice = Voice(options, "airl train", console)
+    show = partial(voice.console.print, soft_wrap=True, highlight=False)
     config = options.configured()
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -63,22 +64,28 @@ def run(
         show(f"speed      {bound.describe()}")
     show(f"folder     {out}")
     show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
-    try:
-        with RichProgress(console) as progress:
-            result = train(
-                config,
-                out,
-                name=options.name or stem,
-                resume=options.resume,
-                progress=TrainingBar(progress, config.steps),
-                command=command_line or shlex.join(["airl", *sys.argv[1:]]),
-            )
-    except KeyboardInterrupt:
-        show(f"interrupted: airl train {options.config} --out {out} --resume continues")
-        return EXIT_INTERRUPTED
-    best, policy = result.best, result.folder.policy
-    rate = f"{best.success_rate:.1%} of {best.episodes} selection episodes"
-    show(f"best       {rate} after {best.steps:,} decisions")
-    show(f"policy     {policy}")
-    show(f"fly it     airl-sitl --policy {policy}")
+    with voice:
+        progress = voice.progress
+        try:
+            with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
+                result = train(
+                    config,
+                    out,
+                    name=options.name or stem,
+                    resume=options.resume,
+                    progress=TrainingBar(progress, config.steps),
+                    command=command_line or shlex.join(["airl", *sys.argv[1:]]),
+                )
+        except KeyboardInterrupt:
+            show(f"interrupted: airl train {options.config} --out {out} --resume continues")
+            voice.finish(EXIT_INTERRUPTED, "interrupted", out)
+            return EXIT_INTERRUPTED
+        best, policy = result.best, result.folder.policy
+        rate = f"{best.success_rate:.1%} of {best.episodes} selection episodes"
+        lines = (f"best       {rate} after {best.steps:,} decisions", f"policy     {policy}")
+        for line in lines:
+            show(line)
+        show(f"fly it     airl-sitl --policy {policy}")
+        progress.tell(Exported(str(policy)))
+        voice.finish(0, "complete", out, more=lines)
     return 0

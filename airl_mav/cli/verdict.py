@@ -11,7 +11,7 @@ from rich.console import Console
 from airl_mav.cli.experiments import OnboardOptions, episodes
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
-from airl_mav.core.progress import RichProgress
+from airl_mav.cli.telling import Voice
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
 from airl_mav.flight.sequential import LOOKS
@@ -74,21 +74,26 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
     Exit status: 0 what is required is met, 1 processes or workers were lost, 3 to 5 as of the
     verdict, 130 Ctrl-C.
     """
-    console = console or Console()
+    voice = Voice(options, "airl verdict", console)
     # Not the field's default: what is given would be added to it.
     asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})
     requirements = requirements_of(asked)
-    with RichProgress(console) as progress:
+    with voice:
         sought = seek_verdict(
             scenario_of(options),
             requirements,
             reference=options.reference,
             reference_workload=options.reference_workload,
             out=options.out,
-            progress=progress,
+            progress=voice.progress,
         )
-    if sought.verdict is None or sought.comparison is None or sought.page is None:
-        return EXIT_CODES[sought.ended]
-    print_comparison(sought.comparison, sought.runs or {}, console, sought.page)
-    leave(options, sought.verdict, "airl verdict")
-    return sought.verdict.exit_code
+        verdict, page, runs = sought.verdict, sought.page, sought.runs or {}
+        code = EXIT_CODES[sought.ended]
+        if verdict is None or sought.comparison is None or page is None:
+            voice.finish(code, sought.ended, sought.path)
+            return code
+        print_comparison(sought.comparison, runs, voice.console, page)
+        leave(options, verdict, "airl verdict")
+        code = verdict.exit_code
+        voice.finish(code, sought.ended, sought.path, verdict=verdict, page=page, runs=runs)
+    return code

@@ -39,6 +39,8 @@ class LogFile:
         self.on_lost = on_lost
         self.lost = False
         """Whether it ended early."""
+        self.failure: OSError | None = None
+        """Why it did."""
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
         self._written = 0
@@ -102,11 +104,18 @@ class LogFile:
         except OSError as error:
             self._end(error, self._written)
 
+    def discard(self) -> None:
+        """Close the file, and leave nothing of it."""
+        with suppress(OSError):
+            self._file.close()
+        with suppress(OSError):
+            self.partial_path.unlink(missing_ok=True)
+
     def _end(self, error: OSError, whole: int) -> None:
         """Write nothing any more, and leave the whole records, of so many bytes."""
         with suppress(OSError, ValueError):  # not a file that could be cut, or closed by now
             self._file.truncate(whole)
         self._written = whole
         if not self.lost:
-            self.lost = True
+            self.lost, self.failure = True, error
             self.on_lost(f"{self.path}: {error.strerror}; the log ends after {whole} bytes")

@@ -41,8 +41,11 @@ SCHEMA = 1
 
 ARENAS = ("no-obstacles", "static-obstacles", "dynamic-obstacles", "dense-obstacles", "crowded")
 LOCKSTEP_ARENAS = ("static-obstacles", "dynamic-obstacles")
-POLICIES = ("greedy", "static-obstacles")
-"""Classical, and a network that chooses among discrete actions."""
+DISCRETE = "static-obstacles"
+"""A network that chooses among discrete actions."""
+
+POLICIES = ("greedy", DISCRETE)
+"""Classical, and a network."""
 
 LATENCIES: Mapping[str, str | None] = {"native": None, "late": "lognormal:396ms,20ms"}
 """As fast as a workstation, and as late as the paper's Raspberry Pi, drawn anew each time."""
@@ -126,9 +129,13 @@ def scenarios() -> Iterator[tuple[str, Scenario]]:
         name = f"{level}, static-obstacles, wind, spread, noise and payload"
         yield name, Scenario(**_FLIGHT, level=level, time_limit_s=limit_s, **CONDITIONS)
     twin: dict[str, Any] = {**_FLIGHT, "level": "gym", "seed": 1}
-    name, hover = "gym, static-obstacles, hover after 60 ms", {"hover_after_s": 0.06}
-    t2 = LATENCIES["late"]
-    yield name, Scenario(**twin, time_limit_s=GYM_LIMIT_S, latency=t2, watchdog=hover)
+    name = "gym, static-obstacles, hover after 60 ms"
+    flown: dict[str, Any] = {
+        "policy": DISCRETE,
+        "latency": LATENCIES["late"],
+        "watchdog": {"hover_after_s": 0.06},
+    }
+    yield name, Scenario(**twin, **flown, time_limit_s=GYM_LIMIT_S)
     for policy in ("dynamic-obstacles", "crowded"):
         name = f"gym, {policy}, continuous actions"
         asked = {"arena": policy, "policy": policy}
@@ -141,7 +148,7 @@ def fly_behaviour(only: Sequence[str] = ()) -> Behaviour:
     Args:
         only: Names of flights; none given: all.
     """
-    flown = {
+    flown: dict[str, Any] = {
         name: sample(_fly(scenario)) for name, scenario in scenarios() if not only or name in only
     }
     return Behaviour(flights=flown)

@@ -12,17 +12,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from airl_mav.core.compiling import COMPILING
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
 from airl_mav.experiments.fliers import Flier, FlyEpisodes, LockstepFlier
 from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
-from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, another_config, open_folder
+from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
@@ -217,21 +218,17 @@ class _OpenCell:
                     "yellow",
                 )
             self._saver = stack.enter_context(EpisodeSaver(self.folder))
-            self._bar = progress.bar(cell.title, planned, completed=len(self.done), unit="episodes")
-            stack.callback(self._bar.close)
+            self._tally = Tally(progress, cell.title, self.folder.path, self.done, planned)
+            stack.callback(self._tally.close)
             self.stack = stack.pop_all()
         self.episodes = {record.index: record for record in self.done}
-        self._reached = sum(record.outcome is Outcome.SUCCESS for record in self.done)
 
     def add(self, episode: FlownEpisode) -> None:
         """Take an episode that has just ended."""
         record = episode.record
         self._saver.add(episode)
         self.episodes[record.index] = record
-        self._reached += record.outcome is Outcome.SUCCESS
-        share = self._reached / len(self.episodes)
-        self._bar.advance()
-        self._bar.update(postfix=f"{share:.1%} reached the goal")
+        self._tally.add(record)
 
     @property
     def complete(self) -> bool:
@@ -255,11 +252,19 @@ def _run(
     """Fly what is left of cells with different flights, each into its folder."""
     opened: dict[str, _OpenCell] = {}
     error: str | None = None
+    # Of one cell its own bar says it all. What was flown before is found as cells are opened.
+    several = progress if len(cells) > 1 else Progress()
+    planned = sum(len(cell.scenario.seeds) for cell in cells)
     with ExitStack() as stack:
+        everything = several.bar(f"all {len(cells)} runs", planned, unit="flights")
+        stack.callback(everything.close)
 
         def open_cell(cell: Cell) -> _OpenCell:
+            nonlocal planned
             new = opened[cell.name] = _OpenCell(cell, paths[cell.name], progress)
             stack.push(new.stack)
+            planned -= len(new.done)
+            everything.update(total=planned)
             return new
 
         def close(cell: _OpenCell) -> None:
@@ -292,12 +297,14 @@ def _run(
             name=name,
             stop=stop,
             lost=partial(progress.note, style="yellow"),
+            compiling=lambda begins: progress.status(COMPILING if begins else None),
         )
         try:
             with closing(results):
                 for job, episode in results:
                     flying = opened[job.cell]
                     flying.add(episode)
+                    everything.advance()
                     if flying.complete:
                         close(flying)
         except WorkerError as problem:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
 
+from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import quantity
@@ -70,6 +71,7 @@ class Executor(Protocol):
         name: Callable[[J], str] = str,
         stop: Stop = never,
         lost: Callable[[str], None] = lambda _: None,
+        compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
         """Carry out jobs, each by whoever is free, and yield their results in any order.
 
@@ -80,6 +82,8 @@ class Executor(Protocol):
             stop: Asked several times a second; True ends it all, and jobs under way are given up.
             lost: Is told, in one line, of each worker that was lost. Its job begins again: results
                 of an attempt that did not end are never yielded.
+            compiling: Is told when this process or one of its workers begins to compile kernels,
+                and when that is over; of workers on other machines it is not known.
 
         Raises:
             UsageError: A job says that the input cannot be used.
@@ -105,18 +109,20 @@ class InProcessExecutor:
         name: Callable[[J], str] = str,
         stop: Stop = never,
         lost: Callable[[str], None] = lambda _: None,  # noqa: ARG002 (nobody is lost here)
+        compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
         """Carry out jobs; see `Executor`."""
         work: Work[J, R] | None = None
-        for job in jobs:
-            if stop():
-                return
-            try:
-                work = work or start(stop)
-                for result in work(job):
-                    yield job, result
-            except UsageError as error:
-                raise UsageError(f"{name(job)}: {error}") from None
+        with heard_compiling(compiling):
+            for job in jobs:
+                if stop():
+                    return
+                try:
+                    work = work or start(stop)
+                    for result in work(job):
+                        yield job, result
+                except UsageError as error:
+                    raise UsageError(f"{name(job)}: {error}") from None
 
 
 class ExecutorSettings(Workers):

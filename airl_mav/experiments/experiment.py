@@ -21,7 +21,7 @@ from airl_mav.experiments.open_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.flight.requirements import Requirement
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
 from airl_mav.report.comparison.show import build_comparison, judge_comparison, write_comparison
@@ -124,6 +124,14 @@ class ExperimentResult:
     """Figures of every run, and the differences between them over pairs of flights."""
     page: Path
     """The report."""
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: what came out, the figures and the first picture."""
+        # Imported here: matplotlib is half a second that who only flies need not wait for.
+        from airl_mav.report.notebook import comparison_html
+
+        loaded = {name: load(run.path) for name, run in self.runs.items()}
+        return comparison_html(self.comparison, loaded, self.path, self.page)
 
 
 def file_name(text: str) -> str:

@@ -17,8 +17,9 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 
-DEFAULT_MITIGATED = "static-obstacles-ras-pi-4"
-"""The shipped policy that was trained as late as the paper's Raspberry Pi decides."""
+DEFAULT_UNMITIGATED, DEFAULT_MITIGATED = "static-obstacles", "static-obstacles-ras-pi-4"
+"""Shipped policies of one kind of training: as fast as a workstation decides, and as late as the
+paper's Raspberry Pi."""
 
 DEFAULT_COMPUTER, DEFAULT_REFERENCE = "ras-pi-4", "workstation"
 

@@ -99,7 +99,7 @@ def fly_live(
         if len(done) == asked.episodes:
             return FlownRun(folder.path, "complete", done, 0)
         announce()
-        live = LiveObserver(progress, done, asked.episodes)
+        live = LiveObserver(progress, folder.path, done, asked.episodes)
         observer: Observer = live
         ends: ViewEnds | None = None
         indices = {record.index for record in done}

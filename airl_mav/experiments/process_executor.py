@@ -22,6 +22,7 @@ from multiprocessing.process import BaseProcess
 from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple
 
+from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.experiments.executors import (
     ONE_THREAD,
     POLL_S,
@@ -69,6 +70,7 @@ class ProcessExecutor:
         name: Callable[[J], str] = str,
         stop: Stop = never,
         lost: Callable[[str], None] = lambda _: None,
+        compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
         """Carry out jobs; see `executors.Executor`. Only workers that are busy end with it."""
         waiting = iter(jobs)
@@ -89,6 +91,10 @@ class ProcessExecutor:
                     except (EOFError, OSError):
                         cause = pool.bury(connection)
                         pool.hire(job, next_attempt(name(job), worker.attempt, cause, lost))
+                        continue
+                    if isinstance(told, _Compiling):
+                        worker.compiles = told.begins
+                        compiling(any(each.compiles for each in pool.busy.values()))
                         continue
                     if isinstance(told, Failure):
                         raise told.error(name(job))
@@ -127,6 +133,8 @@ class _Worker(Generic[J]):
     """What it does now."""
     attempt: int
     """Number of workers that this job has been given to."""
+    compiles: bool = False
+    """Whether it compiles kernels now."""
 
 
 class _Pool(Generic[J]):
@@ -266,6 +274,13 @@ def _cause(exitcode: int | None) -> str:
 # --- in the worker
 
 
+@dataclass(frozen=True)
+class _Compiling:
+    """A worker compiles kernels before it can answer, or has done so."""
+
+    begins: bool
+
+
 def _serve(connection: Connection) -> None:
     """Carry out jobs until the pipe is closed; the first one of a run says how to start."""
     _end_with_parent()
@@ -280,13 +295,18 @@ def _serve(connection: Connection) -> None:
         assert work is not None  # noqa: S101 (no run begins without a start)
         return work(job)
 
+    def tell(begins: bool) -> None:
+        with suppress(OSError):  # The parent has gone, as is found with the answer.
+            connection.send(_Compiling(begins))
+
     while True:
         try:
             new, job = connection.recv()
         except EOFError:
             return
         start = new or start
-        told = answer(partial(carry_out, job))
+        with heard_compiling(tell):
+            told = answer(partial(carry_out, job))
         try:
             connection.send(told)
         except OSError:  # The parent has gone.

@@ -18,6 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
+from airl_mav.core.compiling import Heard
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.executors import (
     ONE_THREAD,
@@ -66,6 +67,7 @@ class RayExecutor:
         name: Callable[[J], str] = str,
         stop: Stop = never,
         lost: Callable[[str], None] = lambda _: None,
+        compiling: Heard = lambda _: None,  # noqa: ARG002 (see there)
     ) -> Results[J, R]:
         """Carry out jobs; see `executors.Executor`."""
         import ray

@@ -72,6 +72,12 @@ class Run:
         """Whether all planned episodes have been flown."""
         return len(self.episodes) == len(self.info.seeds)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the verdict, the figures and a map of the flights."""
+        from airl_mav.report.notebook import run_html
+
+        return run_html(self._loaded)
+
     def report(self) -> Path:
         """Write the page and pictures of the run; return the page.
 

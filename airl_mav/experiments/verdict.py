@@ -14,7 +14,7 @@ from pathlib import Path
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.core.progress import Progress
+from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
@@ -104,12 +104,14 @@ def seek_verdict(
         flown = fly(undelayed, max(n, _planned(out / undelayed.name)))
     if flown.ended != "complete":
         return SoughtVerdict(out, flown.ended)
+    progress.status(DRAWING)
     facts = {**declared.facts, "episodes": n, FLOWN_UNTIL: "the success rate was decided"}
     # The number planned is that of the last look, as the run says itself.
     entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
     comparison, runs = build_comparison(out, declared.kind, facts, entries)
     verdict = judge_comparison(comparison, runs, requirements)
     page = write_comparison(comparison, runs, out, verdict)
+    progress.status(None)
     return SoughtVerdict(out, "complete", verdict, comparison, runs, page)
 
 

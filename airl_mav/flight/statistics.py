@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,6 +15,8 @@ from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
 
 CONFIDENCE = 0.95
+QUANTILE = 1.959963984540054
+"""Of the normal distribution, for a two-sided 95 % interval: `scipy.special.ndtri(0.975)`."""
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 20_210_409
 """The same episodes always get the same interval."""
@@ -83,11 +86,19 @@ class Aggregate:
 
 
 def wilson(successes: int, n: int) -> Estimate:
-    """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927)."""
+    """Return a rate with Wilson's 95 % score interval (Wilson, JASA 22, 1927).
+
+    In closed form, without scipy's module of statistics: it is asked while flights are flown.
+    """
     if n == 0:
         return NO_ESTIMATE
-    interval = scipy.stats.binomtest(successes, n).proportion_ci(CONFIDENCE, method="wilson")
-    return Estimate(successes / n, float(interval.low), float(interval.high), n)
+    rate, z2 = successes / n, QUANTILE**2
+    denominator = 2.0 * (n + z2)
+    centre = (2.0 * n * rate + z2) / denominator
+    half = QUANTILE / denominator * math.sqrt(4.0 * n * rate * (1.0 - rate) + z2)
+    low = 0.0 if successes == 0 else centre - half
+    high = 1.0 if successes == n else centre + half
+    return Estimate(rate, low, high, n)
 
 
 def bootstrap_mean(values: ArrayLike) -> Estimate:

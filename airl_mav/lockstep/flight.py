@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.flight.judge import Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
@@ -41,6 +42,9 @@ from firmware_sim.warm_up import warm_up
 if TYPE_CHECKING:  # A flight that nobody watches need not load it.
     from airl_mav.lockstep.watched import Watched
 
+LOADING = "loading"
+"""What is waited for before the first flight."""
+
 SHOW_EVERY = 125
 """The observer sees the true state every so many ticks: twice a simulated second."""
 
@@ -65,8 +69,9 @@ def rehearse(
         UsageError: The policy cannot use the camera; no arena can be made of a seed.
         LockstepError: The companion hangs, or broke.
     """
-    observer.waiting("loading")
-    warm_up(scenario.vehicle, scenario.scenario.plant)
+    observer.waiting(LOADING)
+    with heard_compiling(lambda begins: observer.waiting(COMPILING if begins else LOADING)):
+        warm_up(scenario.vehicle, scenario.scenario.plant)
     for index, seed in enumerate(scenario.seeds):
         if index in done:
             continue

@@ -104,6 +104,13 @@ class Shutdown(_Line):
 # --- events
 
 
+class Compiling(_Line):
+    """The process begins to compile kernels, or ends it: at the first start after an install."""
+
+    type: Literal["compiling"] = "compiling"
+    begins: bool
+
+
 class Ready(_Line):
     """The process can take requests."""
 
@@ -217,7 +224,7 @@ Request = Annotated[
     Begin | LoadEpisode | FinishEpisode | Fly | Abort | Shutdown, Field(discriminator="type")
 ]
 Event = Annotated[
-    Ready | Loaded | State | Text | LogLost | Due | Saved | Progress | Ended | Failed,
+    Compiling | Ready | Loaded | State | Text | LogLost | Due | Saved | Progress | Ended | Failed,
     Field(discriminator="type"),
 ]
 _REQUESTS: TypeAdapter[Any] = TypeAdapter(Request)

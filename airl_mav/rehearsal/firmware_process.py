@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from airl_mav.core.clock import utc_now
+from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
@@ -24,6 +25,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.channel import (
     Begin,
     ChildChannel,
+    Compiling,
     Due,
     FinishEpisode,
     Loaded,
@@ -264,7 +266,8 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
             from airl_mav.view.taps import SimulationTap
 
             tap = held.enter_context(closing(SimulationTap(begin.view, scenario)))
-        warm_up(scenario.vehicle, scenario.scenario.plant)
+        with heard_compiling(lambda begins: channel.send(Compiling(begins=begins))):
+            warm_up(scenario.vehicle, scenario.scenario.plant)
         channel.send(Ready())
         Service(firmware, channel, scenario, tap).run(requests)
 

@@ -18,7 +18,7 @@ from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.channel import Begin, Event, Failed, Ready, parse_event
+from airl_mav.rehearsal.channel import Begin, Compiling, Event, Failed, Ready, parse_event
 
 FIRMWARE, COMPANION = "firmware", "companion"
 
@@ -128,13 +128,16 @@ class ProcessPair:
         self._suspended_us: dict[str, int] = {}
         """How long each was suspended before [wall µs]."""
 
-    def start(self, begin: Begin, logs: Path, keeps: Sequence[int]) -> None:
+    def start(
+        self, begin: Begin, logs: Path, keeps: Sequence[int], compiling: Callable[[], None]
+    ) -> None:
         """Start both processes and wait until they are ready.
 
         Args:
             begin: What both are told first.
             logs: Folder that their standard error goes to.
             keeps: File descriptors that they inherit: locks.
+            compiling: Called when one compiles kernels first.
 
         Raises:
             UsageError: A process says that its input cannot be used.
@@ -153,6 +156,8 @@ class ProcessPair:
         def note(name: str, event: Event) -> bool:
             if isinstance(event, Ready):
                 ready.add(name)
+            elif isinstance(event, Compiling) and event.begins:
+                compiling()
             return len(ready) == len(self._children)
 
         self.pump(note, READY_TIMEOUT_S, "both processes to be ready")

@@ -1,14 +1,16 @@
-"""What a person sees while a rehearsal flies: a line per episode, and the vehicle's state, live."""
+"""What is seen while a rehearsal flies: a line per episode, and the vehicle's state, live."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.progress import Progress
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import State, Text
+from airl_mav.rehearsal.tally import Tally
 
 WARNING = 4
 """MAV_SEVERITY_WARNING: texts of this severity and graver are shown."""
@@ -53,37 +55,41 @@ class Observer:
 class LiveObserver(Observer):
     """Shows a rehearsal as it flies."""
 
-    def __init__(self, progress: Progress, done: tuple[EpisodeRecord, ...], episodes: int) -> None:
-        """Begin with the episodes that were flown before, of so many in all."""
+    def __init__(
+        self, progress: Progress, folder: Path, done: tuple[EpisodeRecord, ...], episodes: int
+    ) -> None:
+        """Begin with the episodes that a run folder holds, of so many in all."""
         self.finished_records: list[EpisodeRecord] = []
         """Those that have ended while it looked on, in that order."""
         self._progress = progress
-        self._bar = progress.bar("episodes", episodes, completed=len(done))
+        self._tally = Tally(progress, "flights", folder, done, episodes)
+        self._flight = ""
         self._goal = (0.0, 0.0)
         self._phase = ""
 
     def waiting(self, what: str) -> None:
         """Show what is being waited for."""
-        self._bar.update(postfix=what)
+        self._progress.status(what)
 
     def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
         """Show that an episode begins."""
         self._goal = goal
         self._phase = "booting"
-        self._bar.update(postfix=f"flight {index:03d}, seed {seed}")
+        self._flight = f"flight {index:03d}"
+        self._progress.status(f"{self._flight}, seed {seed}")
 
     def phase(self, phase: str, time_us: int) -> None:
         """Show the phase."""
         self._phase = phase
-        self._bar.update(postfix=f"{phase} at {time_us / US_PER_S:.1f} s")
+        self._progress.status(f"{self._flight}: {phase} at {time_us / US_PER_S:.1f} s")
 
     def state(self, state: State, started_us: int) -> None:
         """Show the vehicle's true state."""
         away = math.hypot(self._goal[0] - state.position[0], self._goal[1] - state.position[1])
-        self._bar.update(
-            postfix=f"{self._phase:<12} {(state.time_us - started_us) / US_PER_S:5.1f} s  "
-            f"{away:5.1f} m to goal  {state.speed_m_s:4.1f} m/s  "
-            f"{-state.position[2]:4.1f} m high  {100 * state.battery:3.0f} %"
+        self._progress.watch(
+            f"{self._flight}: {self._phase:<10} {(state.time_us - started_us) / US_PER_S:5.1f} s "
+            f"{away:5.1f} m to goal {state.speed_m_s:4.1f} m/s "
+            f"{-state.position[2]:4.1f} m high {100 * state.battery:3.0f} %"
         )
 
     def text(self, text: Text) -> None:
@@ -110,7 +116,7 @@ class LiveObserver(Observer):
             self._progress.note(f"    {note}", "yellow")
         if record.sha256 is not None:
             self._progress.note(f"    sha256 {record.sha256['flight']}", "dim")
-        self._bar.advance()
+        self._tally.add(record)
 
     def lost(self, what: str) -> None:
         """Print what happened to an episode that begins again."""
@@ -118,4 +124,5 @@ class LiveObserver(Observer):
 
     def close(self) -> None:
         """Remove the bar."""
-        self._bar.close()
+        self._progress.status(None)
+        self._tally.close()

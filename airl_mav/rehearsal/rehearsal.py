@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from airl_mav.core.clock import WallClock
+from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.validity import BY_HAND
@@ -142,12 +143,15 @@ class Rehearsal:
             self._observer.waiting("starting firmware and companion")
             log = (self._folder.path / FIRMWARE_PRINTS).absolute()
             begin = Begin(scenario=self._scenario, log=str(log), view=self._view)
-            pair.start(begin, self._folder.path, self._keeps)
+            pair.start(
+                begin, self._folder.path, self._keeps, lambda: self._observer.waiting(COMPILING)
+            )
         return self._pair
 
     def _dismiss(self) -> None:
         pair, self._pair = self._pair, None
         if pair is not None:
+            self._observer.waiting("ending firmware and companion")
             pair.stop()
 
     # --- one episode
@@ -211,6 +215,7 @@ class Rehearsal:
             raise LostError("; ".join((error.what, *seen)), error.detail) from None
         if (reason := episode.separated) is not None and not disturbing(scenario.scenario.faults):
             raise LostError(f"{SEPARATED_BY} ({reason})")
+        self._observer.waiting("saving the flight")
         if pair.lives(FIRMWARE):
             pair.send(FIRMWARE, FinishEpisode())
             pair.wait_for(Saved, lambda event: self._look(event, episode.notes))

@@ -349,9 +349,15 @@ def load(path: Path) -> LoadedRun:
     return LoadedRun(path, info, episodes, latency, trajectories)
 
 
+def info_data(info: RunInfo) -> dict[str, Any]:
+    """Return the object of `run.json`; `run_info` reads it back."""
+    data: dict[str, Any] = _INFO.dump_python(info, mode="json")
+    return data
+
+
 def _write_info(path: Path, info: RunInfo) -> None:
     """Write `run.json`."""
-    write_json(path, _INFO.dump_python(info, mode="json"))
+    write_json(path, info_data(info))
 
 
 def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, Arrays]:

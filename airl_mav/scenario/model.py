@@ -25,7 +25,7 @@ PolicyName = Annotated[
     ),
 ]
 
-DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles", "static-obstacles"
+DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
 """What is shipped and decides, and is flown in, by default."""
 
 GREATEST_SEED = 2**31

@@ -1,15 +1,46 @@
-"""What a person sees while a policy is trained."""
+"""What is seen while a policy is trained."""
 
 from __future__ import annotations
 
-from airl_mav.core.progress import RichProgress
+from dataclasses import dataclass
+from typing import ClassVar
+
+from airl_mav.core.progress import Event, Progress
 from airl_mav.training.store import Evaluation, TrainingProgress
+
+
+@dataclass(frozen=True)
+class Evaluated(Event):
+    """The policy was evaluated on the selection episodes."""
+
+    event: ClassVar[str] = "evaluation"
+    steps: int
+    """Decisions of all vehicles so far."""
+    episodes: int
+    success_rate: float
+    """Of those episodes, 0 to 1."""
+    collision_rate: float
+    flight_time_s: float | None
+    """Mean of those that reached the goal; None: none did."""
+    zone: int | None
+    """Open zone of the curriculum; None: there is none."""
+    best: bool
+    """Whether it is better than all before it."""
+
+
+@dataclass(frozen=True)
+class Exported(Event):
+    """The best weights were exported."""
+
+    event: ClassVar[str] = "policy"
+    path: str
+    """Folder of the policy, for `--policy`."""
 
 
 class TrainingBar(TrainingProgress):
     """A bar with the success rate, a line for every evaluation. A `TrainingProgress`."""
 
-    def __init__(self, progress: RichProgress, steps: int) -> None:
+    def __init__(self, progress: Progress, steps: int) -> None:
         self._progress = progress
         self._bar = progress.bar("training", steps, unit="decisions")
 
@@ -21,10 +52,22 @@ class TrainingBar(TrainingProgress):
         """Draw the bar."""
         text = "" if success is None else f"success {success:.0%} in training"
         text += "" if zone is None else f", zone {zone}"
-        self._bar.update(completed=steps, postfix=text)
+        figures = {"training_success": success, "zone": zone}
+        self._bar.update(completed=steps, postfix=text, figures=figures)
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
-        """Print a line."""
+        """Print a line, and tell programs."""
+        self._progress.tell(
+            Evaluated(
+                steps=evaluation.steps,
+                episodes=evaluation.episodes,
+                success_rate=evaluation.success_rate,
+                collision_rate=evaluation.collision_rate,
+                flight_time_s=evaluation.flight_time_s,
+                zone=evaluation.zone,
+                best=best,
+            )
+        )
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
         zone = "" if evaluation.zone is None else f"  zone {evaluation.zone}"
         self._progress.note(

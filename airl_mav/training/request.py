@@ -80,5 +80,7 @@ class TrainRequest(BaseModel):
         # Imported here: it takes what the extras install, and they are looked for first.
         from airl_mav.training.config import TrainingConfig, configured
 
-        changes = self.model_dump(exclude={"config", "out", "name", "resume"})
+        # Not what a command adds to it.
+        asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
+        changes = self.model_dump(include=asked)
         return configured(load_profile("training", self.config, TrainingConfig), **changes)

@@ -323,7 +323,8 @@ def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> Po
             date_utc=utc_now().isoformat(timespec="seconds"),
         ),
     )
-    env = NavigationVecEnv(NavigationVectorEnv(1, environment))
+    # As many as learned: with fewer a rollout would not fill its batches.
+    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, environment))
     model = make_model(config.algorithm, config.network, env, config.seed)
     model.set_parameters(str(folder.best_model), device="cpu")
     return export_sb3(model, facts, folder.policy)

@@ -150,6 +150,14 @@ class PpoOptions(Options, NoiseOptions):
     ent_coef: float | None = quantity(
         "weight of the entropy; left out: 0.005", "1", ge=0, le=10, default=None
     )
+    log_std_init: float | None = quantity(
+        "logarithm of the first standard deviation of continuous actions, whose range is -1 to 1;"
+        " left out: 0",
+        "1",
+        ge=-5,
+        le=2,
+        default=None,
+    )
     vf_coef: float | None = quantity("weight of the value's loss", "1", ge=0, le=100, default=None)
     max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
     target_kl: float | None = quantity(
@@ -256,6 +264,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "stable_baselines3.PPO",
         _BATCHES,
         options=PpoOptions,
+        to_policy=("log_std_init",),
         defaults=_PPO,
         batch=256,
         rollouts=True,
@@ -264,7 +273,13 @@ ALGORITHMS: dict[str, Algorithm] = {
         "sb3_contrib.RecurrentPPO",
         _BATCHES,
         options=RecurrentPpoOptions,
-        to_policy=("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm"),
+        to_policy=(
+            "log_std_init",
+            "lstm_hidden_size",
+            "n_lstm_layers",
+            "shared_lstm",
+            "enable_critic_lstm",
+        ),
         defaults=_PPO | {"lstm_hidden_size": 128},
         batch=256,
         rollouts=True,

@@ -149,3 +149,5 @@ def test_options_reach_the_learner_and_the_network() -> None:
     with pytest.raises(UsageError, match=r"algorithm.expert: none for a ToyFleet"):
         make("dagger")
     assert make("recurrent-ppo").policy.lstm_actor.hidden_size == 128
+    timid = make("ppo", continuous=True, options={"log_std_init": -1.5})
+    assert timid.policy.log_std.tolist() == [-1.5, -1.5]

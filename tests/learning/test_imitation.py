@@ -66,7 +66,7 @@ def test_the_planner_is_safer_and_faster_than_what_it_teaches(
 ) -> None:
     flown = flown_by("planner", range(1, 41), arena=arena, actions=actions)
     assert success_rate(flown) >= least
-    # The default policy takes 7.8 s in static-obstacles.
+    # The policy `static-obstacles` takes 7.8 s in static-obstacles.
     assert (mean_of_successes(flown, "flight_time_s") or np.inf) < 6.5
 
 

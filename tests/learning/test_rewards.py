@@ -133,6 +133,16 @@ def test_costs_by_hand() -> None:
     assert not costs(Costs(), last, step).any()
 
 
+def test_a_failure_costs_what_it_is_said_to() -> None:
+    """A collision and an empty battery; not the goal, not the end of time."""
+    before, now = flights([9.0] * 5, [0.0] * 5), flights([8.0] * 5, [1.0] * 5)
+    ends = ("FLYING", "SUCCESS", "COLLISION", "BATTERY", "TIMEOUT")
+    now.verdict[:] = [Verdict[name] for name in ends]
+    still = np.zeros((5, 3))
+    found = costs(Costs(failure=2.5), still, Step(before, now, still, HOLD_S))
+    assert found.tolist() == [0.0, 0.0, 2.5, 2.5, 0.0]
+
+
 def test_the_environment_takes_the_costs_off_its_reward() -> None:
     """Flown alike, with and without; a flight's first command differs from none."""
     paid = {}

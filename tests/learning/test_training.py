@@ -134,6 +134,30 @@ def test_ctrl_c_says_how_to_go_on(short: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
+    config = tmp_path / "brief.toml"
+    config.write_text(short.read_text(encoding="utf-8").replace("3_000", "600"), encoding="utf-8")
+    out = tmp_path / "run"
+    code, text = airl("train", str(config), "--out", str(out), "--json")
+    assert code == 0
+    lines = [json.loads(line) for line in text.splitlines()]
+    assert lines[0]["command"] == "airl train"
+    evaluations = [line for line in lines if line["event"] == "evaluation"]
+    best = TrainingFolder(out).best()
+    assert best is not None
+    assert [line["steps"] for line in evaluations if line["best"]][-1] == best.steps
+    last = [line for line in lines if line["event"] == "progress"][-1]
+    assert (last["work"], last["unit"], last["planned"]) == ("training", "decisions", 600)
+    assert last["done"] >= 600
+    exported, finished = lines[-2:]
+    assert exported == {"event": "policy", "path": str(out / "policy")}
+    assert (finished["event"], finished["exit_status"]) == ("finished", 0)
+    assert (finished["ended"], finished["path"]) == ("complete", str(out))
+    # Trained to the end already: quiet says where the result lies, and nothing else.
+    code, text = airl("train", str(config), "--out", str(out), "--resume", "--quiet")
+    assert [line.split()[0] for line in text.splitlines()] == ["best", "policy", "folder"]
+
+
 def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="or resume"):
         airl("train", str(short), "--out", str(straight))

@@ -115,13 +115,15 @@ class Page:
 
 
 @contextmanager
-def browser(folder: Path) -> Iterator[Page]:
-    """Run Chromium for a while, with its profile in a folder."""
+def browser(folder: Path, *flags: str) -> Iterator[Page]:
+    """Run Chromium for a while, with its profile in a folder, and with more flags."""
     assert CHROMIUM is not None
     profile = folder / "chromium"
     with (folder / "chromium.log").open("wb") as log:
         process = subprocess.Popen(
-            [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", "about:blank"], stdout=log, stderr=log
+            [CHROMIUM, *FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"],
+            stdout=log,
+            stderr=log,
         )
     try:
         with connect(_address(process, profile), max_size=None) as connection:

@@ -35,8 +35,12 @@ class Speaking(Observer):
 
 
 def demo_scenario(**changes: Any) -> ResolvedScenario:
-    """Return a short flight in lockstep; `changes` are fields of the scenario."""
-    return resolve(Scenario(**({"level": "lockstep", "time_limit_s": 60.0} | changes)))
+    """Return a short flight in lockstep by a policy that decides every half a second.
+
+    `changes` are fields of the scenario.
+    """
+    usual = {"policy": "static-obstacles", "level": "lockstep", "time_limit_s": 60.0}
+    return resolve(Scenario(**(usual | changes)))
 
 
 def fly_as_companion(

@@ -222,6 +222,8 @@ class Ground:
 
     def _take(self, message: Any) -> None:
         name = message.get_type()
+        if name == "HEARTBEAT" and message.get_srcComponent() != dialect.MAV_COMP_ID_AUTOPILOT1:
+            return  # a companion's, which is forwarded
         self.latest[name] = message
         if name == "STATUSTEXT":
             self.texts.append(message.text)

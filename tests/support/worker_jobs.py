@@ -43,6 +43,15 @@ def pairs(stop: Stop) -> Callable[[int], Iterator[int]]:
     return lambda job: iter((job, -job))
 
 
+def compiles(stop: Stop) -> Callable[[int], list[int]]:
+    """Each job compiles a kernel."""
+    import numba
+
+    import airl_mav.core.kernels  # noqa: F401 (what reports it)
+
+    return lambda job: [numba.njit(lambda x: x + job)(1)]
+
+
 def counted(folder: Path, stop: Stop) -> Callable[[int], list[int]]:
     """Leave a file with each start and each job."""
     (folder / f"start-{os.getpid()}").touch(exist_ok=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from importlib.util import find_spec
@@ -152,6 +152,14 @@ def test_no_more_processes_than_workers() -> None:
     assert 1 <= len(pids) <= 2
     assert os.getpid() not in pids
     assert not any(is_running(pid) for pid in pids)
+
+
+@pytest.mark.parametrize("make", [InProcessExecutor, partial(ProcessExecutor, 1)])
+def test_who_waits_is_told_that_kernels_are_compiled(make: Callable[[], Any]) -> None:
+    heard: list[bool] = []
+    with closing(make().run([1], worker_jobs.compiles, compiling=heard.append)) as results:
+        assert list(results) == [(1, 2)]
+    assert heard == [True, False]
 
 
 def test_each_worker_starts_once_and_no_more_start_than_there_are_jobs(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -22,6 +23,8 @@ def test_wilson_is_the_closed_form(k: int, n: int) -> None:
     assert (estimate.value, estimate.n) == (k / n, n)
     assert estimate.low == pytest.approx(centre - half, abs=1e-12)
     assert estimate.high == pytest.approx(centre + half, abs=1e-12)
+    theirs = scipy.stats.binomtest(k, n).proportion_ci(0.95, method="wilson")
+    assert (estimate.low, estimate.high) == (theirs.low, theirs.high)
 
 
 def test_the_bootstrap_of_many_values_is_the_normal_interval() -> None:

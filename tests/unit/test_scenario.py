@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from rich.console import Console
 
 from airl_mav.cli import entry, sitl
+from airl_mav.cli.companion import CompanionOptions
 from airl_mav.cli.options import read_options
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import unit_of, validated
@@ -119,8 +120,8 @@ from airl_mav.lockstep.flight import fly
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 
-resolved = resolve(Scenario(level="lockstep", time_limit_s=3.0, computer="ras-pi-4",
-                            workload="template-5x32"))
+resolved = resolve(Scenario(policy="static-obstacles", level="lockstep", time_limit_s=3.0,
+                            computer="ras-pi-4", workload="template-5x32"))
 for name in ("vehicles/quad.toml", "arenas/static-obstacles.toml", "computers/ras-pi-4.toml",
              "static-obstacles/card.json"):
     assert opened.pop(name) == 1, (name, opened)
@@ -272,6 +273,25 @@ def test_options_lie_over_the_file(tmp_path: Path) -> None:
     assert (asked.policy, asked.episodes, asked.hold_s) == ("greedy", 2, 0.3)
     assert (asked.wind.north_m_s, asked.wind.east_m_s) == (2.0, 1.0)
     assert asked.ports.gcs_port == 15000
+
+
+def test_a_companion_has_its_options_in_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "companion.toml"
+    path.write_text(
+        'start = "offboard"\ngoal = [30.0, -5.0]\nblack_box = "/flights"\n'
+        "[limits]\nradius_m = 40.0\n"
+    )
+    asked = read_options(CompanionOptions, "airl-companion", [str(path), "--limits.height-m", "9"])
+    assert (asked.start, asked.goal, asked.black_box) == (
+        "offboard",
+        (30.0, -5.0),
+        Path("/flights"),
+    )
+    assert (asked.limits.radius_m, asked.limits.height_m) == (40.0, 9.0)
+    path.write_text("[limits]\nradius_m = -1\n")
+    with pytest.raises(UsageError) as refused:
+        read_options(CompanionOptions, "airl-companion", [str(path)])
+    assert str(refused.value).startswith(f"{path}: limits.radius_m = -1: accepted: 0 < value")
 
 
 @pytest.mark.parametrize(
