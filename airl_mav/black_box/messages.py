@@ -26,6 +26,7 @@ SUFFIX = ".mcap"
 
 Microseconds: TypeAlias = Annotated[int, Field(ge=-1, lt=2**62)]
 Whole: TypeAlias = Annotated[int, Field(ge=0, lt=2**62)]
+Base64: TypeAlias = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
 
 Number: TypeAlias = float | None
 """None: not a number, or infinite, which JSON cannot say."""
@@ -71,6 +72,49 @@ class Telemetry:
     """[m/s]."""
     quaternion: Vector4
     """w, x, y, z, body to world."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the simulator knows of the vehicle; in files that are exported from a run."""
+
+    time_us: Microseconds
+    position: Vector3
+    """[m]."""
+    velocity: Vector3
+    """[m/s]."""
+    quaternion: Vector4
+    """w, x, y, z, body to world."""
+    power_w: Number
+    """Electrical power, without the companion computer's."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """The velocity that is commanded now, as the vehicle's heading turns it."""
+
+    time_us: Microseconds
+    velocity: Vector3
+    """NED [m/s]."""
+    yaw_rate: Number
+    """[rad/s]."""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """How long each stage of a decision took [ms]; None: one of its two ends is not known."""
+
+    sent_us: Microseconds
+    """Which decision."""
+    t1_ms: Number
+    wait_ms: Number
+    t2_ms: Number
+    send_ms: Number
+    link_ms: Number
+    control_ms: Number
+    end_to_end_ms: Number
+    t3_ms: Number
+    period_ms: Number
 
 
 @dataclass(frozen=True)
@@ -140,8 +184,8 @@ class RawImage:
     """`mono16`: depth in millimetres, 0 = no return."""
     step: Whole
     """Bytes of a row."""
-    data: str
-    """Base64 of the rows, little endian."""
+    data: Base64
+    """The rows, little endian."""
 
 
 @dataclass(frozen=True)
@@ -157,11 +201,26 @@ class Log:
     line: int = 0
 
 
-Message: TypeAlias = Decision | Telemetry | Status | Resources | Phase | End | RawImage | Log
+Message: TypeAlias = (
+    Decision
+    | Telemetry
+    | Truth
+    | Command
+    | Latency
+    | Status
+    | Resources
+    | Phase
+    | End
+    | RawImage
+    | Log
+)
 
 TOPICS: dict[type[Message], str] = {
     Decision: "/decision",
     Telemetry: "/telemetry",
+    Truth: "/truth",
+    Command: "/command",
+    Latency: "/latency",
     Status: "/status",
     Resources: "/resources",
     Phase: "/phase",

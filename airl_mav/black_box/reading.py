@@ -15,10 +15,13 @@ from mcap.records import Message as Record
 from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import TypeAdapter, ValidationError
 
+from airl_mav.black_box.channels import JSON
 from airl_mav.black_box.messages import (
     TOPICS,
+    Command,
     Decision,
     End,
+    Latency,
     Log,
     Message,
     Phase,
@@ -26,6 +29,7 @@ from airl_mav.black_box.messages import (
     Resources,
     Status,
     Telemetry,
+    Truth,
 )
 from airl_mav.black_box.writing import METADATA, RUN
 from airl_mav.core.errors import UsageError
@@ -36,7 +40,20 @@ _RECORD_BYTES = 64 * 2**20
 _TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
 """What a file that ends in the midst of a record, or is damaged there, leads to."""
 
-M = TypeVar("M", Decision, Telemetry, Status, Resources, Phase, End, RawImage, Log)
+M = TypeVar(
+    "M",
+    Decision,
+    Telemetry,
+    Truth,
+    Command,
+    Latency,
+    Status,
+    Resources,
+    Phase,
+    End,
+    RawImage,
+    Log,
+)
 
 
 @dataclass
@@ -96,7 +113,9 @@ def _whole_records(reader: StreamReader) -> Iterator[Any]:
     while True:
         try:
             record = next(records)
-            if isinstance(record, Channel) and record.topic in kinds:
+            if isinstance(record, Channel) and record.message_encoding == JSON:
+                if record.topic not in kinds:
+                    continue
                 kind = kinds[record.topic]
                 adapters[record.id] = kind, TypeAdapter(kind)
             elif isinstance(record, Record) and record.channel_id in adapters:

@@ -1,4 +1,4 @@
-"""Writing a black box: message by message, and onto the disk whenever that is asked for."""
+"""Writing MCAP files: a black box, message by message, or a flight that is exported as a whole."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from mcap.writer import CompressionType, IndexType, Writer
-from pydantic import TypeAdapter
 
-from airl_mav.black_box.messages import SCHEMAS, TOPICS, Message
+from airl_mav.black_box.channels import Channel, encoded
+from airl_mav.black_box.messages import Message
 from airl_mav.core.clock import NS_PER_US
 
 METADATA = "airl-mav"
@@ -22,7 +22,57 @@ RUN = "run"
 """Its only key: the object of a `run.json`."""
 
 
-class BlackBoxFile:
+class McapFile:
+    """An MCAP file with the messages of a flight."""
+
+    def __init__(self, file: IO[bytes], run: Mapping[str, Any], *, in_chunks: bool = True) -> None:
+        """Begin the file.
+
+        Args:
+            file: An open file, empty.
+            run: What flies, as `run.json` has it.
+            in_chunks: Compressed and indexed, so that a viewer can jump to any time; otherwise
+                every message can be read as soon as it is on the disk.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        self._writer = Writer(
+            file,
+            compression=CompressionType.ZSTD if in_chunks else CompressionType.NONE,
+            index_types=IndexType.ALL if in_chunks else IndexType.METADATA,
+            use_chunking=in_chunks,
+            enable_data_crcs=True,
+        )
+        self._writer.start(library="airl-mav")
+        self._writer.add_metadata(METADATA, {RUN: json.dumps(run)})
+        self._channels: dict[Channel, int] = {}
+        self._sequence = 0
+
+    def write(self, message: Message, unix_us: int) -> None:
+        """Add a message of ours, of a calendar time [µs]. Raises OSError."""
+        self.add(*encoded(message), unix_us)
+
+    def add(self, channel: Channel, data: bytes, unix_us: int) -> None:
+        """Add a message of a channel, of a calendar time [µs]. Raises OSError."""
+        if channel not in self._channels:
+            self._channels[channel] = self._register(channel)
+        self._sequence += 1
+        time_ns = unix_us * NS_PER_US
+        self._writer.add_message(self._channels[channel], time_ns, data, time_ns, self._sequence)
+
+    def _register(self, channel: Channel) -> int:
+        number = self._writer.register_schema(
+            channel.schema_name, channel.schema_encoding, channel.schema
+        )
+        return self._writer.register_channel(channel.topic, channel.encoding, number)
+
+    def finish(self) -> None:
+        """Write what is left, and the index. Raises OSError."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+
+class BlackBoxFile(McapFile):
     """An MCAP file that grows.
 
     It is not written in chunks, and its index comes last: whatever lies on the disk when the power
@@ -41,33 +91,7 @@ class BlackBoxFile:
         """
         self.path = path
         self._file = path.open("xb")
-        self._writer = Writer(
-            self._file,
-            compression=CompressionType.NONE,
-            index_types=IndexType.METADATA,
-            use_chunking=False,
-            enable_data_crcs=True,
-        )
-        self._writer.start(library="airl-mav")
-        self._writer.add_metadata(METADATA, {RUN: json.dumps(run)})
-        self._channels: dict[type[Message], int] = {}
-        self._adapters = {kind: TypeAdapter(kind) for kind in TOPICS}
-        self._sequence = 0
-
-    def write(self, message: Message, unix_us: int) -> None:
-        """Add a message of a calendar time [µs]. Raises OSError."""
-        kind = type(message)
-        if kind not in self._channels:
-            self._channels[kind] = self._register(kind)
-        self._sequence += 1
-        time_ns = unix_us * NS_PER_US
-        data = self._adapters[kind].dump_json(message)
-        self._writer.add_message(self._channels[kind], time_ns, data, time_ns, self._sequence)
-
-    def _register(self, kind: type[Message]) -> int:
-        schema = json.dumps(self._adapters[kind].json_schema())
-        number = self._writer.register_schema(SCHEMAS[kind], "jsonschema", schema.encode())
-        return self._writer.register_channel(TOPICS[kind], "json", number)
+        super().__init__(self._file, run, in_chunks=False)
 
     def sync(self) -> None:
         """Put onto the disk what was written so far. Raises OSError."""
@@ -76,7 +100,7 @@ class BlackBoxFile:
 
     def finish(self) -> None:
         """Write the index, and close the file. Raises OSError."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        super().finish()
         self.sync()
         self._file.close()
 

@@ -126,6 +126,15 @@ def utc_now() -> datetime:
     return datetime.now(timezone.utc)
 
 
+def since_1970_us(timestamp: str) -> int:
+    """Return a calendar time, written as ISO 8601 with its offset from UTC, since 1970 [µs].
+
+    Raises:
+        ValueError: The text is no such time.
+    """
+    return round(datetime.fromisoformat(timestamp).timestamp() * US_PER_S)
+
+
 def utc_us() -> int:
     """Return the calendar time since 1970 [µs], for stamps that a driver took from it.
 

@@ -48,13 +48,17 @@ def replace_file(path: Path, data: bytes) -> None:
         OSError: It cannot be written, a full disk above all; its `filename` is the path. The old
             file is untouched, and nothing is left beside it.
     """
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Yield the temporary name of a file; on leaving it takes the place of `path`."""
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield the temporary name of a file; on leaving it takes the place of `path`.
+
+    Raises:
+        OSError: As `replace_file`.
+    """
     partial = path.with_name(path.name + ".partial")
     try:
         with naming(path):
@@ -285,7 +289,7 @@ NO_ARRAYS = ArrayGroup({}, "00000000")
 def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays by name to a new .npz, in place of any old one."""
     keywords: dict[str, Any] = dict(arrays)
-    with _replacing(path) as partial, partial.open("wb") as file:
+    with replacing(path) as partial, partial.open("wb") as file:
         np.savez(file, **keywords)
 
 
@@ -303,7 +307,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
     Returns:
         The CRC of each group, as `read_groups` finds it.
     """
-    with _replacing(path) as partial:
+    with replacing(path) as partial:
         old = path.exists()
         if old:
             shutil.copyfile(path, partial)

@@ -22,6 +22,13 @@ _PX4_RELEASE = 1 << 24 | 16 << 16 | 0 << 8 | 255
 _DATA_FORMAT = 2
 """ver_data_format: by it Flight Review knows the names of fields, here those of PX4 1.16."""
 
+DESCRIBED = (
+    ("ver_hw", "PX4_SITL"),
+    ("ver_sw_release", _PX4_RELEASE),
+    ("ver_data_format", _DATA_FORMAT),
+)
+"""Facts of the vehicle by ULog's keys, beside its name."""
+
 _SAMPLES = 0
 """Number of `SENSOR_COMBINED` in the file; the other topics follow in their order."""
 
@@ -59,7 +66,7 @@ class FlightLog:
             path,
             start_us,
             (SENSOR_COMBINED, *(logged.topic for logged in TOPICS)),
-            _info(),
+            (("sys_name", "airl-mav"), *DESCRIBED),
             self._known.items(),
             on_lost,
         )
@@ -145,13 +152,3 @@ def _values(parameters: ParameterStore) -> Iterable[tuple[str, int | float]]:
         parameter = parameters.by_index(index)
         if parameter is not None:
             yield parameter.name, parameter.value
-
-
-def _info() -> Iterable[tuple[str, str | int]]:
-    """Return facts of the vehicle by ULog's keys."""
-    return (
-        ("sys_name", "airl-mav"),
-        ("ver_hw", "PX4_SITL"),
-        ("ver_sw_release", _PX4_RELEASE),
-        ("ver_data_format", _DATA_FORMAT),
-    )

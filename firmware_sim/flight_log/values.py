@@ -32,10 +32,10 @@ NAVIGATION_STATES: dict[Mode, int] = {
 }
 """VehicleStatus.nav_state (NAVIGATION_STATE_*) of each mode."""
 
-_DISARMED, _ARMED = 1, 2
+DISARMED, ARMED = 1, 2
 """VehicleStatus.arming_state."""
 
-_ROTARY_WING = 1
+ROTARY_WING = 1
 """VehicleStatus.vehicle_type."""
 
 MOTORS = 12
@@ -224,10 +224,10 @@ def status(moment: Moment) -> Values:
     """Return the arming state and the flight mode."""
     status = moment.state.status
     return (
-        _ARMED if status.arming is Arming.ARMED else _DISARMED,
+        ARMED if status.arming is Arming.ARMED else DISARMED,
         NAVIGATION_STATES[status.intended_mode],
         NAVIGATION_STATES[status.mode],
-        _ROTARY_WING,
+        ROTARY_WING,
         status.failsafe,
         status.arming is not Arming.BOOT,
     )

@@ -1,0 +1,49 @@
+"""The files of a run's flights."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Literal
+
+from airl_mav.core.files import replacing
+from airl_mav.report.export_log.recorded import RecordedFlight
+from airl_mav.report.export_log.ulog_log import write_ulog
+from airl_mav.report.replay.runs import ReplayedRun
+from firmware_sim.flight_log.log_folder import ULOG_SUFFIX
+
+Format = Literal["mcap", "ulog"]
+
+
+def flight_of(run: ReplayedRun, index: int) -> RecordedFlight:
+    """Return a flight of a run.
+
+    Raises:
+        UsageError: It is not there, or its arena cannot be made any more.
+    """
+    return RecordedFlight(run.flight(run.record(index)), run.info)
+
+
+def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
+    """Write a flight's file into a folder, and return its path.
+
+    The flight controller's own log, where the run has it, is the ULog: it holds more.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    name = f"flight-{flight.replayed.record.index:03d}"
+    if kind == "mcap":
+        # Imported here: MCAP and Foxglove's messages are extras.
+        from airl_mav.report.export_log.mcap_log import write_mcap
+
+        path = out / f"{name}.mcap"
+        write_mcap(flight, path)
+        return path
+    path, own = out / f"{name}{ULOG_SUFFIX}", run / f"{name}{ULOG_SUFFIX}"
+    if not own.exists():
+        write_ulog(flight, path)
+    elif not (path.exists() and path.samefile(own)):
+        with replacing(path) as partial:
+            shutil.copyfile(own, partial)
+    return path

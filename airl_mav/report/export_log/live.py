@@ -1,0 +1,119 @@
+"""A recorded flight on Foxglove's WebSocket, at its own pace."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import foxglove
+from foxglove.websocket import ChannelView, Client, ServerListener
+
+from airl_mav.black_box.channels import Channel
+from airl_mav.core.clock import NS_PER_US, Clock, WallClock
+from airl_mav.core.errors import FieldError
+from airl_mav.core.ports import LOOPBACK
+from airl_mav.report.export_log.recorded import RecordedFlight
+from airl_mav.report.export_log.told import FlightMessages
+
+PAUSE_US = 2_000_000
+"""Between the end of a flight and its next beginning [wall µs]."""
+
+
+BACKLOG = 1024
+"""Messages that may wait for a viewer, at least (Foxglove's default); the oldest go first."""
+
+
+class LiveFlight(ServerListener):
+    """A server that publishes a flight, from its beginning once somebody watches.
+
+    Who comes later gets at once what is told only now and then: the newest message of each topic.
+    """
+
+    def __init__(self, flight: RecordedFlight, port: int) -> None:
+        """Serve on a TCP port of the loopback address; 0 takes a free one.
+
+        Raises:
+            FieldError: The port is taken.
+        """
+        messages = FlightMessages(flight)
+        self._began_unix_us = messages.began_unix_us
+        self._told = list(messages)
+        self._context = foxglove.Context()
+        self._channels: dict[Channel, foxglove.Channel] = {}
+        self._newest: dict[int, tuple[foxglove.Channel, bytes, int]] = {}
+        """By the channel's number: channel, message, time [ns]."""
+        self._lock = threading.Lock()
+        self._watched = threading.Event()
+        for channel in dict.fromkeys(message.channel for message in self._told):
+            self._channels[channel] = self._new(channel)
+        try:
+            self._server = foxglove.start_server(
+                name="airl export-log",
+                host=LOOPBACK,
+                port=port,
+                server_listener=self,
+                context=self._context,
+                # A viewer that falls behind keeps the scene, which is told once: room for all.
+                message_backlog_size=max(BACKLOG, len(self._told)),
+            )
+        except RuntimeError:
+            raise FieldError("port", port, problem="it is taken; accepted: a free one") from None
+        self.port = int(self._server.port)
+        """Of the server."""
+
+    def _new(self, channel: Channel) -> foxglove.Channel:
+        schema = foxglove.Schema(
+            name=channel.schema_name, encoding=channel.schema_encoding, data=channel.schema
+        )
+        return foxglove.Channel(
+            channel.topic,
+            schema=schema,
+            message_encoding=channel.encoding,
+            context=self._context,
+        )
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002
+        """Send the newest message of the channel again; called from the server's thread."""
+        with self._lock:
+            newest = self._newest.get(channel.id)
+            if newest is not None:
+                self._log(*newest)
+        self._watched.set()
+
+    @staticmethod
+    def _log(channel: foxglove.Channel, data: bytes, time_ns: int) -> None:
+        channel.log(data, log_time=time_ns)
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until somebody watches; return whether somebody does."""
+        return self._watched.wait(timeout_s)
+
+    def play(self, clock: Clock | None = None) -> None:
+        """Publish the flight once, from its beginning to its end."""
+        clock = clock or WallClock()
+        later_us = clock.time_us() - self._told[0].time_us
+        for message in self._told:
+            clock.sleep_until(message.time_us + later_us)
+            time_ns = (self._began_unix_us + message.time_us) * NS_PER_US
+            channel = self._channels[message.channel]
+            with self._lock:
+                self._newest[channel.id()] = channel, message.data, time_ns
+                self._log(channel, message.data, time_ns)
+
+    def run(self, ended: Callable[[], None], clock: Clock | None = None) -> None:
+        """Publish the flight again and again, until interrupted; `ended` is called after each."""
+        clock = clock or WallClock()
+        while not self.wait(0.5):
+            pass
+        while True:
+            self.play(clock)
+            ended()
+            clock.sleep_until(clock.time_us() + PAUSE_US)
+            with self._lock:
+                self._newest.clear()
+            # Time begins anew: viewers drop what they have.
+            self._server.clear_session()
+
+    def close(self) -> None:
+        """Free the port."""
+        self._server.stop()

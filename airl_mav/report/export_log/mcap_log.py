@@ -1,0 +1,56 @@
+"""A flight as an MCAP file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from airl_mav.black_box.writing import McapFile
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import replacing
+from airl_mav.rehearsal.run_folder import info_data
+from airl_mav.report.export_log.recorded import RecordedFlight
+from airl_mav.report.export_log.told import FlightMessages
+
+
+def write_mcap(flight: RecordedFlight, path: Path) -> None:
+    """Write a flight; what is there already is replaced.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    messages = FlightMessages(flight)
+    with replacing(path) as partial, partial.open("wb") as opened:
+        file = McapFile(opened, run_of(flight))
+        for message in messages:
+            unix_us = messages.began_unix_us + message.time_us
+            file.add(message.channel, message.data, unix_us)
+        file.finish()
+
+
+def run_of(flight: RecordedFlight) -> dict[str, Any]:
+    """Return what flew, as a black box says it: the run's settings, with those of this flight."""
+    record, info = flight.replayed.record, flight.info
+    config = info.config
+    pilot, limits = dict(config.get("pilot") or {}), dict(config.get("limits") or {})
+    pilot["goal_radius_m"] = record.goal_radius_m
+    pilot.setdefault("hold_s", _hold_s(flight))
+    limits["flight_s"] = record.time_limit_s
+    told = {
+        "goal": list(record.goal),
+        "seed": record.seed,
+        "speed": config.get("speed") or info.setup.speed or 1.0,
+        "pilot": pilot,
+        "limits": limits,
+    }
+    return {**info_data(info), "config": {**config, **told}, "seeds": [record.seed]}
+
+
+def _hold_s(flight: RecordedFlight) -> float:
+    """Return how long actions were held, where the run does not say it: older ones [s]."""
+    columns = flight.decisions
+    if not len(columns.get("sent_us", ())):
+        return 0.0
+    return float(np.median(columns["held_until_us"] - columns["sent_us"])) / US_PER_S

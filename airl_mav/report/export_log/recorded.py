@@ -1,0 +1,130 @@
+"""What the messages and topics of an exported flight are made of, by the times of its recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.black_box.messages import Decision
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP, STAMPS
+from airl_mav.rehearsal.run_folder import RunInfo
+from airl_mav.report.forensics.camera_view import pose_at
+from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
+
+RECORDED_LEVEL = "flight"
+"""Level of a run that a companion has recorded: nobody knew the truth."""
+
+
+@dataclass(frozen=True)
+class RecordedFlight:
+    """A flight, and the run that it belongs to. Times are simulated µs."""
+
+    replayed: ReplayedFlight
+    info: RunInfo
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """The true path; None: it is not known."""
+        return None if self.info.setup.level == RECORDED_LEVEL else self.replayed.path
+
+    @property
+    def estimate(self) -> Trajectory | None:
+        """What the flight controller believed; None: it is not recorded beside the path."""
+        stamps = self.replayed.stamps
+        if "estimate/time_us" not in stamps or not len(stamps["estimate/time_us"]):
+            return None
+        arrays = {
+            name: stamps[f"estimate/{name}"]
+            for name in ("time_us", "position", "velocity", "quaternion")
+        }
+        return Trajectory(**arrays, power_w=np.zeros(len(arrays["time_us"])))
+
+    @property
+    def believed(self) -> Trajectory:
+        """What the companion was told; the true path where no estimate is recorded."""
+        return self.estimate or self.replayed.path
+
+    @property
+    def decisions(self) -> dict[str, NDArray[Any]]:
+        """The columns of the decisions that were sent, one row each."""
+        stamps = self.replayed.stamps
+        columns = {
+            name: stamps[name]
+            for name in (*STAMPS, "setpoint", "accepted_us", "motor_us")
+            if name in stamps
+        }
+        sent = columns.get("sent_us", np.zeros(0, np.int64)) != NO_STAMP
+        return {name: column[sent] for name, column in columns.items()}
+
+    def navigates(self, time_us: int) -> bool:
+        """Return whether the policy flies."""
+        record = self.replayed.record
+        return record.navigation_us is not None and (
+            record.navigation_us <= time_us < record.ended_us
+        )
+
+
+@dataclass(frozen=True)
+class Charge:
+    """The battery over time, (n,) at the times of the path."""
+
+    voltage_v: NDArray[np.float64]
+    current_a: NDArray[np.float64]
+    discharged_mah: NDArray[np.float64]
+    remaining: NDArray[np.float64]
+    """1 full to 0 empty."""
+
+
+def charge_of(flight: RecordedFlight) -> Charge | None:
+    """Return the battery, worked out from the recorded power as the simulator does.
+
+    None where the power is no simulator's.
+    """
+    path, battery = flight.truth, flight.replayed.vehicle.battery
+    if path is None:
+        return None
+    empty_v, full_v = battery.cells * battery.cell_empty_v, battery.cells * battery.cell_full_v
+    left = float(flight.info.config.get("battery_charge") or 1.0)
+    first = left
+    rows = np.zeros((len(path), 4))
+    steps_s = np.diff(path.time_us, prepend=path.time_us[:1]) / US_PER_S
+    loads_w = path.power_w + flight.info.setup.computer_watts
+    for i, (step_s, load_w) in enumerate(zip(steps_s.tolist(), loads_w.tolist(), strict=True)):
+        rest_v = open_circuit(left, empty_v, full_v)
+        voltage = terminal_voltage(rest_v, battery.resistance_ohm, load_w)
+        current = load_w / voltage
+        left = drain(left, current, battery.capacity_mah, step_s)
+        rows[i] = voltage, current, (first - left) * battery.capacity_mah, left
+    return Charge(*rows.T)
+
+
+def decision_messages(flight: RecordedFlight) -> list[Decision]:
+    """Return the decisions as a black box has them.
+
+    The state that a decision saw is that of the moment at which its inference began.
+    """
+    columns, believed = flight.decisions, flight.believed
+    north, east = flight.replayed.record.goal
+    held_before_us, found = NO_STAMP, []
+    for i in range(len(columns.get("sent_us", ()))):
+        stamps = {name: int(columns[name][i]) for name in STAMPS}
+        position, velocity, quaternion = pose_at(believed, stamps["infer_start_us"])
+        found.append(
+            Decision(
+                **stamps,
+                held_before_us=held_before_us,
+                position=tuple(position.tolist()),
+                velocity=tuple(velocity.tolist()),
+                quaternion=tuple(quaternion.tolist()),
+                goal_away_m=float(np.hypot(position[0] - north, position[1] - east)),
+                setpoint=tuple(columns["setpoint"][i].astype(float).tolist()),
+            )
+        )
+        held_before_us = stamps["held_until_us"]
+    return found

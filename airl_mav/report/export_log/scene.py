@@ -1,0 +1,282 @@
+"""The scene of a flight in Foxglove's primitives: arena, goal, path, vehicle, velocities.
+
+What stands in a message of its own topic is there at any time that a viewer jumps to: viewers load
+the newest message of each topic.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from foxglove.messages import (
+    ArrowPrimitive,
+    CubePrimitive,
+    CylinderPrimitive,
+    LinePrimitive,
+    LinePrimitiveLineType,
+    Pose,
+    SceneEntity,
+    SceneUpdate,
+    SpherePrimitive,
+    TextPrimitive,
+    Timestamp,
+    Vector3,
+)
+
+from airl_mav.arena.geometry import Arena, Bounds, Shape
+from airl_mav.core.frames import frd_to_flu, ned_to_enu, quat_from_direction, quat_from_euler
+from airl_mav.profiles.vehicle import CORNERS
+from airl_mav.report.export_log.foxglove_types import (
+    UNTURNED,
+    WORLD,
+    Floats,
+    colour,
+    place,
+    points,
+    pose,
+    quaternion,
+    vector,
+)
+from airl_mav.view.look import (
+    ARROW_S,
+    COMMANDED,
+    FIRST,
+    FLOOR,
+    FLOWN,
+    GOAL,
+    LEAST_ARROW_M,
+    MOVING,
+    NOSE,
+    OPEN,
+    START,
+    STILL,
+    WALL_OPACITY,
+    Colour,
+    Look,
+)
+from airl_mav.view.messages import VehicleShape
+
+THIN_M = 0.02
+"""Floor, walls and discs."""
+
+Size = tuple[float, float, float]
+
+
+def arena_scene(
+    arena: Arena | None, goal: tuple[float, float], goal_radius_m: float, at: Timestamp
+) -> SceneUpdate:
+    """Return what stands still: floor, walls, obstacles, goal and start."""
+    bounds = OPEN if arena is None else arena.bounds
+    entities = [
+        SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
+        _ends(goal, goal_radius_m, 0.6 * bounds.height, at),
+    ]
+    if arena is not None:
+        walls = SceneEntity(
+            timestamp=at, frame_id=WORLD, id="walls", cubes=_walls(bounds, arena.wall_colour)
+        )
+        centers = arena.obstacles.center
+        standing = [
+            obstacle(arena, i, centers[i], STILL, f"obstacle/{i}", at)
+            for i in range(arena.n_static)
+        ]
+        entities += [walls, *standing]
+    return SceneUpdate(entities=entities)
+
+
+def movers_scene(arena: Arena, from_us: int, at: Timestamp) -> SceneUpdate:
+    """Return the moving obstacles, so long after the reset [µs]."""
+    centers = arena.centers_at(from_us)
+    moving = range(arena.n_static, len(arena.obstacles))
+    return SceneUpdate(
+        entities=[obstacle(arena, i, centers[i], MOVING, f"mover/{i}", at) for i in moving]
+    )
+
+
+def path_scene(way: Floats, at: Timestamp) -> SceneUpdate:
+    """Return the whole way (n, 3) NED [m] as a line."""
+    line = LinePrimitive(
+        type=LinePrimitiveLineType.LineStrip,
+        pose=Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+        thickness=2.0,  # pixels
+        scale_invariant=True,
+        points=points(way),
+        color=colour(FIRST.trail),
+    )
+    return SceneUpdate(
+        entities=[SceneEntity(timestamp=at, frame_id=WORLD, id="path", lines=[line])]
+    )
+
+
+def velocity_scene(
+    position: Floats, flown: Floats, commanded: Floats | None, at: Timestamp
+) -> SceneUpdate:
+    """Return the velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
+    arrows = [_arrow(position, flown, FLOWN)]
+    if commanded is not None:
+        arrows.append(_arrow(position, commanded, COMMANDED))
+    shown = [arrow for arrow in arrows if arrow is not None]
+    return SceneUpdate(
+        entities=[SceneEntity(timestamp=at, frame_id=WORLD, id="velocity", arrows=shown)]
+    )
+
+
+def vehicle_scene(shape: VehicleShape, frame: str, look: Look, at: Timestamp) -> SceneUpdate:
+    """Return a vehicle of its parts, which moves with its frame."""
+    forward, right = shape.arm_forward_m, shape.arm_right_m
+    height, size = max(0.04, 0.5 * shape.height_m), 0.45 * min(forward, right)
+    opacity = 1.0 if look.whole else 0.4
+    cubes = [
+        _part((0.0, 0.0, 0.0), (3.4 * size, 2.2 * size, height), look.body, opacity),
+        _part((2.0 * size, 0.0, 0.0), (0.9 * size, size, 0.6 * height), NOSE, opacity),
+    ]
+    rotors = []
+    for corner in CORNERS:
+        fore, side = "front" in corner, "right" in corner
+        at_frd = np.array(
+            [forward if fore else -forward, right if side else -right, -0.5 * height - THIN_M]
+        )
+        cubes.append(_arm(at_frd, look.body, opacity))
+        rotors.append(
+            CylinderPrimitive(
+                pose=_in_body(at_frd),
+                size=Vector3(x=2.0 * shape.rotor_radius_m, y=2.0 * shape.rotor_radius_m, z=THIN_M),
+                bottom_scale=1.0,
+                top_scale=1.0,
+                color=colour(look.disc, 0.5 * opacity),
+            )
+        )
+    entity = SceneEntity(
+        timestamp=at, frame_id=frame, id=frame, frame_locked=True, cubes=cubes, cylinders=rotors
+    )
+    return SceneUpdate(entities=[entity])
+
+
+def obstacle(
+    arena: Arena, i: int, center: Floats, rgb: Colour, name: str, at: Timestamp
+) -> SceneEntity:
+    """Return obstacle i, whose centre (3,) NED [m] is there now."""
+    half_size = arena.obstacles.half_size[i]
+    yaw = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
+    look: dict[str, Any] = {
+        "pose": pose(center, yaw),
+        "size": vector(2.0 * half_size),
+        "color": colour(rgb),
+    }
+    entity: dict[str, Any] = {"timestamp": at, "frame_id": WORLD, "id": name}
+    if arena.obstacles.shape[i] == Shape.BOX:
+        return SceneEntity(**entity, cubes=[CubePrimitive(**look)])
+    if arena.obstacles.shape[i] == Shape.SPHERE:
+        return SceneEntity(**entity, spheres=[SpherePrimitive(**look)])
+    whole = CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
+    return SceneEntity(**entity, cylinders=[whole])
+
+
+def _floor(b: Bounds) -> CubePrimitive:
+    north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
+    size = (b.north_max - b.north_min, b.east_max - b.east_min, THIN_M)
+    return _block(np.array([north, east, 0.5 * THIN_M]), size, FLOOR)
+
+
+def _walls(b: Bounds, rgb: Colour) -> list[CubePrimitive]:
+    north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
+    along_east = (THIN_M, b.east_max - b.east_min, b.height)
+    along_north = (b.north_max - b.north_min, THIN_M, b.height)
+    sides = [
+        (b.north_min, east, along_east),
+        (b.north_max, east, along_east),
+        (north, b.east_min, along_north),
+        (north, b.east_max, along_north),
+    ]
+    return [
+        _block(np.array([x, y, -0.5 * b.height]), size, rgb, WALL_OPACITY) for x, y, size in sides
+    ]
+
+
+def _ends(
+    goal: tuple[float, float], radius_m: float, height_m: float, at: Timestamp
+) -> SceneEntity:
+    """Return the goal with its pole and name, and the start."""
+
+    def disc(north: float, east: float, radius: float, rgb: Colour) -> CylinderPrimitive:
+        return _cylinder(np.array([north, east, -THIN_M]), radius, THIN_M, rgb, 0.45)
+
+    north, east = goal
+    pole = _cylinder(np.array([north, east, -0.5 * height_m]), 0.04, height_m, GOAL)
+    name = TextPrimitive(
+        pose=pose(np.array([north, east, -height_m - 0.4])),
+        billboard=True,
+        font_size=0.6,
+        color=colour(GOAL),
+        text="goal",
+    )
+    return SceneEntity(
+        timestamp=at,
+        frame_id=WORLD,
+        id="goal",
+        cylinders=[disc(north, east, radius_m, GOAL), pole, disc(0.0, 0.0, 0.4, START)],
+        texts=[name],
+    )
+
+
+def _cylinder(
+    center: Floats, radius: float, height: float, rgb: Colour, opacity: float = 1.0
+) -> CylinderPrimitive:
+    return CylinderPrimitive(
+        pose=pose(center),
+        size=Vector3(x=2.0 * radius, y=2.0 * radius, z=height),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=colour(rgb, opacity),
+    )
+
+
+def _block(center: Floats, size: Size, rgb: Colour, opacity: float = 1.0) -> CubePrimitive:
+    """Return a block, north by east by height [m], at a place NED."""
+    x, y, z = size
+    return CubePrimitive(pose=pose(center), size=Vector3(x=x, y=y, z=z), color=colour(rgb, opacity))
+
+
+def _in_body(frd: Floats, yaw: float = 0.0) -> Pose:
+    """Return a place FRD [m] on the body, turned by an angle to the right [rad]."""
+    turned = quat_from_euler(0.0, 0.0, -yaw)
+    return Pose(position=vector(frd_to_flu(frd)), orientation=quaternion(turned))
+
+
+def _part(frd: Size, size: Size, rgb: Colour, opacity: float) -> CubePrimitive:
+    x, y, z = size
+    return CubePrimitive(
+        pose=_in_body(np.array(frd)), size=Vector3(x=x, y=y, z=z), color=colour(rgb, opacity)
+    )
+
+
+def _arm(rotor: Floats, rgb: Colour, opacity: float) -> CubePrimitive:
+    """Return what carries a rotor, from the middle to its place FRD [m]."""
+    forward, right, _ = rotor.tolist()
+    half = np.array([0.5 * forward, 0.5 * right, 0.0])
+    return CubePrimitive(
+        pose=_in_body(half, math.atan2(right, forward)),
+        size=Vector3(x=math.hypot(forward, right), y=0.025, z=0.02),
+        color=colour(rgb, opacity),
+    )
+
+
+def _arrow(position: Floats, velocity: Floats, rgb: Colour) -> ArrowPrimitive | None:
+    """Return the arrow of a velocity NED [m/s]; None: it is too short."""
+    length = ARROW_S * float(np.linalg.norm(velocity))
+    if length < LEAST_ARROW_M:
+        return None
+    head = min(0.16, 0.5 * length)
+    return ArrowPrimitive(
+        pose=Pose(
+            position=place(position),
+            orientation=quaternion(quat_from_direction(ned_to_enu(velocity))),
+        ),
+        shaft_length=length - head,
+        shaft_diameter=0.05,
+        head_length=head,
+        head_diameter=0.14,
+        color=colour(rgb),
+    )

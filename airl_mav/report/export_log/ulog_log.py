@@ -1,0 +1,226 @@
+"""A flight as a ULog, for a level that has no flight controller's own log.
+
+Topics are those of the vehicle's own log (`firmware_sim.flight_log.topics`), as far as a run folder
+holds them. A field that is not known is NaN, or 0 where it is no float.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from airl_mav.core.frames import quats_to_euler
+from airl_mav.flight.smoothness import commanded_velocity
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.report.export_log.recorded import RecordedFlight, charge_of
+from airl_mav.report.replay.flight import INFO, STANDING_M, WARNING
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.flight_log.flight_log import DESCRIBED
+from firmware_sim.flight_log.topics import ON_CHANGE_US, TOPICS
+from firmware_sim.flight_log.ulog import Topic, UlogWriter, Values
+from firmware_sim.flight_log.values import ARMED, DISARMED, NAVIGATION_STATES, ROTARY_WING
+
+_LOGGED = {logged.topic.name: logged for logged in TOPICS}
+
+TRAJECTORY_SETPOINT = Topic(
+    "trajectory_setpoint",
+    (
+        *("float[3] position", "float[3] velocity", "float[3] acceleration", "float[3] jerk"),
+        *("float yaw", "float yawspeed"),
+    ),
+)
+"""What the companion asks for; PX4 logs it every 200 ms."""
+
+SETPOINT_US = 200_000
+
+NAMES = (
+    "vehicle_attitude",
+    "vehicle_attitude_groundtruth",
+    "vehicle_local_position",
+    "vehicle_local_position_groundtruth",
+    "vehicle_local_position_setpoint",
+    "battery_status",
+    "vehicle_status",
+    "actuator_armed",
+    "vehicle_land_detected",
+)
+
+EXPORTED = (*(_LOGGED[name].topic for name in NAMES), TRAJECTORY_SETPOINT)
+
+_NUMBER = {topic.name: i for i, topic in enumerate(EXPORTED)}
+
+Sample = tuple[int, str, Values]
+"""Time [µs], topic, values."""
+
+
+def write_ulog(flight: RecordedFlight, path: Path) -> None:
+    """Write a flight; what is there already is replaced.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    start_us = int(flight.replayed.path.time_us[0])
+    writer = UlogWriter(
+        path,
+        start_us,
+        EXPORTED,
+        (("sys_name", "airl-mav export-log"), *DESCRIBED),
+        (),
+    )
+    try:
+        texts = [(time_us, "", (severity, words)) for time_us, severity, words in _texts(flight)]
+        rows: list[tuple[int, str, Any]] = [*samples(flight), *texts]
+        for time_us, name, values in sorted(rows, key=itemgetter(0)):
+            if name:
+                writer.sample(_NUMBER[name], time_us, values)
+            else:
+                writer.text(time_us, *values)
+        writer.flush()
+        if writer.failure is not None:
+            raise OSError(writer.failure.errno, writer.failure.strerror, str(path))
+        writer.close()
+    except BaseException:
+        writer.discard()
+        raise
+
+
+def samples(flight: RecordedFlight) -> Iterator[Sample]:
+    """Give what is logged, topic by topic."""
+    path, truth = flight.replayed.path, flight.truth
+    yield from _motion(flight.believed, "")
+    if truth is not None:
+        yield from _motion(truth, "_groundtruth")
+    yield from _setpoints(flight)
+    yield from _battery(flight)
+    yield from _states(flight, path)
+
+
+def row(topic: str, **known: Any) -> Values:
+    """Return the values of a topic's fields, of which some are known.
+
+    Raises:
+        ValueError: An array has another length than its field.
+        KeyError: The topic has no such field.
+    """
+    values: list[float | int | bool] = []
+    for field in EXPORTED[_NUMBER[topic]].fields:
+        kind, name = field.split()
+        base, _, count = kind.rstrip("]").partition("[")
+        length = int(count or 1)
+        unknown = math.nan if base in ("float", "double") else False if base == "bool" else 0
+        given = known.pop(name, [unknown] * length)
+        part = np.atleast_1d(given).tolist()
+        if len(part) != length:
+            raise ValueError(f"{topic}.{name}: {len(part)} values, not {length}")
+        values += part
+    if known:
+        raise KeyError(f"{topic}: {', '.join(known)}")
+    return tuple(values)
+
+
+def _every(path: Trajectory, interval_us: int) -> list[int]:
+    """Return rows of a path that are at least so far apart [µs]."""
+    kept, due_us = [], int(path.time_us[0])
+    for i, time_us in enumerate(path.time_us.tolist()):
+        if time_us >= due_us:
+            kept.append(i)
+            due_us = time_us + interval_us
+    return kept
+
+
+def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
+    """Give attitude, position and velocity, NED; `suffix` is that of the topics' names."""
+    attitude, position = f"vehicle_attitude{suffix}", f"vehicle_local_position{suffix}"
+    for i in _every(path, _LOGGED[attitude].interval_us):
+        time_us = int(path.time_us[i])
+        yield time_us, attitude, row(attitude, timestamp_sample=time_us, q=path.quaternion[i])
+    headings = quats_to_euler(path.quaternion)[2]
+    valid = dict.fromkeys(("xy_valid", "z_valid", "v_xy_valid", "v_z_valid"), True)
+    for i in _every(path, _LOGGED[position].interval_us):
+        time_us = int(path.time_us[i])
+        places = dict(zip(("x", "y", "z"), path.position[i].tolist(), strict=True))
+        speeds = dict(zip(("vx", "vy", "vz"), path.velocity[i].tolist(), strict=True))
+        known = {**places, **speeds, "z_deriv": speeds["vz"], "heading": headings[i], **valid}
+        yield time_us, position, row(position, timestamp_sample=time_us, **known)
+
+
+def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
+    """Give the commanded velocity, NED, and yaw rate, while the policy flies."""
+    columns, path = flight.decisions, flight.replayed.path
+    if not len(columns.get("sent_us", ())):
+        return
+    velocities = commanded_velocity(path, columns, path.time_us)
+    which = np.searchsorted(columns["sent_us"], path.time_us, side="right") - 1
+    tracked = "vehicle_local_position_setpoint"
+    for name, interval_us in (
+        (tracked, _LOGGED[tracked].interval_us),
+        (TRAJECTORY_SETPOINT.name, SETPOINT_US),
+    ):
+        for i in _every(path, interval_us):
+            time_us = int(path.time_us[i])
+            if which[i] < 0 or not flight.navigates(time_us):
+                continue
+            turn = float(columns["setpoint"][which[i], 3])
+            velocity = velocities[i].tolist()
+            if name == tracked:
+                speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
+                yield time_us, name, row(name, **speeds, yawspeed=turn)
+            else:
+                yield time_us, name, row(name, velocity=velocity, yawspeed=turn)
+
+
+def _battery(flight: RecordedFlight) -> Iterator[Sample]:
+    charge, path, name = charge_of(flight), flight.replayed.path, "battery_status"
+    if charge is None:
+        return
+    for i in _every(path, _LOGGED[name].interval_us):
+        values = row(
+            name,
+            voltage_v=charge.voltage_v[i],
+            current_a=charge.current_a[i],
+            discharged_mah=charge.discharged_mah[i],
+            remaining=charge.remaining[i],
+            scale=1.0,
+            connected=True,
+            id=1,
+        )
+        yield int(path.time_us[i]), name, values
+
+
+def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
+    """Give who flies and whether it flies, when that changes and every half second."""
+    last, due_us = None, 0
+    for time_us, position in zip(path.time_us.tolist(), path.position, strict=True):
+        navigates = flight.navigates(time_us)
+        flies = navigates or -float(position[2]) > STANDING_M
+        if (navigates, flies) == last and time_us < due_us:
+            continue
+        last, due_us = (navigates, flies), time_us + ON_CHANGE_US
+        mode = NAVIGATION_STATES[Mode.OFFBOARD if navigates else Mode.HOLD]
+        status = row(
+            "vehicle_status",
+            arming_state=ARMED if flies else DISARMED,
+            nav_state_user_intention=mode,
+            nav_state=mode,
+            vehicle_type=ROTARY_WING,
+            pre_flight_checks_pass=True,
+        )
+        landed = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), not flies)
+        yield time_us, "vehicle_status", status
+        yield time_us, "actuator_armed", row("actuator_armed", armed=flies, ready_to_arm=True)
+        yield time_us, "vehicle_land_detected", row("vehicle_land_detected", **landed)
+
+
+def _texts(flight: RecordedFlight) -> Iterator[tuple[int, int, str]]:
+    """Give texts: time [µs], severity, words."""
+    record = flight.replayed.record
+    for note in (*record.notes, *record.invalid):
+        yield int(flight.replayed.path.time_us[0]), WARNING, note
+    for fault in record.faults:
+        yield fault.from_us, WARNING, f"begins: {fault.fault}"
+    yield record.ended_us, INFO, f"{record.outcome.value}: {record.reason}"
