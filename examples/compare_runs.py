@@ -1,4 +1,4 @@
-"""Compare two runs over pairs of flights: the default policy in calm air and in wind.
+"""Compare two runs over pairs of flights: `static-obstacles` in calm air and in wind.
 
 In the batch twin, where forty flights take seconds; `level="lockstep"` flies them through MAVSDK.
 """

@@ -1,4 +1,4 @@
-"""Rehearse the default policy as late as a Raspberry Pi 4, from Python."""
+"""Rehearse `static-obstacles` as late as a Raspberry Pi 4, from Python."""
 
 from airl_mav import Scenario, rehearse
 

@@ -32,9 +32,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep the tests of a module on one worker: what they share is made once.
 
     Tests that name a group of their own fly in real time, the longest of all: they begin.
+    A machine that stands still for a second alters such a flight, so that what fails among them
+    and among the slow ones is run once more; the summary lists it (RERUN).
     """
     named = [item.get_closest_marker("xdist_group") is not None for item in items]
     for item, group in zip(items, named, strict=True):
+        if group or item.get_closest_marker("slow") is not None:
+            item.add_marker(pytest.mark.flaky(reruns=1))
         if not group:
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
     order = sorted(range(len(items)), key=lambda index: not named[index])

@@ -16,7 +16,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_tables import failures_first
-from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
+from airl_mav.report.table import NONE, Column, TableView
 
 ENERGY_NAME = "energy"
 
@@ -76,8 +76,11 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
     return flights
 
 
-def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
-    """Return the energy of all flights (at least one) together, by part."""
+def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> TableView:
+    """Return the energy of all flights (at least one) together, by part.
+
+    A computer `on_ground` takes nothing from the pack, and has no row.
+    """
     columns = (
         Column("part", number=False),
         Column("all flights", "kJ"),
@@ -91,8 +94,12 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
     splits = [f.parts for f in flights if f.parts is not None]
     lines = [("airframe", airframe)]
     notes = [
-        f"{len(flights):,} flights, from the start of navigation, failed ones included. Computer: "
-        "its watts times the flight time."
+        f"{len(flights):,} flights, from the start of navigation, failed ones included. "
+        + (
+            "The computer is on the ground: not charged."
+            if on_ground
+            else "Computer: its watts times the flight time."
+        )
     ]
     if splits and len(splits) == len(flights):
         split = add_up(splits)
@@ -102,7 +109,8 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
             "Speed: what steady level flight at that speed adds; below 0 where it saves. "
             "Manoeuvres: what is left, of accelerating, braking, climbing and wind."
         )
-    lines.append(("computer", computer))
+    if not on_ground:
+        lines += [("computer", computer), ("together", whole)]
     rows = tuple(
         (
             title,
@@ -110,7 +118,7 @@ def energy_table(flights: Sequence[FlightEnergy]) -> TableView:
             f"{100.0 * joules / whole:.1f}" if whole else NONE,
             f"{joules / time_s:,.1f}" if time_s else NONE,
         )
-        for title, joules in [*lines, ("together", whole)]
+        for title, joules in lines
     )
     return TableView("energy", "Energy", columns, rows, tuple(notes))
 
@@ -119,17 +127,13 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
     """Return the energy of each flight, of at most so many, those that failed first."""
     columns = (
         Column("#"),
-        Column("outcome", number=False),
-        Column("time", "s"),
-        Column("airframe", "kJ"),
         *(Column(title, "kJ") for title in AIRFRAME.values()),
-        Column("computer", "J"),
         Column("mean power", "W"),
     )
     shown = {r.index for r in failures_first([f.record for f in flights], most)}
     rows = tuple(_flight_row(f) for f in flights if f.record.index in shown)
-    notes = ("Mean power: of airframe and computer together.",)
-    return TableView("energy-flights", "Energy of each flight", columns, rows, notes)
+    notes = ("The airframe's parts. Mean power: of airframe and computer together.",)
+    return TableView("energy-flights", "Parts of each flight's energy", columns, rows, notes)
 
 
 def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
@@ -139,16 +143,12 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     q = flight.quality
     return (
         f"{flight.record.index}",
-        OUTCOME_LABELS[flight.record.outcome],
-        f"{q.flight_time_s:.2f}",
-        f"{q.energy_j / 1e3:.2f}",
         *parts,
-        f"{q.computer_energy_j:,.0f}",
         f"{q.total_energy_j / q.flight_time_s:,.1f}" if q.flight_time_s else NONE,
     )
 
 
-def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
+def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> theme.Picture:
     """Draw the energy of each flight (at least one), its parts on top of each other."""
     figure = theme.new_figure(6.4, 3.4)
     ax = figure.subplots()
@@ -162,7 +162,8 @@ def energy_figure(flights: Sequence[FlightEnergy]) -> theme.Picture:
     whole = all(f.parts is not None for f in flights)
     x = kept
     above, below = np.zeros(len(ranked)), np.zeros(len(ranked))
-    for name, title, colour in PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1]):
+    parts = PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1])
+    for name, title, colour in parts[:-1] if on_ground else parts:
         values = np.array([_joules(f, name) for f in ranked]) / 1e3
         # What is below 0 hangs below the axis: the bar above it is longer than the energy drawn.
         base = np.where(values < 0.0, below, above)

@@ -95,7 +95,7 @@ def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Pictu
     arena = next(iter(arenas.values())) if len(bounds) == 1 else None
     panel = Panel("", "", run.episodes, run.trajectories, arena)
     alt = f"The paths of {len(run.episodes)} flights from above, coloured by how they ended"
-    return _draw_panel(OVERVIEW_NAME, alt, panel, _extent([panel]), width_in=6.4)
+    return _draw_panel(OVERVIEW_NAME, alt, panel, _extent([panel]), width_in=4.6)
 
 
 def _extent(panels: Sequence[Panel]) -> _Extent:

@@ -1,9 +1,8 @@
-"""The figures of a run's report: latency by stage, the flight from above, the flight over time."""
+"""The figures of a run's report: latency by stage, the flight from above."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -19,22 +18,19 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import draw_arena
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stages import Samples, Stage
 from airl_mav.report import theme
-from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.table import OUTCOME_LABELS, ms
 
 LONG_TAIL = 30.0
 """A maximum this many times the median: the axis becomes logarithmic."""
 PATH_SEGMENTS = 500
 """A drawn path has at most this many corners: more are not seen, and weigh."""
-TIME_POINTS = 500
-"""A line over time has at most this many corners."""
 PATH_COLOURS = 24
 """Steps of a path's colour: neighbours of one step are one line."""
 
@@ -238,49 +234,3 @@ def coloured_pieces(
     starts, ends = [0, *cuts], [*cuts, len(values)]
     pieces = [points[start : end + 1] for start, end in zip(starts, ends, strict=True)]
     return pieces, (levels[np.array(starts)] + 0.5) * step
-
-
-def time_figure(episode: EpisodeRecord, trajectory: Trajectory) -> theme.Picture:
-    """Draw speed, altitude and power over time, zero where navigation begins."""
-    zero_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
-    keep = np.unique(np.linspace(0, len(trajectory) - 1, TIME_POINTS).astype(int))
-    # Power is a mean since the sample before: so it stays when samples are left out.
-    steps_us = np.diff(trajectory.time_us, prepend=trajectory.time_us[0] - 1)
-    energy = np.cumsum(trajectory.power_w * steps_us)
-    passed_us = trajectory.time_us[keep] - trajectory.time_us[0] + 1
-    power = np.diff(energy[keep], prepend=0.0) / np.diff(passed_us, prepend=0)
-    t = (trajectory.time_us[keep] - zero_us) / US_PER_S
-    margins = theme.Margins(left=0.62, right=0.12, bottom=0.45, top=0.08, between=0.1)
-    figure, axes = theme.stacked_axes(3, 5.2, 4.9, margins)
-    rows: tuple[tuple[Any, str, NDArray[np.float64]], ...] = tuple(
-        zip(
-            axes,
-            ("speed [m/s]", "altitude [m]", "power [W]"),
-            (trajectory.speed()[keep], -trajectory.position[keep, 2], power),
-            strict=True,
-        )
-    )
-    for ax, label, values in rows:
-        ax.plot(t, values, color=theme.SERIES, lw=1.2)
-        theme.label_axes(ax, y=label)
-        ax.set_ylim(bottom=min(0.0, float(values.min())))
-        if t[0] < 0.0:
-            ax.axvspan(t[0], 0.0, color=theme.RULE, alpha=0.45, lw=0)
-        for begin_s, end_s in fault_spans_s(episode):
-            ax.axvspan(begin_s, end_s, color=theme.MARK, alpha=0.12, lw=0)
-        theme.plain_axes(ax)
-        ax.set_xlim(t[0], t[-1])
-    if t[0] < 0.0:
-        rows[0][0].annotate(
-            "take-off",
-            (t[0], 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(3, -3),
-            textcoords="offset points",
-            va="top",
-            fontsize=8,
-            color=theme.MUTED,
-        )
-    theme.label_axes(rows[-1][0], "time since the start of navigation [s]")
-    alt = f"Speed, altitude and power over time, flight {episode.index}"
-    return theme.render(figure, f"flight-{episode.index:03d}-time", alt)

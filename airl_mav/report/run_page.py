@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.files import replace_file
-from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.ages import ages_table, run_ages
@@ -31,18 +30,14 @@ from airl_mav.report.energy import (
     energy_table,
     flight_energies,
 )
+from airl_mav.report.estimation import estimation_table
 from airl_mav.report.faults import faults_table
+from airl_mav.report.flight_data import BEST
 from airl_mav.report.flights_above import overview_picture
-from airl_mav.report.forensics.evidence import Cause
-from airl_mav.report.forensics.worst import (
-    causes_table,
-    examine_worst,
-    flown_path,
-    ranked,
-    worst_table,
-)
+from airl_mav.report.forensics.worst import causes_table, examine_worst, worst_table
 from airl_mav.report.measures import rate_digits
-from airl_mav.report.run_figures import latency_figure, map_figure, time_figure
+from airl_mav.report.packing import packed
+from airl_mav.report.run_figures import latency_figure
 from airl_mav.report.run_summary import RunSummary, summarize_run
 from airl_mav.report.run_tables import (
     episodes_table,
@@ -51,28 +46,29 @@ from airl_mav.report.run_tables import (
     real_time_table,
     setup_rows,
 )
-from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, plotly_script, scene_json, top_speed
+from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
+from airl_mav.report.shown_flights import (
+    ShownFlights,
+    page_data,
+    pictured_flights,
+    shown_flights,
+)
 from airl_mav.report.table import OUTCOME_LABELS, ms
-from airl_mav.report.theme import Picture, montage
-from airl_mav.report.timeline import OUTLIER_NOTE, slowest_table, timeline_figure, timeline_of
+from airl_mav.report.theme import montage
+from airl_mav.report.timeline import (
+    OUTLIER_NOTE,
+    sawtooth_notes,
+    slowest_table,
+    timeline_figure,
+    timeline_of,
+)
 from airl_mav.report.verdict import OverallVerdict
 
-MAX_PICTURED = 12
-"""Flights with pictures: the worst."""
+SCRIPTS = ("scene.js", "tracks.js", "seen.js", "page.js")
+"""Of the page, in the order in which they build on each other."""
 
 MAX_LISTED = 200
 """Flights in the table: those that failed first."""
-
-
-@dataclass(frozen=True)
-class PicturedFlight:
-    """One flight that the page shows by itself."""
-
-    record: EpisodeRecord
-    cause: Cause | None
-    pictures: tuple[Picture, ...]
-    scene: int | None
-    """Its number in the view in three dimensions; None where it has no path."""
 
 
 def build_page(
@@ -99,24 +95,30 @@ def build_page(
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize_run(run)
     measured = [stage for stage in summary.shown_stages if summary.stages[stage.key].n]
-    samples = [(s, summary.samples[s.key], summary.stages[s.key]) for s in measured]
+    # Of what is the same in every decision, the table has said all.
+    drawn = [stage for stage in measured if np.ptp(summary.samples[stage.key])]
+    samples = [(s, summary.samples[s.key], summary.stages[s.key]) for s in drawn]
     latency_pictures = [latency_figure(*part) for part in samples]
     if latency_pictures:
         replace_file(folder / "latency.png", montage(latency_pictures, SHEET_COLUMNS))
     decisions = timeline_of(run)
-    timeline = timeline_figure(decisions, measured) if measured and len(decisions) else None
-    energies = flight_energies(run, vehicle)
-    energy = energy_figure(energies) if energies else None
-    overview = overview_picture(run, arenas) if needs_overview(run) else None
+    timeline = timeline_figure(decisions, drawn) if drawn and len(decisions) else None
+    energies, on_ground = flight_energies(run, vehicle), run.info.setup.computer_on_ground
+    energy = energy_figure(energies, on_ground=on_ground) if energies else None
     judged = examine_worst(run, arenas, vehicle)
-    shown = _shown(run, arenas)
-    flights = _flights(run, arenas, shown, {j.record.index: j.cause for j in judged})
-    alone = [overview, timeline, energy]
-    pictures = [picture for flight in flights for picture in flight.pictures]
-    for picture in [*pictures, *(picture for picture in alone if picture)]:
+    view = shown_flights(run, arenas, vehicle)
+    range_m = 0.0 if vehicle is None else vehicle.camera.range_m
+    causes = {j.record.index: j.cause for j in judged}
+    flights = pictured_flights(run, arenas, view, causes, range_m)
+    overview = overview_picture(run, arenas) if run.episodes else None
+    packed_pictures = [
+        *(picture for flight in flights for picture in flight.pictures),
+        *(picture for picture in (timeline, energy) if picture),
+    ]
+    for picture in [*packed_pictures, *([overview] if overview else [])]:
         replace_file(folder / f"{picture.name}.png", picture.png)
-    everyone = ranked(run)[:ALL_FLIGHTS]
-    fov = 0.0 if vehicle is None else vehicle.camera.horizontal_fov_deg
+    data = page_data(run, view, [*packed_pictures, *latency_pictures], vehicle)
+    slowest = slowest_table(decisions, measured) if len(decisions) else None
     page = (
         environment()
         .get_template("report.html.j2")
@@ -131,29 +133,35 @@ def build_page(
             ],
             verdict=() if verdict is None else verdict.lines,
             status="" if verdict is None else verdict.status,
-            headlines=_headlines(run, summary),
+            headlines=run_headlines(run, summary),
             origin=run.info.setup.injection.origin,
             setup=setup_rows(run),
-            quality=quality_table(summary),
+            quality=quality_table(summary, computer=not on_ground),
             conduct=conduct_table(run, summary),
             faults=faults_table(run),
             real_time=real_time_table(run, summary) if summary.timed else None,
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,
+            worst_links=[_link(view, j.record.index) for j in judged],
             causes=causes_table(judged, run),
-            scene_flights=[(k, flight) for k, flight in enumerate(shown)],
-            scene_all=len(everyone),
-            scene_data=Markup(scene_json(run, shown, everyone, fov)),  # noqa: S704 - escaped there
-            scene_scripts=[Markup(text) for text in _scripts()] if shown else [],  # noqa: S704 - our own
+            scene_flights=[(k, flight.scene) for k, flight in enumerate(view.flights)],
+            scene_all=min(len(run.episodes), ALL_FLIGHTS),
+            scores_title=_scores_title(view),
+            seen_note=view.note,
+            estimation=estimation_table([flight.tracked for flight in view.flights]),
+            page_data=packed(data),
+            library=packed(plotly_script()) if view.flights else "",
+            script=Markup(_script()),  # noqa: S704 - our own
             energy=energy,
-            energy_table=energy_table(energies) if energies else None,
+            energy_table=energy_table(energies, on_ground=on_ground) if energies else None,
             energy_flights=energy_flights_table(energies, MAX_LISTED) if energies else None,
             latency=latency_table(summary),
             ages=ages_table(run_ages(run), summary.stages["end_to_end"]),
             latency_pictures=latency_pictures,
             timeline=timeline,
-            timeline_rule=OUTLIER_NOTE,
-            slowest=slowest_table(decisions, measured) if len(decisions) else None,
+            timeline_notes=[*sawtooth_notes(decisions, vehicle), OUTLIER_NOTE],
+            slowest=None if slowest is None else slowest[0],
+            slowest_links=[] if slowest is None else [_link(view, *each) for each in slowest[1]],
             episodes=episodes_table(run, MAX_LISTED),
             flights=flights,
             flown=len(run.episodes),
@@ -172,54 +180,28 @@ def _kind(run: LoadedRun, summary: RunSummary) -> str:
     return "Evaluation" if summary.modelled or "command" in run.info.config else "Rehearsal"
 
 
-def pictured(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return the episodes that get pictures, the worst first."""
-    return ranked(run)[:MAX_PICTURED]
+def _script() -> str:
+    """Return the page's own script."""
+    folder = files("airl_mav.report") / "templates"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS)
 
 
-def needs_overview(run: LoadedRun) -> bool:
-    """Return whether there are too many flights to be looked at one by one."""
-    many = len(run.episodes) > MAX_PICTURED or run.info.setup.level == "gym"
-    return many and bool(run.episodes)
+def _link(
+    view: ShownFlights, index: int, seconds: float | None = None
+) -> tuple[int, float | None] | None:
+    """Return where a flight, and a moment of it, is in the view of single flights."""
+    number = view.numbers.get(index)
+    return None if number is None else (number, None if seconds is None else round(seconds, 3))
 
 
-def _scripts() -> list[str]:
-    """Return the scripts of the page: the library, and what shows the views with it."""
-    own = files("airl_mav.report") / "templates" / "scene.js"
-    return [plotly_script(), own.read_text(encoding="utf-8")]
+def _scores_title(view: ShownFlights) -> str:
+    """Say what stands beside the actions."""
+    if view.policy is None:
+        return ""
+    return f"{BEST} best of {len(view.policy.actions)} actions and their {view.policy.scores_are}s"
 
 
-def _shown(run: LoadedRun, arenas: Mapping[int, Arena]) -> list[SceneFlight]:
-    """Return the flights with pictures that have a path, the worst first."""
-    paths = [(episode, flown_path(run, episode)) for episode in pictured(run)]
-    return [
-        SceneFlight(episode, path, arenas.get(episode.index))
-        for episode, path in paths
-        if path is not None and len(path) > 1
-    ]
-
-
-def _flights(
-    run: LoadedRun,
-    arenas: Mapping[int, Arena],
-    shown: Sequence[SceneFlight],
-    causes: Mapping[int, Cause],
-) -> list[PicturedFlight]:
-    """Draw the flights that get pictures, the worst first."""
-    numbers = {flight.record.index: k for k, flight in enumerate(shown)}
-    top = top_speed(shown)
-    flights = []
-    for episode in pictured(run):
-        number = numbers.get(episode.index)
-        path = None if number is None else shown[number].path
-        pictures = [map_figure(episode, path, arenas.get(episode.index), top)]
-        if path is not None:
-            pictures.append(time_figure(episode, path))
-        flights.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))
-    return flights
-
-
-def _headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
+def run_headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
     """Return the figures that answer the question: how late, how well."""
     q = summary.quality
     end_to_end = summary.stages["end_to_end"]

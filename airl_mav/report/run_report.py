@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.statistics import aggregate
 from airl_mav.rehearsal.run_folder import LoadedRun, load
@@ -17,7 +18,7 @@ from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_verdict
 from airl_mav.report.faults import faults_table
 from airl_mav.report.forensics.worst import EXAMINED, ranked
-from airl_mav.report.run_page import build_page, pictured
+from airl_mav.report.run_page import build_page
 from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import (
     episodes_table,
@@ -26,6 +27,7 @@ from airl_mav.report.run_tables import (
     real_time_table,
     setup_rows,
 )
+from airl_mav.report.shown_flights import shown
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -71,7 +73,7 @@ def write_report(
     if isinstance(run, Path):
         run = load(run)
     vehicle = vehicle_of(run.info)
-    arenas = arenas_of([*ranked(run)[:EXAMINED], *pictured(run)], vehicle)
+    arenas = arenas_of([*ranked(run)[:EXAMINED], *shown(run)], vehicle)
     verdict = verdict or verdict_of(run)
     page = build_page(run, arenas, out, vehicle=vehicle, verdict=verdict)
     save_verdict(verdict, page.parent)
@@ -94,10 +96,14 @@ def print_report(
     """
     print_verdict((verdict or verdict_of(run)).lines, console)
     console.print()
-    summary = summarize_run(run)
+    summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
     flights = count_outcomes([episode.outcome for episode in run.episodes])
     print_facts([*setup_rows(run), ("flights", flights)], console)
-    views = [latency_table(summary), episodes_table(run, MAX_LISTED), quality_table(summary)]
+    views = [
+        latency_table(summary),
+        episodes_table(run, MAX_LISTED),
+        quality_table(summary, computer=feeds),
+    ]
     if (conduct := conduct_table(run, summary)) is not None:
         views.append(conduct)
     if (faults := faults_table(run)) is not None:
@@ -112,11 +118,26 @@ def print_report(
         console.print(Text.assemble(("report  ", "dim"), str(page)), soft_wrap=True)
 
 
-def show_report(run: LoadedRun, verdict: OverallVerdict, console: Console) -> None:
+def show_report(
+    run: LoadedRun, verdict: OverallVerdict, console: Console, progress: Progress | None = None
+) -> Path | None:
     """Write the report of a run, where a flight was finished, and print it.
+
+    Args:
+        run: The run.
+        verdict: Heads it.
+        console: Where it is printed.
+        progress: Is told that it is drawn.
+
+    Returns:
+        The path of the page; None: no flight was finished.
 
     Raises:
         UsageError: See `write_report`.
     """
+    progress = progress or Progress()
+    progress.status(DRAWING)
     page = write_report(run, verdict=verdict) if run.episodes else None
+    progress.status(None)
     print_report(run, console, page, verdict)
+    return page

@@ -111,6 +111,7 @@ def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[Episode
 
 def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
     """Return the quality of each flight, or of at most so many, those that failed first."""
+    feeds = not run.info.setup.computer_on_ground
     columns = (
         Column("#"),
         Column("seed"),
@@ -120,15 +121,17 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
         Column("energy", "kJ"),
         Column("speed", "m/s"),
         Column("top speed", "m/s", page_only=True),
-        Column("computer", "J", page_only=True),
+        *([Column("computer", "J", page_only=True)] if feeds else []),
         Column("take-off", "s, kJ", page_only=True),
         Column("battery", "%", page_only=True),
         Column("why", number=False, page_only=True),
     )
     total = len(run.episodes)
     shown = run.episodes if most is None else failures_first(run.episodes, most)
-    rows = tuple(_episode_row(episode) for episode in shown)
-    notes = ["From the start of navigation; the take-off apart. Energy without the computer's."]
+    rows = tuple(_episode_row(episode, computer=feeds) for episode in shown)
+    notes = ["From the start of navigation; the take-off apart."]
+    if feeds:
+        notes[0] += " Energy without the computer's."
     if len(shown) < total:
         notes.append(
             f"{len(shown)} of {total:,} flights, those that failed first; all: {EPISODES_FILE}."
@@ -136,11 +139,11 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
     return TableView("episodes", "Flights", columns, rows, tuple(notes))
 
 
-def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
-    """Return an episode's cells."""
+def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
+    """Return an episode's cells, with the energy of its `computer` or without."""
     q = episode.quality
     figures = (
-        (NONE,) * 7
+        (NONE,) * (6 + computer)
         if q is None
         else (
             f"{q.flight_time_s:.2f}",
@@ -148,7 +151,7 @@ def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
             f"{q.energy_j / 1e3:.2f}",
             f"{q.mean_speed_m_s:.2f}",
             f"{q.max_speed_m_s:.2f}",
-            f"{q.computer_energy_j:,.0f}",
+            *([f"{q.computer_energy_j:,.0f}"] if computer else []),
             f"{q.takeoff.time_s:.2f}, {q.takeoff.energy_j / 1e3:.2f}",
         )
     )
@@ -159,8 +162,11 @@ def _episode_row(episode: EpisodeRecord) -> tuple[str, ...]:
     return (f"{episode.index}", f"{episode.seed}", label, *figures, left, why)
 
 
-def quality_table(summary: RunSummary) -> TableView:
-    """Return the quality of flight over all episodes, with intervals."""
+def quality_table(summary: RunSummary, *, computer: bool = True) -> TableView:
+    """Return the quality of flight over all episodes, with intervals.
+
+    Without `computer` its energy has no row: it is on the ground.
+    """
     columns = (
         Column("measure", number=False),
         Column("value"),
@@ -171,8 +177,10 @@ def quality_table(summary: RunSummary) -> TableView:
     )
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
-    computer = replace(COMPUTER_ENERGY, unit="J", scale=1.0, digits=0)
-    measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY, computer, MEAN_SPEED]
+    measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY]
+    if computer:
+        measures.append(replace(COMPUTER_ENERGY, unit="J", scale=1.0, digits=0))
+    measures.append(MEAN_SPEED)
     measures += [measure for measure in PACK if measure.of(q).n]
     rows = tuple(
         _estimate_row(measure, measure.of(q), summary.medians.get(measure.key, NO_ESTIMATE))

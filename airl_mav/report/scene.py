@@ -43,6 +43,9 @@ CORNERS = 12
 VIEW_M = 6.0
 """Length of the drawn field of view."""
 
+ALL_ROUND_DEG = 360.0
+"""A field of view that has no edges."""
+
 STILL_COLOUR = "#8b97a3"
 
 Floats = NDArray[np.float64]
@@ -172,9 +175,19 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
         },
         "navigation": round(since_us / US_PER_S, 2),
         "vehicle": len(traces) - 1,
-        "view": [VIEW_M, round(math.radians(fov_deg) / 2.0, 3)],
+        "view": _view(fov_deg),
         "moving": moving,
     }
+
+
+def _view(fov_deg: float) -> list[float]:
+    """Return how long the edges of the field of view are [m], and how far from ahead [rad].
+
+    Where all is seen there are none; a line ahead shows the heading.
+    """
+    if fov_deg >= ALL_ROUND_DEG:
+        return [VIEW_M, 0.0]
+    return [VIEW_M if fov_deg else 0.0, round(math.radians(fov_deg) / 2.0, 3)]
 
 
 def all_flights_view(

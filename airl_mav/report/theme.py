@@ -67,6 +67,8 @@ _DECIMALS = re.compile(r"(?<=\d)(\d\.\d)\d+|(\.\d\d)\d+")
 _BITMAP = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=\s]+)")
 BITMAP_COLOURS = 128
 """Colours of a bitmap inside a figure: more are not seen, and weigh."""
+_SIZE = re.compile(r'<svg[^>]*? width="([\d.]+)pt" height="([\d.]+)pt"')
+CSS_PX_PER_PT = 96.0 / 72.0
 _FONT = re.compile(r"(font: [^;\"]*?px) [^;\"]*")
 
 
@@ -80,6 +82,15 @@ class Picture:
     """What it shows, for those who do not see it."""
     svg: str
     png: bytes
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [CSS px], which keep its place on a page before it is there."""
+        found = _SIZE.search(self.svg)
+        if found is None:
+            raise ValueError(f"{self.name}: an SVG without its width and height in points")
+        width, height = (round(float(points) * CSS_PX_PER_PT) for points in found.groups())
+        return width, height
 
     def data_uri(self) -> str:
         """Return the SVG for an `img`."""

@@ -15,6 +15,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
 from airl_mav.latency.stages import STAGES, Samples, Stage
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_figures import long_tail
@@ -36,6 +37,13 @@ NAMED = 16
 
 SLOWEST = 8
 """Rows of the table of decisions that stand out."""
+
+SAW_DECISIONS = 16
+"""With fewer decisions no saw is seen."""
+
+SAW_STEADY = 0.25
+"""Half of the decisions follow the one before within this share of the camera's period: what
+scatters more has no saw."""
 
 OUTLIER_NOTE = (
     f"Marked: above the third quartile by more than {FENCE_RANGES:g} times the interquartile range "
@@ -204,8 +212,49 @@ def _outlier_text(limit: Fence) -> str:
     return f"{limit.beyond:,} of {limit.n:,} {where}{shown}"
 
 
-def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | None:
+def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[str]:
+    """Explain the saw in the age of the newest frame, where it is seen.
+
+    Decisions that follow each other at one interval meet the camera's frames, which have another,
+    a little later or earlier each time.
+
+    Args:
+        timeline: The decisions.
+        vehicle: For its camera; None: nothing is explained.
+    """
+    periods = timeline.stages["period"]
+    periods = periods[periods != NO_STAMP]
+    if vehicle is None or len(periods) < SAW_DECISIONS:
+        return []
+    frame_us = vehicle.camera.period_us
+    low, period, high = np.percentile(periods, (25.0, 50.0, 75.0))
+    if high - low > SAW_STEADY * frame_us:
+        return []
+    notes = []
+    for stage in (stage for stage in STAGES if stage.key in ("t1", "wait")):
+        found = timeline.stages[stage.key]
+        found = found[found != NO_STAMP]
+        if len(found) < SAW_DECISIONS or np.ptp(np.percentile(found, (2.0, 98.0))) < 0.5 * frame_us:
+            continue
+        frames = period / frame_us
+        drift_us = float((frames - round(frames)) * frame_us)
+        way = "older" if drift_us > 0.0 else "younger"
+        notes.append(
+            f"The saw in {stage.title} is no fault: the camera takes a frame every "
+            f"{ms(frame_us, 1)} ms and a decision comes every {ms(period, 1)} ms, which is "
+            f"{frames:.2f} frames. Each decision finds its frame {ms(abs(drift_us), 1)} ms {way} "
+            "than the one before did, until the next frame takes its place."
+        )
+    return notes
+
+
+def slowest_table(
+    timeline: Timeline, stages: Sequence[Stage]
+) -> tuple[TableView, list[tuple[int, float]]] | None:
     """Return the decisions that stand out from frame to motors; None when none does.
+
+    Beside the table comes the place of each row: the flight, and seconds since the start of
+    navigation.
 
     Args:
         timeline: The decisions.
@@ -233,7 +282,8 @@ def slowest_table(timeline: Timeline, stages: Sequence[Stage]) -> TableView | No
         f"{limit.beyond:,} of {limit.n:,} decisions above {ms(limit.limit_us)} ms; "
         f"the {len(rows)} longest. Times from the start of navigation.",
     )
-    return TableView("slowest", "Decisions that stand out", columns, rows, notes)
+    places = [(timeline.flight_of(int(k)), float(timeline.since_us[k]) / US_PER_S) for k in beyond]
+    return TableView("slowest", "Decisions that stand out", columns, rows, notes), places
 
 
 def _slow_row(

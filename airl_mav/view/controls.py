@@ -18,7 +18,11 @@ FIRST_MS = 400
 
 
 class Controls:
-    """The controls of one page."""
+    """The controls of one page.
+
+    What viser calls is a coroutine: it runs before the next message of a page is read. A function
+    would run in a thread of a pool, and read what another click has made of the control since.
+    """
 
     def __init__(self, gui: Any, steering: Steering) -> None:
         """Take viser's interface, and what is asked for at the beginning."""
@@ -45,7 +49,7 @@ class Controls:
         pace = gui.add_dropdown("Speed", (*speeds, FASTEST), initial_value=first)
 
         @pause.on_click
-        def _(_event: object) -> None:
+        async def _(_event: object) -> None:
             if pause.value == "Go on":
                 self._ask(paused=False)
             elif pause.value == "Pause":
@@ -54,7 +58,7 @@ class Controls:
                 self._ask(paused=True, steps=self.steering.steps + 1)
 
         @pace.on_update
-        def _(_event: object) -> None:
+        async def _(_event: object) -> None:
             self._ask(speed=speeds.get(pace.value))
 
     def add_knob(self, *, compensable: bool, compensated: bool) -> None:
@@ -70,7 +74,7 @@ class Controls:
         )
         t2 = gui.add_slider("t2 [ms]", 0, LONGEST_MS, 10, FIRST_MS, disabled=True)
 
-        def changed(_event: object) -> None:
+        async def changed(_event: object) -> None:
             t2.disabled = not by_hand.value
             self._ask(t2_ms=float(t2.value) if by_hand.value else None)
 
@@ -83,5 +87,5 @@ class Controls:
         )
 
         @switch.on_update
-        def _(_event: object) -> None:
+        async def _(_event: object) -> None:
             self._ask(compensate=None if switch.value == compensated else bool(switch.value))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
 Vector3 = tuple[float, float, float]
@@ -101,6 +102,7 @@ class VehicleShape(Message):
     camera_forward_m: float
     camera_up_m: float
     camera_pitch_up_deg: float
+    camera_projection: Projection
     camera_fov_deg: float
     """Horizontal."""
     camera_aspect: float
@@ -122,6 +124,7 @@ class VehicleShape(Message):
             camera_forward_m=camera.forward_m,
             camera_up_m=camera.up_m,
             camera_pitch_up_deg=camera.pitch_up_deg,
+            camera_projection=camera.projection,
             camera_fov_deg=camera.horizontal_fov_deg,
             camera_aspect=camera.width_px / camera.height_px,
             camera_range_m=camera.range_m,

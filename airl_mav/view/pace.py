@@ -38,12 +38,13 @@ class Pace:
         self._new_clock = new_clock
         self._clock: WallClock | None = None
         self._steps: int | None = None
-        self._stepping = False
+        self._left = 0
+        """Single steps that were asked for and are not done."""
 
     def tick(self, time_us: int) -> None:
         """Return when the flight may go on; it is at simulated `time_us` [µs]."""
         asked = self._heard(self._asked.newest())
-        while asked.paused and not self._stepping:
+        while asked.paused and not self._left:
             self._clock = None
             asked = self._heard(self._asked.newest(LOOK_S))
         if asked.speed is None:
@@ -57,15 +58,18 @@ class Pace:
 
     def decided(self) -> None:
         """A decision was sent: a single step ends here."""
-        self._stepping = False
+        self._left = max(0, self._left - 1)
 
     def close(self) -> None:
         """Disconnect."""
         self._asked.close()
 
     def _heard(self, asked: Steering) -> Steering:
-        if self._steps is not None and asked.steps > self._steps:
-            self._stepping = True
+        if self._steps is None or asked.steps < self._steps or not asked.paused:
+            # Of another page, or no longer wanted.
+            self._left = 0
+        else:
+            self._left += asked.steps - self._steps
         self._steps = asked.steps
         return asked
 

@@ -7,7 +7,6 @@ frame FRD.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,46 +14,43 @@ import viser
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds, Shape
-from airl_mav.core.frames import heading_to_ned, quat_from_euler, quat_multiply, quat_yaw
+from airl_mav.core.frames import (
+    FRD_FROM_OPTICAL,
+    heading_to_ned,
+    quat_from_euler,
+    quat_multiply,
+    quat_yaw,
+)
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
+from airl_mav.view.look import (
+    ARROW_S,
+    BLADE,
+    COMMANDED,
+    DROP,
+    FIRST,
+    FLOOR,
+    FLOWN,
+    GOAL,
+    GRID,
+    LEAST_ARROW_M,
+    MOVING,
+    NOSE,
+    OPEN,
+    SECTION,
+    START,
+    STILL,
+    WALL_OPACITY,
+    Look,
+)
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape
 from airl_mav.view.pictures import depth_picture
 from airl_mav.view.shown import Shown
 
-STILL, MOVING, GOAL, START = (139, 151, 163), (240, 147, 43), (27, 138, 63), (31, 78, 140)
-FLOOR, GRID, SECTION = (236, 238, 240), (214, 218, 222), (186, 192, 198)
-FLOWN, COMMANDED, DROP = (40, 104, 168), (214, 84, 10), (120, 128, 136)
-NOSE, BLADE = (214, 84, 10), (33, 38, 45)
-
-Colour = tuple[int, int, int]
-
-
-@dataclass(frozen=True)
-class Look:
-    """What tells one flight from another in the same scene."""
-
-    trail: Colour
-    body: Colour
-    disc: Colour
-    whole: bool = True
-    """Whether arena, camera and commanded velocity are drawn, too."""
-
-
-FIRST = Look((47, 127, 196), (47, 54, 61), (40, 104, 168))
-OTHER = Look((150, 80, 170), (110, 50, 130), (150, 80, 170), whole=False)
-
-OPEN = Bounds(-50.0, 50.0, -50.0, 50.0, 5.0)
-"""The floor of a flight outside of all arenas: around its start."""
-
-WALL_OPACITY = 0.25
 FRUSTUM_M = 0.6
-"""How far in front of the vehicle the camera's image is drawn [m]."""
+"""How far ahead the camera's image is drawn, or above where it sees all round [m]."""
 
-ARROW_S = 0.6
-"""A velocity's arrow ends where the vehicle would be after so long [s]."""
-
-LEAST_ARROW_M = 0.02
-"""A shorter one is not drawn."""
+UNROLLED_M = 2.0
+"""Width of the image of a camera that sees all round [m]."""
 
 CHUNK = 200
 """Segments of a finished part of the trail, which is not sent again."""
@@ -64,9 +60,6 @@ BLADE_TURN_RAD = 1.9
 times between two, which no screen shows."""
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
-
-CAMERA_FROM_BODY = np.array([0.5, 0.5, 0.5, 0.5])
-"""From a camera that looks along +z with y down, as viser draws it, to the body frame FRD."""
 
 Floats = NDArray[np.float64]
 
@@ -266,6 +259,20 @@ class FlightScene:
 
     def _build_camera(self, shape: VehicleShape) -> None:
         pitch = quat_from_euler(0.0, math.radians(shape.camera_pitch_up_deg), 0.0)
+        if shape.camera_projection == "cylindrical":
+            # It looks all round: its picture hangs unrolled above the vehicle, ahead in the middle.
+            self._camera = self._add(
+                "image",
+                "/vehicle/camera",
+                np.zeros((1, 1, 3), np.uint8),
+                render_width=UNROLLED_M,
+                render_height=UNROLLED_M / shape.camera_aspect,
+                position=(0.0, 0.0, -shape.camera_up_m - FRUSTUM_M),
+                wxyz=FRD_FROM_OPTICAL,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
         across = math.tan(0.5 * math.radians(shape.camera_fov_deg))
         self._camera = self._add(
             "camera_frustum",
@@ -276,7 +283,7 @@ class FlightScene:
             thickness=0.012,
             color=FLOWN,
             position=(shape.camera_forward_m, 0.0, -shape.camera_up_m),
-            wxyz=quat_multiply(pitch, CAMERA_FROM_BODY),
+            wxyz=quat_multiply(pitch, FRD_FROM_OPTICAL),
             cast_shadow=False,
             receive_shadow=False,
         )

@@ -35,9 +35,6 @@ PICTURE_EVERY, PANEL_EVERY, STRIP_EVERY = 3, 4, 8
 NICENESS = 10
 """Less than that of flights: on a busy machine it is the view that waits."""
 
-NICENESS = 10
-"""Less than that of flights: on a busy machine it is the view that waits."""
-
 
 class View:
     """The page of a run."""

@@ -252,10 +252,10 @@ FORKS = """
 import json, os, sys
 from airl_mav.cli import evaluate, main
 from airl_mav.rehearsal import episode_saver
-from airl_mav.report import run_page
+from airl_mav.report import shown_flights
 
 episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.02, 0.0
-run_page.MAX_PICTURED = 1
+shown_flights.MAX_PICTURED = 1
 for script in json.loads(sys.argv.pop(1)):
     if (pid := os.fork()) == 0:
         exec(script)

@@ -33,7 +33,11 @@ def runs(
         computer.write_text(FURNACE + more)
         out = folder / name
         scenario = Scenario(
-            level=request.param, episodes=1, computer=str(computer), battery_charge=0.2
+            policy="static-obstacles",
+            level=request.param,
+            episodes=1,
+            computer=str(computer),
+            battery_charge=0.2,
         )
         rehearse(scenario, out=out)
         runs[name] = load(out)

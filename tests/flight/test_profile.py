@@ -35,7 +35,7 @@ from airl_mav.profiling.measurement import Recording
 from airl_mav.profiling.profile import busy_remark, profile
 from airl_mav.profiling.report import correlation_line, verdict
 from airl_mav.profiling.request import ProfileRequest
-from airl_mav.scenario.model import Lateness
+from airl_mav.scenario.model import DEFAULT_POLICY, Lateness
 from airl_mav.scenario.piloting import select_latency
 from companion.mission import MissionResult
 from tests.support.ports import choose_ports
@@ -61,17 +61,17 @@ def test_profile_flies(tmp_path: Path) -> None:
     printed = profiled(tmp_path)
     path = tmp_path / "box.toml"
     computer = load_computer(str(path))
-    work = computer.workloads["static-obstacles-bare"]
-    stamps = np.load(tmp_path / "box.static-obstacles-bare.npz")
+    work = computer.workloads[f"{DEFAULT_POLICY}-bare"]
+    stamps = np.load(tmp_path / f"box.{DEFAULT_POLICY}-bare.npz")
     took_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     assert all(stamps[key].dtype == np.int64 for key in stamps.files)
     assert len(took_us) == 80
     # In their order, as the replay wants them.
     assert work.latency.samples_ms == tuple(took_us / 1000.0)
     assert "--computer" in printed
-    assert f"{path} --workload static-obstacles-bare" in printed
-    policy = find_policy("static-obstacles")
-    asked = Lateness(computer=str(path), workload="static-obstacles-bare")
+    assert f"{path} --workload {DEFAULT_POLICY}-bare" in printed
+    policy = find_policy(DEFAULT_POLICY)
+    asked = Lateness(computer=str(path), workload=f"{DEFAULT_POLICY}-bare")
     drawn = select_latency(asked, policy, on_this_computer=True).sampler(latency_generator(1, 0))
     assert drawn is not None
     assert {drawn.sample_us() for _ in range(80)} == set(took_us.tolist())
@@ -94,7 +94,7 @@ def test_python_api_measures_without_a_word(
     written = profile(request, out=tmp_path)
     assert [path.name for path in written.files] == [
         "box.toml",
-        *(f"box.static-obstacles-bare{end}" for end in (".txt", ".npz", ".json")),
+        *(f"box.{DEFAULT_POLICY}-bare{end}" for end in (".txt", ".npz", ".json")),
     ]
     assert load_computer(str(written.files[0])) == written.profile
 
@@ -116,8 +116,8 @@ def test_other_workloads_are_kept(tmp_path: Path) -> None:
     profiled(tmp_path, "--watts", "6.4", "--price-usd", "80")
     profiled(tmp_path, "--decisions", "30", "--workload", "again")
     computer = load_computer(str(tmp_path / "box.toml"))
-    assert list(computer.workloads) == ["static-obstacles-bare", "again"]
-    assert len(computer.workloads["static-obstacles-bare"].latency.samples_ms or ()) == 80
+    assert list(computer.workloads) == [f"{DEFAULT_POLICY}-bare", "again"]
+    assert len(computer.workloads[f"{DEFAULT_POLICY}-bare"].latency.samples_ms or ()) == 80
     assert len(computer.workloads["again"].latency.samples_ms or ()) == 30
     assert (computer.watts, computer.price_usd) == (6.4, 80.0)
     assert "not measured" not in computer.source
@@ -137,7 +137,7 @@ def test_power_that_nobody_gave_is_said_to_be_unknown(tmp_path: Path) -> None:
 
 def test_facts_beside_the_samples(tmp_path: Path) -> None:
     profiled(tmp_path)
-    facts = json.loads((tmp_path / "box.static-obstacles-bare.json").read_text())
+    facts = json.loads((tmp_path / f"box.{DEFAULT_POLICY}-bare.json").read_text())
     assert facts["schema"] == 1
     assert facts["command"]["decisions"] == 80
     assert facts["stages_us"]["t2"]["n"] == 80
@@ -344,7 +344,7 @@ def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     rest = process.communicate(timeout=60)[0]
     assert process.returncode == 130, rest
-    stem = tmp_path / "out/box.static-obstacles-bare"
+    stem = tmp_path / f"out/box.{DEFAULT_POLICY}-bare"
     facts = json.loads(Path(f"{stem}.json").read_text())
     assert facts["soak"]["interrupted"]
     assert facts["soak"]["duration_s"] < 60.0 < facts["soak"]["asked_s"] == 600.0
@@ -358,7 +358,7 @@ def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
     assert "data:image/svg+xml" in page
     assert "interrupted" in page
     # The measurement before the soak is whole, and flies.
-    work = load_computer(str(tmp_path / "out/box.toml")).workloads["static-obstacles-bare"]
+    work = load_computer(str(tmp_path / "out/box.toml")).workloads[f"{DEFAULT_POLICY}-bare"]
     assert len(work.latency.samples_ms or ()) == 20
 
 
@@ -375,7 +375,7 @@ def test_power_that_the_computer_tells_is_its_watts(
     held = load_computer(str(out / "box.toml"))
     assert held.watts == pytest.approx(6.02)
     assert held.source.endswith(f"; watts: {told}; price: not known")
-    facts = json.loads((out / "box.static-obstacles-bare.json").read_text())
+    facts = json.loads((out / f"box.{DEFAULT_POLICY}-bare.json").read_text())
     assert facts["power"]["source"] == "INA monitor: VDD_IN"
     # Measured again: said once. Given by a person: kept, whatever is measured later.
     profile(few, out=out, root=root)
@@ -393,7 +393,7 @@ def test_power_that_the_computer_tells_is_its_watts(
 def test_stages_in_flight(tmp_path: Path) -> None:
     words = ("--level", "sitl", "--decisions", "70", "--warm-up", "10", *choose_ports().options())
     printed = profiled(tmp_path, *words)
-    stamps = np.load(tmp_path / "box.static-obstacles-sitl.npz")
+    stamps = np.load(tmp_path / f"box.{DEFAULT_POLICY}-sitl.npz")
     assert len(stamps["sent_us"]) == 70
     order = [stamps[stage.start] for stage in STAGES[:6]]
     assert all((later >= sooner).mean() > 0.95 for sooner, later in pairwise(order))
@@ -402,7 +402,7 @@ def test_stages_in_flight(tmp_path: Path) -> None:
     assert (np.diff(stamps["sent_us"]) >= 50_000).mean() > 0.95
     assert "link" in printed
     assert "timing was measured, not the quality of flight" in printed
-    assert "static-obstacles-sitl" in load_computer(str(tmp_path / "box.toml")).workloads
+    assert f"{DEFAULT_POLICY}-sitl" in load_computer(str(tmp_path / "box.toml")).workloads
 
 
 def test_busy_machine_is_said_to_be_so() -> None:
@@ -546,8 +546,8 @@ def test_on_the_drones_computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         finally:
             firmware.terminate()
             firmware.wait(30)
-    stamps = np.load(tmp_path / "box.static-obstacles-hil.npz")
-    facts = json.loads((tmp_path / "box.static-obstacles-hil.json").read_text())
+    stamps = np.load(tmp_path / f"box.{DEFAULT_POLICY}-hil.npz")
+    facts = json.loads((tmp_path / f"box.{DEFAULT_POLICY}-hil.json").read_text())
     counts = {key: stage["n"] for key, stage in facts["stages_us"].items()}
     assert "motor_us" not in stamps.files
     assert len(stamps["sent_us"]) == 70

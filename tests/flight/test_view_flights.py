@@ -160,7 +160,9 @@ def test_a_browser_shows_the_flight(tmp_path: Path) -> None:
 
         wait_until(stands, "the pause")
         time = times[-1]
-        assert page.press("Step")
+        # The first step ends with the decision that was due, which may be at once.
+        for _ in range(2):
+            assert page.press("Step")
         wait_until(lambda: told_time(page.text()) != time, "a step")
         # What the policy saw, each pixel three by three.
         sizes = page.evaluate(

@@ -24,7 +24,12 @@ from PIL import Image
 from airl_mav.cli.gap import OPTIONS
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import gap as gap_experiment
-from airl_mav.experiments.gap import DEFAULT_MITIGATED, TRAINING_LATENCY_SEED, declare_gap
+from airl_mav.experiments.gap import (
+    DEFAULT_MITIGATED,
+    DEFAULT_UNMITIGATED,
+    TRAINING_LATENCY_SEED,
+    declare_gap,
+)
 from airl_mav.flight.paired import tango
 from airl_mav.policy.registry import PolicyInfo
 from airl_mav.profiles.loading import profiles_dir
@@ -37,7 +42,7 @@ from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES
-from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
+from airl_mav.scenario.model import Scenario
 from tests.support.command_line import airl, option_words
 
 GAP_FILE = "gap.json"
@@ -50,8 +55,8 @@ ROLES = NOT_RETRAINED + RETRAINED
 def make_policy(
     folder: Path, delay: dict[str, Any] | None, extra: tuple[float, float] = (0.0, 0.0)
 ) -> Path:
-    """Make a policy that says it was trained that late: the default one under another name."""
-    shutil.copytree(profiles_dir() / "policies" / DEFAULT_POLICY, folder)
+    """Make a policy that says it was trained that late: the unmitigated one under another name."""
+    shutil.copytree(profiles_dir() / "policies" / DEFAULT_UNMITIGATED, folder)
     card = json.loads((folder / "card.json").read_text())
     card.pop("crc32", None)
     card["name"] = "mitigated"
@@ -131,10 +136,12 @@ def test_the_columns_and_what_they_are_flown_on(whole: tuple[Path, str]) -> None
     out, _ = whole
     columns = columns_of(data_of(out))
     assert [column["role"] for column in columns] == list(ROLES)
-    assert [column["mark"] for column in columns] == list("ABCDEFGH")
+    # Columns have names, not letters.
+    assert [column["mark"] for column in columns] == [role.replace("-", " ") for role in ROLES]
     runs = {c["role"]: json.loads((out / c["folder"] / "run.json").read_text()) for c in columns}
     policies = {role: info["setup"]["policy"]["name"] for role, info in runs.items()}
-    names = dict.fromkeys(RETRAINED, "mitigated") | dict.fromkeys(NOT_RETRAINED, DEFAULT_POLICY)
+    names = dict.fromkeys(RETRAINED, "mitigated")
+    names |= dict.fromkeys(NOT_RETRAINED, DEFAULT_UNMITIGATED)
     assert policies == names
     between = {role: info["setup"]["between_commands"] for role, info in runs.items()}
     assert between == dict.fromkeys(ROLES, "persist") | {
@@ -322,9 +329,14 @@ def test_tables_and_figures_agree(whole: tuple[Path, str]) -> None:
         shown = row[column].partition(" ")[0]
         assert float(shown) == pytest.approx(run.quality.flight_time_s.value, abs=5e-3)
     told = [(row[0], below[column]) for row, below in pairwise(table.rows) if below[0] == "  paper"]
-    assert told == [("A", "24.08"), ("B", "44.93"), ("E", "32.44"), ("G", "32.62")]
+    assert told == [
+        ("reference", "24.08"),
+        ("target", "44.93"),
+        ("mitigated", "32.44"),
+        ("training", "32.62"),
+    ]
     first = gaps_table(gap, arena).rows[0]
-    assert first[0] == "B against A\nno mitigation"
+    assert first[0] == "target\nagainst reference"
     difference = gap.contrasts[0].paired.flight_time_s.difference
     assert difference.value is not None
     assert first[2].startswith(f"{difference.value:+.1f} [")
@@ -527,7 +539,7 @@ def test_another_source_of_latency(tmp_path: Path, latency: str) -> None:
 
 def test_defaults_are_those_of_the_package() -> None:
     command = OPTIONS()
-    assert command.policy == DEFAULT_POLICY
+    assert command.policy == DEFAULT_UNMITIGATED
     assert command.mitigated == DEFAULT_MITIGATED
 
 
@@ -563,7 +575,7 @@ def _unknown(name: str, **_: object) -> PolicyInfo:
         ({"computer": "abacus"}, "abacus"),
         ({"reference": "abacus"}, "abacus"),
         ({"policy": "nobody"}, "nobody"),
-        ({"mitigated": DEFAULT_POLICY}, "accepted: another policy, or none"),
+        ({"mitigated": DEFAULT_UNMITIGATED}, "accepted: another policy, or none"),
         ({"arena": ("no-obstacles", "no-obstacles")}, "each arena once"),
         ({"arena": ()}, "--arena"),
         ({"arena": ("nowhere",)}, "nowhere"),
@@ -602,7 +614,8 @@ def test_it_compensates_where_that_can_be(tmp_path: Path) -> None:
 
 
 def training_of(folder: Path) -> tuple[list[Any], tuple[str, ...]]:
-    scenario = Scenario(level="gym", policy=DEFAULT_POLICY, computer="ras-pi-4", episodes=EPISODES)
+    given = {"policy": DEFAULT_UNMITIGATED, "computer": "ras-pi-4", "episodes": EPISODES}
+    scenario = Scenario.model_validate(given | {"level": "gym"})
     gap = declare_gap(scenario, mitigated=str(folder))
     cells = [cell for cell in gap.cells if cell.role == "training"]
     return cells, gap.remarks

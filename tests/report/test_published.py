@@ -18,7 +18,7 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.policy.card import load_card
 from airl_mav.report.saved_table import write_table
 from airl_mav.report.table import Column, TableView
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
 from published import coverage, flying, pages, record, tables_policies
 from published.changes import Change, read_changes, stands
 from published.collect import collect
@@ -203,7 +203,7 @@ def test_a_run_is_collected_as_it_was_flown(tmp_path: Path) -> None:
     found = collect(declare("airl evaluate", "run"), tmp_path / "run", "f" * 16)
     flown, rate = found.runs["run"], aggregate(run.episodes).success_rate
     assert (flown.policy, flown.arena, flown.latency) == (
-        "static-obstacles",
+        DEFAULT_POLICY,
         "static-obstacles",
         "150ms",
     )
@@ -211,7 +211,7 @@ def test_a_run_is_collected_as_it_was_flown(tmp_path: Path) -> None:
     assert flown.success_rate.value == rate.value
     assert flown.success_rate.low == pytest.approx(rate.low)
     assert flown.t2_ms == pytest.approx(150.0)
-    assert set(found.made.policies) == {"static-obstacles"}
+    assert set(found.made.policies) == {DEFAULT_POLICY}
     assert found.made.behaviour == "f" * 16
     record.write_record(found, tmp_path)
     assert record.read_record("x", tmp_path) == found
@@ -247,7 +247,7 @@ def test_a_roofline_is_collected_as_a_table(tmp_path: Path) -> None:
     cells = dict(zip(found.printed.columns, row, strict=True))
     assert cells["measured"] == f"{point.measured_m_s:.2f} m/s"
     assert cells["binds"] == point.binds
-    assert set(found.made.policies) == {"static-obstacles"}
+    assert set(found.made.policies) == {DEFAULT_POLICY}
     assert found.made.behaviour == "f" * 16
 
 
@@ -255,7 +255,7 @@ def test_a_table_of_a_script_is_taken_with_its_pictures(tmp_path: Path) -> None:
     columns = (Column("what", number=False), Column("success", "%"))
     view = TableView("x", "A test", columns, (("late", "97.0 [95.0, 98.1]"),))
     made = provenance("python scripts/x.py")
-    write_table(view, tmp_path / "out", made, ("static-obstacles", "mine"))
+    write_table(view, tmp_path / "out", made, (DEFAULT_POLICY, "mine"))
     declared = declare("python scripts/x.py", "table", pictures={"a.png": "docs/b.png"})
     (tmp_path / "docs").mkdir()
     with pytest.raises(UsageError, match=r"pictures: a.png"):
@@ -270,7 +270,7 @@ def test_a_table_of_a_script_is_taken_with_its_pictures(tmp_path: Path) -> None:
     assert found.printed.rows == view.rows
     assert found.made.date == made["created_utc"][:10]
     # Of the policies that flew only a shipped one can be known to have changed.
-    assert set(found.made.policies) == {"static-obstacles"}
+    assert set(found.made.policies) == {DEFAULT_POLICY}
 
 
 def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import base64
 import io
 import json
 import re
@@ -24,7 +23,8 @@ from airl_mav.report.ages import ages_table, run_ages
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.forensics.worst import examine_worst
-from airl_mav.report.run_page import MAX_PICTURED, build_page
+from airl_mav.report.packing import unpacked
+from airl_mav.report.run_page import build_page
 from airl_mav.report.run_report import print_report
 from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import (
@@ -34,6 +34,7 @@ from airl_mav.report.run_tables import (
     real_time_table,
 )
 from airl_mav.report.scene import plotly_script
+from airl_mav.report.shown_flights import MAX_PICTURED
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
@@ -82,6 +83,12 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, dict[int,
 @pytest.fixture(scope="module")
 def page(demo: tuple[LoadedRun, dict[int, Arena]]) -> str:
     return build_page(*demo).read_text(encoding="utf-8")
+
+
+def script_of(page: str, name: str) -> str:
+    """Return what the script element of an id holds."""
+    begin = page.index(">", page.index(f'id="{name}"')) + 1
+    return page[begin : page.index("</script>", begin)]
 
 
 def cells(view: TableView, first: str) -> dict[str, str]:
@@ -196,29 +203,31 @@ def test_a_run_recorded_without_them_has_no_such_table(
 
 def test_the_page_is_one_file_that_reaches_nothing_else(page: str) -> None:
     parsed = Page(page)
-    images = [ref for ref in parsed.references if not ref.startswith("#")]
-    assert images
-    assert all(ref.startswith("data:image/svg+xml;base64,") for ref in images)
+    (first,) = [ref for ref in parsed.references if not ref.startswith("#")]
+    assert first.startswith("data:image/svg+xml;base64,")
     assert not parsed.tags & {"link", "iframe", "object"}
     # The library, what shows the views with it, and their data are in the page, once each.
-    assert page.count("<script") == 3 + plotly_script().count("<script")
-    assert page.count(plotly_script()[:200]) == 1
+    assert page.count("<script") == 3
+    assert unpacked(script_of(page, "page-library")) == plotly_script()
     script = page[page.rindex("<script>") :]
     assert not re.search(r"https?:|fetch\(|XMLHttp|import\(|WebSocket|eval\(", script)
     style = page[page.index("<style>") : page.index("</style>")]
     assert "url(" not in style
     assert "@import" not in style
     assert all(image["alt"] for image in parsed.images)
-    # Nine stages and their timeline, energy; two figures for each flight.
-    assert len(parsed.images) == 9 + 2 + 2 * 5
+    # All flights; six stages that vary and their timeline, energy; two figures for each flight.
+    assert len(parsed.images) == 1 + 6 + 2 + 2 * 5
+    named = {image["data-picture"] for image in parsed.images[1:]}
+    assert named == set(json.loads(unpacked(script_of(page, "page-data")))["pictures"])
     inside = {ref[1:] for ref in parsed.references if ref.startswith("#")}
     assert inside <= set(re.findall(r'id="([^"]+)"', page))
-    assert len(page) < len(plotly_script()) + 2_000_000
+    assert len(page) < 4_000_000
 
 
 def test_pictures_follow_light_and_dark_and_carry_no_links(page: str) -> None:
-    for image in Page(page).images:
-        svg = base64.b64decode((image["src"] or "").partition(",")[2]).decode()
+    pictures = json.loads(unpacked(script_of(page, "page-data")))["pictures"]
+    assert pictures
+    for svg in pictures.values():
         ET.fromstring(svg)  # noqa: S314 - our own
         body = svg.partition("</style>")[2]
         assert "prefers-color-scheme:dark" in svg
@@ -247,7 +256,7 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
     run, _ = demo
     names = {path.name for path in run.path.glob("*.png")}
     expected = {f"flight-{i:03d}-{kind}.png" for i in range(5) for kind in ("map", "time")}
-    alone = {"latency.png", "latency-timeline.png", "energy.png"}
+    alone = {"latency.png", "latency-timeline.png", "energy.png", "trajectories.png"}
     assert names == expected | alone
     for name in names:
         with Image.open(run.path / name) as image:
@@ -312,7 +321,8 @@ def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> N
     for row in listed.rows:
         quality = run.episodes[int(row[0])].quality
         assert quality is not None
-        assert row[3] == f"{quality.energy_j / 1e3:.2f}"
+        parts = sum(float(cell) for cell in row[1:4])
+        assert parts == pytest.approx(quality.energy_j / 1e3, abs=0.02)
 
 
 def test_worst_flights_come_first_and_have_causes(
@@ -368,13 +378,15 @@ def test_decisions_that_stand_out_are_named(demo: tuple[LoadedRun, dict[int, Are
     for name in ("action_ready_us", "sent_us", "accepted_us", "motor_us"):
         slow[name][3] += 5_000_000
     timeline = timeline_of(replace(run, latency={**run.latency, 1: slow}))
-    view = slowest_table(timeline, SHOWN_STAGES)
-    assert view is not None
-    (row,) = view.rows
+    found = slowest_table(timeline, SHOWN_STAGES)
+    assert found is not None
+    (row,), (place,) = found[0].rows, found[1]
     assert row[0] == "1"
     assert row[4] == "t2 infer"
     at_us = slow["capture_us"][3] - (run.episodes[1].navigation_us or 0)
     assert row[1] == f"{at_us / 1e6:.2f}"
+    assert place[0] == 1
+    assert place[1] == pytest.approx(at_us / 1e6)
     assert slowest_table(timeline_of(run), SHOWN_STAGES) is None
 
 

@@ -168,3 +168,14 @@ def test_a_flight_without_an_arena(demo: Demo) -> None:
     view = flight_view(SceneFlight(run.episodes[0], run.trajectories[0], None), 5.0, 0.0)
     assert view["moving"] is None
     go.Figure(view["figure"])
+
+
+@pytest.mark.parametrize(
+    ("fov_deg", "view"), [(0.0, [0.0, 0.0]), (90.0, [6.0, 0.785]), (360.0, [6.0, 0.0])]
+)
+def test_edges_of_the_field_of_view_where_there_are_any(
+    demo: Demo, fov_deg: float, view: list[float]
+) -> None:
+    run, _ = demo
+    flight = SceneFlight(run.episodes[0], run.trajectories[0], None)
+    assert flight_view(flight, 5.0, fov_deg)["view"] == view

@@ -128,7 +128,7 @@ def test_a_computer_that_was_never_timed_is_left_out_and_said_so(
     assert "left out: no workload template-5x32 measured (measured: none)" in shown[1]
     refusals: tuple[tuple[dict[str, Any], str], ...] = (
         ({"computers": (left.computer,)}, "no workload template-5x32 measured"),
-        ({"workload": "policy"}, "no latency measured for static-obstacles "),
+        ({"workload": "policy"}, "no latency measured for static-obstacles-fast "),
         ({"workload": "estimate"}, "workload 'estimate': accepted: a measured workload, or policy"),
         ({"policy": "greedy", "sensing_distance_m": None}, "policy greedy is no network"),
         ({"computers": ("ras-pi-4", "ras-pi-4")}, "each once"),
@@ -181,6 +181,7 @@ def test_a_policy_takes_notice_at_the_depth_at_which_it_acts() -> None:
 
 
 def test_the_sensing_distance_is_the_least_that_the_policy_took_notice_at(tmp_path: Path) -> None:
-    result = roofline(computers=("workstation",), draws=1, out=tmp_path / "out")
+    asked: dict[str, Any] = {"policy": "static-obstacles", "computers": ("workstation",)}
+    result = roofline(**asked, draws=1, out=tmp_path / "out")
     assert result.found.sensing_distance_m == min(result.found.noticed_m)
     assert 4.0 < result.found.sensing_distance_m < 12.0

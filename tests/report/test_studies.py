@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import math
 import os
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.run import load_run
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.report.comparison import show
 from airl_mav.scenario.model import Scenario
 from tests.support.processes import ROOT
@@ -32,6 +35,7 @@ CONFIGS = {
     "ablation": "AblationConfig",
     "degradation": "DegradationConfig",
     "generalisation": "GeneralisationConfig",
+    "held_out_zone": "HeldOutConfig",
     "mitigation": "MitigationConfig",
     "system": "SystemConfig",
 }
@@ -330,6 +334,35 @@ def test_ablation_zeroes_one_input_after_the_other(tmp_path: Path) -> None:
     assert min(rates) < max(rates)
     assert rows[0] == ["no-obstacles", "body", *(f"{rate:.0f}" for rate in rates)]
     assert rows[1] == ["no-obstacles", "the", "paper", "91.0", "53.0", "42.0", "7.0"]
+
+
+@pytest.mark.slow
+def test_the_held_out_zone_is_neither_learned_nor_mixed(tmp_path: Path) -> None:
+    """Goals lie within and beyond the radius; the policy was trained with the former alone."""
+    pytest.importorskip("torch")
+    training = tmp_path / "short.toml"
+    training.write_text(
+        'base = "static-obstacles"\n[environment.episode]\ntime_limit_s = 5.0\n'
+        "[selection]\nepisodes = 2\n"
+    )
+    config = (
+        'episodes = 6\ntime_limit_s = 3.0\narena = "static-obstacles"\nradius_m = 20.0\n'
+        f'steps = 300\npolicy = "no-obstacles"\ntraining = "{training}"\n'
+    )
+    out = tmp_path / "out"
+    code, text = study("held_out_zone", config, out)
+    assert code == 0
+    away = {
+        zone: [math.hypot(*each["goal"]) for each in flights(out / zone / "near").values()]
+        for zone in ("within", "beyond")
+    }
+    assert max(away["within"]) <= 20.0 < min(away["beyond"])
+    assert max(away["beyond"]) <= 48.0
+    card = json.loads((out / "train-held-out-zone" / "policy" / "card.json").read_text())
+    arena = Path(card["training"]["arena"])
+    assert load_profile("arenas", str(arena), ArenaSpec).zones_m == (20.0,)
+    lines = text[text.index("Goals farther off") :].splitlines()
+    assert len([line for line in lines if "learned within 20 m" in line]) == 2
 
 
 @pytest.mark.slow

@@ -24,6 +24,7 @@ from airl_mav.cli.viewing import view_of
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.latency.samplers import FixedSampler
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.view.by_hand import Hand, HandCompensator, HandLatency
@@ -66,8 +67,8 @@ def some_arena() -> Arena:
     return Arena("some", 7, bounds, (200, 120, 130), obstacles, (tour,), np.array([20.0, 5.0]))
 
 
-def episode(arena: Arena | None = None) -> Episode:
-    shape = VehicleShape.of(resolve(Scenario()).vehicle)
+def episode(arena: Arena | None = None, vehicle: str = "quad") -> Episode:
+    shape = VehicleShape.of(load_vehicle(vehicle))
     shown = ArenaShown.of(arena or some_arena())
     known = {"vehicle": shape, "goal": (20.0, 5.0), "goal_radius_m": 2.0}
     return Episode(seed=3, started_us=START_US, arena=shown, **known)
@@ -281,7 +282,9 @@ def test_a_paused_flight_goes_on_by_a_decision_or_for_good(ends: Ends) -> None:
         wait_until(lambda: ticks[0] == 10, "a step")
         watchers.wanted = Steering(paused=True, steps=2)
         wait_until(lambda: ticks[0] == 20, "another one")
-        watchers.wanted = Steering(paused=False, steps=2)
+        watchers.wanted = Steering(paused=True, steps=5)
+        wait_until(lambda: ticks[0] == 50, "three at once")
+        watchers.wanted = Steering(paused=False, steps=5)
         wait_until(lambda: ticks[0] > 100, "the rest")
         ticks[0] = -1000
         thread.join()
@@ -333,6 +336,25 @@ def test_compensation_is_switched_in_flight() -> None:
 
 
 # --- the scene, on a server that nobody watches
+
+
+def test_an_image_of_all_sides_hangs_unrolled_above_the_vehicle() -> None:
+    viser = pytest.importorskip("viser")
+    from airl_mav.view.scene import UNROLLED_M, FlightScene
+
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        scene, shown = FlightScene(server), Shown()
+        shown.take(episode(vehicle="quad-panorama"), None)
+        shown.take(vehicle(0.0), None)
+        shown.take(Picture(captured_us=5, shape=(3, 4)), DEPTH_MM)
+        scene.draw(shown, picture=True)
+        drawn = server.scene.get_handle_by_name("/flight/vehicle/camera")
+        assert drawn.image.shape[:2] != (1, 1)
+        assert (drawn.render_width, drawn.render_height) == (UNROLLED_M, UNROLLED_M * 40 / 128)
+        assert drawn.position[2] < -0.5
+    finally:
+        server.stop()
 
 
 def test_the_scene_holds_arena_vehicle_and_trail() -> None:

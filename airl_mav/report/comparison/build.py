@@ -23,11 +23,15 @@ from airl_mav.report.comparison.model import (
     Kind,
     NavigationStart,
     RunEntry,
+    part_of,
 )
 from airl_mav.report.run_tables import setup_rows
 
 SHORT_NAME = 14
 """Runs whose names are all this short or shorter need no letters."""
+
+LONGEST_PART = 24
+"""The parts of runs in a comparison stand for them where all are this short or shorter."""
 
 UNCOMPARED = ("sha256 of the flights",)
 """Terms that always differ, and explain nothing."""
@@ -108,9 +112,12 @@ def letter(index: int) -> str:
 
 
 def _marks(entries: Sequence[RunEntry]) -> dict[str, str]:
-    """Return what stands for each run: letters, group by group, unless all names are short."""
+    """Return what stands for each run: its part in the comparison, or a short name, or a letter."""
     if all(len(entry.label or entry.name) <= SHORT_NAME for entry in entries):
         return {entry.name: entry.label or entry.name for entry in entries}
+    parts = {entry.name: part_of(entry) for entry in entries}
+    if all(entry.role for entry in entries) and max(map(len, parts.values())) <= LONGEST_PART:
+        return parts
     counts: dict[str, int] = {}
     marks = {}
     for entry in entries:

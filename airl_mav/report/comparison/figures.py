@@ -20,7 +20,7 @@ from airl_mav.report import theme
 from airl_mav.report.arenas import arena_of
 from airl_mav.report.comparison.build import samples_of, tests_of
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
-from airl_mav.report.comparison.tables import letters_of, published_change
+from airl_mav.report.comparison.tables import contrast_head, published_change
 from airl_mav.report.flights_above import Panel, path_points
 from airl_mav.report.measures import COMPUTER_ENERGY, DISTANCE, ENERGY, MEASURES, rate_digits
 from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
@@ -56,7 +56,7 @@ def contrast_pictures(
         contrasts: One or more, from top to bottom.
         medians: Whether the medians of the pairs are drawn too.
     """
-    names = [f"{letters_of(comparison, each)}\n{each.entry.short}".rstrip() for each in contrasts]
+    names = [contrast_head(comparison, each) for each in contrasts]
     pictures = []
     for measure in MEASURES:
         figure = theme.new_figure(4.4, 1.05 + ROW_IN * len(contrasts))

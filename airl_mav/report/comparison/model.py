@@ -62,6 +62,14 @@ class ContrastEntry:
     """The same in few words."""
 
 
+def part_of(entry: RunEntry) -> str:
+    """Return what a run is in its comparison: its name without the group that it stands in.
+
+    In words, so that narrow columns can break it.
+    """
+    return entry.name.removeprefix(f"{Path(entry.group).stem}-").replace("-", " ")
+
+
 @dataclass(frozen=True)
 class NavigationStart:
     """Where navigation begins: means over the flights in which it did."""
@@ -84,7 +92,8 @@ class ComparedRun:
 
     entry: RunEntry
     mark: str
-    """Stands for the run where there is little room: a letter, or its name where that is short."""
+    """Stands for the run where there is little room: its part in the comparison (`target`), a short
+    name, or a letter."""
     setup: Setup
     """What was flown on what."""
     planned: int
@@ -120,6 +129,11 @@ class ComparedRun:
     def heading(self) -> str:
         """Mark and label."""
         return self.label if self.mark == self.label else f"{self.mark}  {self.label}"
+
+    @property
+    def named(self) -> bool:
+        """Whether its mark is what it is in the comparison, as those of all runs are then."""
+        return bool(self.entry.role) and self.mark == part_of(self.entry)
 
     @property
     def modelled(self) -> bool:

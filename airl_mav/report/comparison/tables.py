@@ -69,10 +69,18 @@ def signed(value: float | None, digits: int = 1) -> str:
     return NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
 
 
-def letters_of(comparison: Comparison, contrast: Contrast) -> str:
-    """Return the runs of a contrast as `B against A`."""
+def versus(comparison: Comparison, contrast: Contrast) -> str:
+    """Return the runs of a contrast as `target against reference`."""
     target, reference = comparison.pair(contrast)
     return f"{target.mark} against {reference.mark}"
+
+
+def contrast_head(comparison: Comparison, contrast: Contrast) -> str:
+    """Return the runs of a contrast on lines of their own, and what stands for it if letters do."""
+    target, reference = comparison.pair(contrast)
+    if target.named:
+        return f"{target.mark}\nagainst {reference.mark}"
+    return f"{versus(comparison, contrast)}\n{contrast.entry.short}".rstrip()
 
 
 # --- runs by themselves
@@ -203,7 +211,7 @@ def contrast_table(
     ]
     if 1 < n < FEW_FLIGHTS:
         notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
-    title = letters_of(comparison, contrast)
+    title = versus(comparison, contrast)
     if contrast.entry.short:
         title += f": {contrast.entry.title}"
     key = f"{contrast.entry.target}-against-{contrast.entry.reference}"
@@ -250,7 +258,7 @@ def contrasts_table(
     rows: list[tuple[str, ...]] = []
     for contrast in contrasts:
         changes = [measure.change(contrast.paired).difference for measure in MEASURES]
-        head = f"{letters_of(comparison, contrast)}\n{contrast.entry.short}".rstrip()
+        head = contrast_head(comparison, contrast)
         told = [with_interval(d, 1, "+") for d in changes]
         rows.append((head, *told, signed(contrast.t2_percent, 0), f"{contrast.successes:,}"))
         if contrast.published is not None:
@@ -259,7 +267,7 @@ def contrasts_table(
             rows.append((f"  {THE_PAPER}", *figures, t2, NONE))
     notes = [
         *(
-            f"{letters_of(comparison, c)}: {c.entry.title}, {c.successes:,} pairs."
+            f"{versus(comparison, c)}: {c.entry.title}, {c.successes:,} pairs."
             for c in contrasts
             if c.entry.title
         ),

@@ -38,7 +38,7 @@ class PolicyCamera:
     @property
     def half_angle_rad(self) -> float:
         """Return how far to either side it sees [rad]."""
-        return math.atan(0.5 * self.intrinsics.width / self.intrinsics.focal)
+        return 0.5 * self.intrinsics.horizontal_fov_rad
 
 
 @dataclass(frozen=True)

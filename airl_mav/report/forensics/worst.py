@@ -145,7 +145,7 @@ def _row(judged: ExaminedFlight) -> tuple[str, ...]:
         f"{record.seed}",
         OUTCOME_LABELS[record.outcome],
         f"{(record.ended_us - began_us) / US_PER_S:.1f}",
-        NONE if judged.lost_s is None or not whole else f"{judged.lost_s:+.1f}",
+        NONE if judged.lost_s is None or not whole else f"{round(judged.lost_s, 1) + 0.0:+.1f}",
         NONE if judged.excess is None or not arrived else f"{1.0 + judged.excess:.2f}",
         judged.cause.kind,
     )

@@ -11,8 +11,9 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
 from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.view.look import OTHER
 from airl_mav.view.panel import Panel
-from airl_mav.view.scene import OTHER, FlightScene
+from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.watchers import Watchers
 

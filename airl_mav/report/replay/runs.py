@@ -25,6 +25,7 @@ class ReplayedRun:
         """
         self._run: LoadedRun = load(path)
         self._vehicle: VehicleProfile = vehicle_of(self._run.info)
+        self.path, self.info = path, self._run.info
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
         """What was flown where."""
         paths = self._run.trajectories

@@ -1,0 +1,42 @@
+"""Depth images as bytes and in colour: near is bright."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MM_PER_M
+
+NO_RETURN = "#262a30"
+"""Colour of pixels that the camera has no depth of: that of the live view."""
+
+LEVELS = 255
+"""Shades from far to near."""
+
+
+def shades(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
+    """Return a depth image (h, w) [mm] as bytes: 0 no return, 1 at `range_m`, 255 at the camera.
+
+    By the square root, which shows near things best.
+    """
+    share = np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
+    bytes_of: NDArray[np.uint8] = (1.0 + np.round((LEVELS - 1) * (1.0 - share))).astype(np.uint8)
+    bytes_of[depth_mm == 0] = 0
+    return bytes_of
+
+
+@cache
+def palette() -> tuple[str, ...]:
+    """Return the colour "#rrggbb" of each byte."""
+    table = colormaps["viridis"](np.linspace(0.0, 1.0, LEVELS), bytes=True)[:, :3].tolist()
+    return (NO_RETURN, *(f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in table))
+
+
+def coloured(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
+    """Return a depth image (h, w) [mm] in colour, RGB (h, w, 3)."""
+    table = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in palette()], np.uint8)
+    picture: NDArray[np.uint8] = table[shades(depth_mm, range_m)]
+    return picture

@@ -1,0 +1,121 @@
+"""What the page's script shows of a flight: its motion, its decisions and what the policy saw."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.files import Arrays
+from airl_mav.latency.series import decision_series
+from airl_mav.latency.stages import STAGES
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.depth_colours import shades
+from airl_mav.report.packing import Steps, steps_of
+from airl_mav.report.policy_view import PolicyAgain, SeenDecision
+from airl_mav.report.tracking import EstimateErrors, Motion, TrackedFlight
+
+TIME_POINTS = 1000
+"""A line has at most this many points: 20 s at the recorded rate, or what is seen of more."""
+
+UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1}
+"""Numbers are kept to half of this, by the unit that a name ends with."""
+
+IMAGES = 24
+"""Decisions of a flight with a depth image: all, or the first, the last and some between."""
+
+LAST = 8
+"""Of them, so many are the last: they led to the end."""
+
+BEST = 5
+"""So many of a decision's scores are shown, the best first."""
+
+
+def chosen(count: int, most: int = IMAGES, last: int = LAST) -> list[int]:
+    """Return which of so many decisions are shown, increasing: `most` of them at most."""
+    if count <= most:
+        return list(range(count))
+    before = np.linspace(0, count - last - 1, most - last).round().astype(int)
+    return [*np.unique(before).tolist(), *range(count - last, count)]
+
+
+def flight_data(
+    flight: TrackedFlight,
+    stamps: Arrays,
+    seen: Sequence[SeenDecision],
+    range_m: float,
+    again: PolicyAgain | None,
+) -> dict[str, Any]:
+    """Return one flight as plain data.
+
+    Args:
+        flight: Its motion.
+        stamps: Its columns in `latency.npz`.
+        seen: Its decisions, worked out again; empty where that cannot be done.
+        range_m: Farthest depth that the camera returns [m].
+        again: Its policy; None: no scores are known.
+    """
+    count = len(flight.time_s)
+    keep = np.unique(np.linspace(0, count - 1, min(count, TIME_POINTS)).round().astype(int))
+    commands = flight.commands
+    return {
+        "time": steps_of(flight.time_s[keep], 0.001),
+        "flown": _lines(flight.flown, keep),
+        "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
+        "errors": None if flight.errors is None else _lines(flight.errors, keep),
+        "power": steps_of(flight.power_w[keep], 1.0),
+        "altitude": flight.altitude_m,
+        "commands": {
+            "sent": steps_of(commands.sent_s, 0.001),
+            "forward_m_s": steps_of(commands.forward_m_s, 0.01),
+            "right_m_s": steps_of(commands.right_m_s, 0.01),
+            "yaw_rate_deg_s": steps_of(commands.yaw_rate_deg_s, 0.1),
+        },
+        "stages": _stages(stamps),
+        "seen": [_seen(seen[k], range_m, again) for k in chosen(len(seen))],
+    }
+
+
+def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
+    """Return each array of a dataclass by its name."""
+    return {name: steps_of(values[keep], _unit(name)) for name, values in vars(of).items()}
+
+
+def _unit(name: str) -> float:
+    ends = [end for end in UNITS if name.endswith(end)]
+    return UNITS[max(ends, key=len)]
+
+
+def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
+    """Return what each decision that was sent took, stage by stage [ms]; None: not known."""
+    series = decision_series(stamps)
+    sent = np.asarray(stamps.get("sent_us", np.zeros(0, np.int64)))
+    there = sent != NO_STAMP
+    found = {}
+    for stage in STAGES:
+        values = series.get(stage.key)
+        if values is None or len(values) != len(sent) or (values[there] == NO_STAMP).all():
+            continue
+        found[stage.key] = [
+            None if us == NO_STAMP else round(float(us) / US_PER_MS, 2) for us in values[there]
+        ]
+    return found
+
+
+def _seen(decision: SeenDecision, range_m: float, again: PolicyAgain | None) -> Mapping[str, Any]:
+    """Return one decision: its image as base64 of bytes, and its best actions."""
+    height, width = decision.depth_mm.shape
+    image = base64.b64encode(shades(decision.depth_mm, range_m).tobytes()).decode()
+    told: dict[str, Any] = {"number": decision.number, "size": [width, height], "image": image}
+    if decision.scores is not None and again is not None:
+        best = np.argsort(-decision.scores, kind="stable")[:BEST]
+        told["best"] = [
+            [round(float(decision.scores[k]), 3), *np.round(again.actions[k], 3).tolist()]
+            for k in best
+        ]
+        told["again"] = decision.again
+    return told

@@ -1,0 +1,100 @@
+"""What a notebook shows of a run or a comparison: the verdict, the figures, one picture."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.errors import UsageError
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.arenas import arenas_of, vehicle_of
+from airl_mav.report.comparison.model import Comparison
+from airl_mav.report.comparison.show import comparison_to_document
+from airl_mav.report.comparison.tables import runs_table
+from airl_mav.report.document import Headline, environment
+from airl_mav.report.flights_above import overview_picture
+from airl_mav.report.forensics.worst import flown_path
+from airl_mav.report.measures import MEASURES
+from airl_mav.report.run_figures import map_figure
+from airl_mav.report.run_page import run_headlines
+from airl_mav.report.run_report import verdict_of
+from airl_mav.report.run_summary import summarize_run
+from airl_mav.report.scene import SceneFlight, top_speed
+from airl_mav.report.shown_flights import pictured
+from airl_mav.report.table import Column, TableView
+from airl_mav.report.theme import Picture
+from airl_mav.report.verdict import OverallVerdict, load_verdict
+
+
+def run_html(run: LoadedRun) -> str:
+    """Return a run as a piece of HTML; nothing is written.
+
+    Arenas that cannot be made any more are left out of the picture.
+    """
+    verdict = verdict_of(run)
+    table = _figures(run_headlines(run, summarize_run(run)))
+    picture = _picture(run) if run.episodes else None
+    return _html(verdict, table, picture, f"{run.path}")
+
+
+def comparison_html(
+    comparison: Comparison, loaded: Mapping[str, LoadedRun], folder: Path, page: Path
+) -> str:
+    """Return a comparison as a piece of HTML; nothing is written.
+
+    Args:
+        comparison: What is shown.
+        loaded: Its runs by name.
+        folder: Where it lies.
+        page: Its report.
+    """
+    verdict = load_verdict(folder)
+    document = comparison_to_document(comparison, loaded, folder, verdict)
+    table = runs_table(comparison.runs, measures=MEASURES)
+    drawing = next((section.draw for section in document.sections if section.draw), None)
+    pictures = () if drawing is None else drawing()
+    return _html(verdict, table, next(iter(pictures), None), f"{page}")
+
+
+def _figures(headlines: list[Headline]) -> TableView:
+    columns = (Column("measure", number=False), Column("value"), Column("95 % interval, n"))
+    rows = tuple((each.title, f"{each.value} {each.unit}", each.detail) for each in headlines)
+    return TableView("figures", "", columns, rows)
+
+
+def _picture(run: LoadedRun) -> Picture:
+    """Draw the flights from above; of a single one, with its speed."""
+    arenas = _arenas(run)
+    if len(run.episodes) > 1:
+        return overview_picture(run, arenas)
+    (record,) = run.episodes
+    path, arena = flown_path(run, record), arenas.get(record.index)
+    top = 0.0 if path is None else top_speed([SceneFlight(record, path, arena)])
+    return map_figure(record, path, arena, top)
+
+
+def _arenas(run: LoadedRun) -> dict[int, Arena]:
+    """Return the arenas of the worst flights; none where a profile is gone."""
+    try:
+        return arenas_of(pictured(run), vehicle_of(run.info))
+    except UsageError:
+        return {}
+
+
+def _html(
+    verdict: OverallVerdict, table: TableView | None, picture: Picture | None, place: str
+) -> str:
+    image = None if picture is None else base64.b64encode(picture.png).decode()
+    return (
+        environment()
+        .get_template("notebook.html.j2")
+        .render(
+            lines=verdict.lines,
+            table=table,
+            image=image,
+            alt="" if picture is None else picture.alt,
+            place=place,
+        )
+    )

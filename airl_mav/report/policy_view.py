@@ -1,0 +1,214 @@
+"""What the policy saw and chose, decision by decision, worked out again from what was recorded.
+
+No images are recorded. They are rendered again from the true pose at their exposure, without the
+camera's noise, by the ray caster that rendered them in flight; telemetry is the recorded estimate.
+A learned policy is asked again what it makes of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.frame import depth_to_z16
+from airl_mav.camera.render import camera_pose, render
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import Arrays
+from airl_mav.core.plugins import names_code
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.policy.action_sets import commands, discrete_actions
+from airl_mav.policy.layouts import MOST_FRAMES, encode_layout
+from airl_mav.policy.learned import LearnedPolicy, load_learned
+from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
+from airl_mav.policy.registry import find_policy
+from airl_mav.prediction.compensator import Compensator
+from airl_mav.prediction.memory import DecisionMemory
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
+from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
+
+ONE = np.zeros(1, np.intp)
+
+SAME_ACTION = 0.01
+"""Commands closer than this are the same action [m/s, rad/s]."""
+
+MOST = 2000
+"""Decisions of a flight that are worked out again: the first."""
+
+
+@dataclass(frozen=True)
+class SeenDecision:
+    """One decision."""
+
+    number: int
+    """Its row in `latency.npz`."""
+    depth_mm: NDArray[np.uint16]
+    """(h, w) what the policy saw [mm]; 0 = no return."""
+    scores: NDArray[np.float32] | None
+    """(k,) of each discrete action, as the network gives them; None: nothing tells them."""
+    again: bool | None
+    """Whether the action of the best score is the one that was flown; None without scores."""
+
+
+@dataclass(frozen=True)
+class PolicyAgain:
+    """A run's policy, ready to be asked again."""
+
+    policy: LearnedPolicy
+    actions: NDArray[np.float64]
+    """(k, 3) commands of its actions: forward, right [m/s], yaw rate [rad/s]."""
+
+    @property
+    def scores_are(self) -> str:
+        """What its scores are, in a word."""
+        return "Q-value" if "dqn" in self.policy.card.algorithm else "score"
+
+
+def policy_again(info: RunInfo) -> PolicyAgain | None:
+    """Return the policy that flew a run, if it is one of discrete actions that lies here unchanged.
+
+    Nothing of the run folder is run: a policy that is code, or whose card names code, is passed
+    over, as is one whose file has changed since.
+    """
+    name, digest = info.config.get("policy"), info.config.get("policy_sha256")
+    if not isinstance(name, str) or digest is None or names_code(name):
+        return None
+    try:
+        known = find_policy(name)
+        if known.folder is None or known.card is None or known.sha256 != digest:
+            return None
+        count = discrete_actions(known.card.actions)
+        if count is None:
+            return None
+        policy = load_learned(known.folder, known.card, ablate=info.config.get("ablate"))
+        table = commands(known.card.actions, np.arange(count))
+    except UsageError:
+        return None
+    return PolicyAgain(policy, table)
+
+
+def seen_decisions(
+    run: LoadedRun,
+    record: EpisodeRecord,
+    arena: Arena,
+    vehicle: VehicleProfile,
+    again: PolicyAgain | None = None,
+) -> Iterator[SeenDecision]:
+    """Yield the decisions of a flight in the order flown, as far as they were recorded.
+
+    Args:
+        run: The run.
+        record: The flight.
+        arena: Where it flew.
+        vehicle: What flew, with the camera of its environment.
+        again: Its policy; None: no scores.
+    """
+    path, stamps = run.trajectories.get(record.index), run.latency.get(record.index, {})
+    needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", "setpoint")
+    if path is None or not len(path) or any(name not in stamps for name in needed):
+        return
+    lens = _Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
+    pilot, watchdog = run.info.config.get("pilot", {}), run.info.config.get("watchdog", {})
+    companion = _Companion(vehicle, lens.camera, compensates=bool(pilot.get("compensate")))
+    hover_s, lasts_s = watchdog.get("hover_after_s"), pilot.get("hold_s", 0.0)
+    policy = None if again is None else again.policy.with_generator(np.random.default_rng(0))
+    for number in range(min(MOST, len(stamps["sent_us"]))):
+        captured, began, ready, sent = (int(stamps[name][number]) for name in needed[:4])
+        if NO_STAMP in (captured, began, ready, sent):
+            continue
+        image, state = lens.image(captured), _telemetry(stamps, path, began)
+        seen = companion.observe(image, state, record.goal, began - captured, began)
+        setpoint = np.asarray(stamps["setpoint"][number], np.float64)
+        scores = same = None
+        if again is not None and policy is not None:
+            encoded = encode_layout(policy.card.observation, seen.rows(None))
+            scores = policy.outputs(encoded)[0]
+            best = again.actions[int(np.argmax(scores))]
+            same = bool(np.abs(best - setpoint[[0, 1, 3]]).max() < SAME_ACTION)
+        yield SeenDecision(number, seen.depth_mm, scores, same)
+        stops = None if hover_s is None else sent + round((lasts_s + hover_s) * US_PER_S)
+        companion.decided(setpoint, ready - began, sent, stops)
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The camera along a recorded path."""
+
+    arena: Arena
+    camera: PolicyCamera
+    path: Trajectory
+    started_us: int
+
+    def image(self, time_us: int) -> NDArray[np.uint16]:
+        """Return what is seen (h, w) [mm] at a time."""
+        position, _, quaternion = pose_at(self.path, time_us)
+        eye, attitude = camera_pose(position, quaternion, self.camera.mount)
+        centers = self.arena.centers_at(time_us - self.started_us)
+        lens, range_m = self.camera.intrinsics, self.camera.range_m
+        return depth_to_z16(render(self.arena, centers, lens, range_m, eye, attitude))
+
+
+class _Companion:
+    """What a companion keeps from one decision to the next, as `companion.pilot` does."""
+
+    def __init__(self, vehicle: VehicleProfile, camera: PolicyCamera, *, compensates: bool) -> None:
+        self._intrinsics = camera.intrinsics
+        self._compensator = None
+        if compensates and vehicle.response is not None:
+            self._compensator = Compensator(1, vehicle, camera.intrinsics)
+            self._compensator.begin(0)
+            self._memory = self._compensator.memory
+        else:
+            self._memory = DecisionMemory(1)
+            self._memory.begin(0)
+        self._earlier: tuple[NDArray[np.uint16], ...] = ()
+
+    def observe(
+        self,
+        depth_mm: NDArray[np.uint16],
+        state: Kinematics,
+        goal: tuple[float, float],
+        age_us: int,
+        now_us: int,
+    ) -> Observation:
+        """Return what the policy sees: what is, or what will be when its action is sent."""
+        age = np.array([age_us])
+        if self._compensator is not None:
+            images, states = self._compensator.foresee(
+                ONE, depth_mm[None], age, np.array([now_us]), state.rows(None)
+            )
+            depth_mm, state = images[0], states.rows(0)
+        told = self._memory.in_flight(age).rows(0)
+        earlier = self._earlier
+        self._earlier = (depth_mm, *earlier)[: MOST_FRAMES - 1]
+        where = np.asarray(goal, np.float64)
+        in_flight = InFlight(told.command, told.latency_s, told.age_s)
+        return observe(depth_mm, self._intrinsics, state, where, in_flight, earlier)
+
+    def decided(
+        self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None
+    ) -> None:
+        """Take what was sent."""
+        command, t2 = setpoint[None], np.array([t2_us])
+        if self._compensator is None:
+            self._memory.decided(ONE, command, t2)
+            return
+        stops = None if stops_us is None else np.array([stops_us])
+        self._compensator.decided(ONE, command, t2, np.array([sent_us]), stops)
+
+
+def _telemetry(stamps: Arrays, path: Trajectory, time_us: int) -> Kinematics:
+    """Return the newest estimate at a time; the true state where none was recorded."""
+    if not len(stamps.get("estimate/time_us", ())):
+        return Kinematics(*pose_at(path, time_us))
+    at = max(0, int(np.searchsorted(stamps["estimate/time_us"], time_us, side="right")) - 1)
+    return Kinematics(
+        *(stamps[f"estimate/{name}"][at] for name in ("position", "velocity", "quaternion"))
+    )

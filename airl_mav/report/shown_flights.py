@@ -1,0 +1,160 @@
+"""The flights that a page shows one by one: stills of the worst, and what its script shows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.depth_colours import palette
+from airl_mav.report.faults import fault_spans_s
+from airl_mav.report.flight_data import chosen, flight_data
+from airl_mav.report.forensics.evidence import Cause
+from airl_mav.report.forensics.worst import flown_path, ranked
+from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
+from airl_mav.report.run_figures import map_figure
+from airl_mav.report.scene import ALL_FLIGHTS, SceneFlight, scene_json, top_speed
+from airl_mav.report.theme import Picture
+from airl_mav.report.tracking import TrackedFlight, track
+from airl_mav.report.tracking_figure import IMAGES, tracking_figure
+
+MAX_PICTURED = 6
+"""Flights with still pictures: the worst."""
+
+MAX_SHOWN = 24
+"""Flights that the page's script shows one by one: the worst."""
+
+
+@dataclass(frozen=True)
+class PicturedFlight:
+    """One flight that the page shows by itself."""
+
+    record: EpisodeRecord
+    cause: Cause | None
+    pictures: tuple[Picture, ...]
+    scene: int | None
+    """Its number in the view of single flights; None where it has no path."""
+
+
+@dataclass(frozen=True)
+class ShownFlight:
+    """One flight of the view of single flights."""
+
+    scene: SceneFlight
+    tracked: TrackedFlight
+    seen: tuple[SeenDecision, ...]
+    """Its decisions, worked out again; empty where arena or vehicle is not known."""
+
+
+@dataclass(frozen=True)
+class ShownFlights:
+    """The flights of the view, the worst first."""
+
+    flights: tuple[ShownFlight, ...]
+    policy: PolicyAgain | None
+    numbers: dict[int, int] = field(init=False)
+    """Of each flight in the view, by episode index."""
+
+    def __post_init__(self) -> None:
+        """Number the flights."""
+        numbers = {flight.scene.record.index: k for k, flight in enumerate(self.flights)}
+        object.__setattr__(self, "numbers", numbers)
+
+    @property
+    def note(self) -> str:
+        """How what the policy saw is known."""
+        told = "Rendered again from the recorded path, without the camera's noise."
+        asked = [d.again for flight in self.flights for d in flight.seen if d.again is not None]
+        if asked:
+            told += (
+                f" The policy, asked again, chose the flown action in {sum(asked):,} of "
+                f"{len(asked):,} decisions."
+            )
+        return told
+
+
+def pictured(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the episodes that get still pictures, the worst first."""
+    return ranked(run)[:MAX_PICTURED]
+
+
+def shown(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return the episodes that the script shows one by one, the worst first."""
+    return ranked(run)[:MAX_SHOWN]
+
+
+def shown_flights(
+    run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
+) -> ShownFlights:
+    """Return the flights of the view: those that have a path."""
+    again = None if vehicle is None else policy_again(run.info)
+    flights = []
+    for record in shown(run):
+        path, tracked, arena = flown_path(run, record), track(run, record), arenas.get(record.index)
+        if path is None or tracked is None:
+            continue
+        seen: tuple[SeenDecision, ...] = ()
+        if arena is not None and vehicle is not None:
+            seen = tuple(seen_decisions(run, record, arena, vehicle, again))
+        flights.append(ShownFlight(SceneFlight(record, path, arena), tracked, seen))
+    return ShownFlights(tuple(flights), again)
+
+
+def pictured_flights(
+    run: LoadedRun,
+    arenas: Mapping[int, Arena],
+    view: ShownFlights,
+    causes: Mapping[int, Cause],
+    range_m: float,
+) -> list[PicturedFlight]:
+    """Draw the flights that get still pictures, the worst first."""
+    top = top_speed([flight.scene for flight in view.flights])
+    found = []
+    for episode in pictured(run):
+        number = view.numbers.get(episode.index)
+        flight = None if number is None else view.flights[number]
+        path = None if flight is None else flight.scene.path
+        pictures = [map_figure(episode, path, arenas.get(episode.index), top)]
+        if flight is not None:
+            seen = [flight.seen[k] for k in chosen(len(flight.seen), IMAGES, 2)]
+            pictures.append(tracking_figure(flight.tracked, seen, range_m))
+        found.append(PicturedFlight(episode, causes.get(episode.index), tuple(pictures), number))
+    return found
+
+
+def page_data(
+    run: LoadedRun,
+    view: ShownFlights,
+    pictures: Sequence[Picture],
+    vehicle: VehicleProfile | None,
+) -> str:
+    """Return all that the page's script shows, as JSON: pictures, views and flights."""
+    fov, range_m = (0.0, 0.0) if vehicle is None else (
+        vehicle.camera.horizontal_fov_deg, vehicle.camera.range_m,
+    )  # fmt: skip
+    everyone = ranked(run)[:ALL_FLIGHTS]
+    data: dict[str, Any] = {
+        "pictures": {picture.name: picture.svg for picture in pictures},
+        "flights": [
+            {
+                **flight_data(
+                    flight.tracked,
+                    run.latency.get(flight.scene.record.index, {}),
+                    flight.seen,
+                    range_m,
+                    view.policy,
+                ),
+                "faults": fault_spans_s(flight.scene.record),
+            }
+            for flight in view.flights
+        ],
+        "palette": palette(),
+    }
+    views = scene_json(run, [flight.scene for flight in view.flights], everyone, fov)
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return f'{text[:-1]},"views":{views}}}'

@@ -1,0 +1,179 @@
+"""A flight over time as a still picture: what the policy saw, its commands, what became of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from airl_mav.report import theme
+from airl_mav.report.depth_colours import coloured
+from airl_mav.report.faults import fault_spans_s
+from airl_mav.report.policy_view import SeenDecision
+from airl_mav.report.tracking import Commands, Floats, TrackedFlight
+
+TIME_POINTS = 300
+"""A line has at most this many corners."""
+
+WIDTH_IN, ROW_IN, STRIP_IN = 5.2, 0.86, 0.78
+LEFT_IN, RIGHT_IN = 0.62, 0.12
+
+BEFORE_S = 2.0
+"""So much of the take-off is shown [s]; all of it where it was not finished."""
+
+IMAGES = 5
+"""Depth images above the rows."""
+
+COMMANDED = theme.MARK
+FLOWN = theme.SERIES
+ESTIMATED = "#2c9a5b"
+"""Of middling lightness: legible on light and on dark paper."""
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One line of a row."""
+
+    values: Floats
+    colour: str
+    dashes: str = "-"
+    wide: float = 1.1
+
+
+def tracking_figure(
+    flight: TrackedFlight, seen: Sequence[SeenDecision] = (), range_m: float = 0.0
+) -> theme.Picture:
+    """Draw a flight over time, zero where navigation begins.
+
+    Args:
+        flight: What is drawn.
+        seen: Decisions whose depth images stand above the rows, `IMAGES` of them at most.
+        range_m: Farthest depth that the camera returns [m].
+    """
+    rows = _rows(flight)
+    strip = STRIP_IN if seen else 0.0
+    height = 0.45 + 0.3 + strip + len(rows) * ROW_IN
+    margins = theme.Margins(LEFT_IN, RIGHT_IN, 0.45, 0.3 + strip, 0.12)
+    figure, axes = theme.stacked_axes(len(rows), WIDTH_IN, height, margins)
+    t = flight.time_s
+    first = 0
+    if flight.record.navigation_us is not None:
+        first = min(int(np.searchsorted(t, -BEFORE_S)), len(t) - 2)
+    keep = np.unique(np.linspace(first, len(t) - 1, TIME_POINTS).astype(int))
+    for ax, (label, lines) in zip(axes, rows, strict=True):
+        _draw_row(ax, flight, label, lines, keep)
+    for image, ax in zip(seen, _strip(figure, seen, height), strict=True):
+        ax.imshow(coloured(image.depth_mm, range_m), interpolation="nearest", aspect="equal")
+        at = flight.commands.sent_s[min(image.number, len(flight.commands.sent_s) - 1)]
+        ax.set_title(f"{at:.1f} s", fontsize=7.5, color=theme.MUTED, pad=2)
+        for row in axes:
+            row.axvline(at, color=theme.MUTED, lw=0.6, ls=":", zorder=1)
+    if t[first] < 0.0:
+        axes[0].annotate(
+            "take-off", (t[first], 1.0), xycoords=("data", "axes fraction"), xytext=(3, -3),
+            textcoords="offset points", va="top", fontsize=8, color=theme.MUTED,
+        )  # fmt: skip
+    theme.label_axes(axes[-1], "time since the start of navigation [s]")
+    figure.legend(
+        handles=_legend(flight), loc="upper left", bbox_to_anchor=(LEFT_IN / WIDTH_IN, 1.0),
+        ncols=3, frameon=False, fontsize=8, labelcolor=theme.INK, borderaxespad=0.1,
+        handlelength=1.6, columnspacing=1.4,
+    )  # fmt: skip
+    number = flight.record.index
+    alt = f"Flight {number} over time: " + ", ".join(label.partition(" [")[0] for label, _ in rows)
+    return theme.render(figure, f"flight-{number:03d}-time", alt)
+
+
+def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
+    """Return the rows, from the top: label and lines."""
+    flown, estimated, errors, t = flight.flown, flight.estimated, flight.errors, flight.time_s
+    rows = []
+    for name, label in (
+        ("forward_m_s", "forward\n[m/s]"),
+        ("right_m_s", "right\n[m/s]"),
+        ("yaw_rate_deg_s", "yaw rate\n[°/s]"),
+    ):
+        lines = [_Line(getattr(flown, name), FLOWN)]
+        if estimated is not None and name != "yaw_rate_deg_s":
+            lines.append(_Line(getattr(estimated, name), ESTIMATED, "--", 0.9))
+        lines.append(_Line(held(flight.commands, name, t), COMMANDED, "-", 0.9))
+        rows.append((label, lines))
+    lines = [_Line(flown.height_m, FLOWN)]
+    if estimated is not None:
+        lines.append(_Line(estimated.height_m, ESTIMATED, "--", 0.9))
+    if flight.altitude_m is not None:
+        asked = np.where(t >= 0.0, flight.altitude_m, np.nan)
+        lines.append(_Line(asked, COMMANDED, "-", 0.9))
+    rows.append(("height\n[m]", lines))
+    tilt = [_Line(flown.roll_deg, FLOWN), _Line(flown.pitch_deg, FLOWN, ":")]
+    rows.append(("roll, pitch:\ndotted [°]", tilt))
+    if errors is not None:
+        away = [_Line(errors.aside_m, ESTIMATED), _Line(errors.height_m, ESTIMATED, ":")]
+        rows.append(("error of est.\n[m], height:\ndotted", away))
+    rows.append(("power\n[W]", [_Line(flight.power_w, FLOWN)]))
+    return rows
+
+
+def held(commands: Commands, name: str, time_s: Floats) -> Floats:
+    """Return what is commanded at each time (m,): the newest setpoint; NaN before the first."""
+    values: Floats = getattr(commands, name)
+    if not len(values):
+        return np.full(len(time_s), np.nan)
+    which = np.searchsorted(commands.sent_s, time_s, side="right") - 1
+    return np.where(which < 0, np.nan, values[np.maximum(which, 0)])
+
+
+def _draw_row(
+    ax: Axes, flight: TrackedFlight, label: str, lines: Sequence[_Line], keep: NDArray[np.int64]
+) -> None:
+    t = flight.time_s
+    for line in lines:
+        power = line.values is flight.power_w
+        values = _mean_power(flight, keep) if power else line.values[keep]
+        ax.plot(t[keep], values, color=line.colour, ls=line.dashes, lw=line.wide)
+    theme.label_axes(ax, y=label)
+    ax.yaxis.label.set_fontsize(7.5)
+    ax.margins(y=0.08)
+    if t[keep[0]] < 0.0:
+        ax.axvspan(t[keep[0]], 0.0, color=theme.RULE, alpha=0.45, lw=0)
+    for begin_s, end_s in fault_spans_s(flight.record):
+        ax.axvspan(begin_s, end_s, color=theme.MARK, alpha=0.12, lw=0)
+    theme.plain_axes(ax)
+    ax.locator_params(axis="y", nbins=4)
+    ax.set_xlim(t[keep[0]], t[-1])
+
+
+def _mean_power(flight: TrackedFlight, keep: NDArray[np.int64]) -> Floats:
+    """Return the mean power between kept samples: it is a mean since the sample before."""
+    steps = np.diff(flight.time_s, prepend=flight.time_s[0] - 1e-6)
+    energy = np.cumsum(flight.power_w * steps)
+    passed = flight.time_s[keep] - flight.time_s[0] + 1e-6
+    first = flight.power_w[keep[0]]
+    power: Floats = np.append(first, np.diff(energy[keep]) / np.diff(passed))
+    return power
+
+
+def _strip(figure: Figure, seen: Sequence[SeenDecision], height: float) -> list[Axes]:
+    """Return axes for the images, side by side above the rows."""
+    width = (WIDTH_IN - LEFT_IN - RIGHT_IN) / IMAGES
+    axes = []
+    for k in range(len(seen)):
+        left = (LEFT_IN + k * width + 0.04) / WIDTH_IN
+        bottom = (height - 0.3 - STRIP_IN + 0.04) / height
+        ax = figure.add_axes((left, bottom, (width - 0.08) / WIDTH_IN, (STRIP_IN - 0.2) / height))
+        ax.axis("off")
+        axes.append(ax)
+    return axes
+
+
+def _legend(flight: TrackedFlight) -> list[Line2D]:
+    """Return what the colours mean."""
+    kinds = [("commanded", COMMANDED, "-"), ("flown", FLOWN, "-")]
+    if flight.estimated is not None:
+        kinds.append(("estimated", ESTIMATED, "--"))
+    return [Line2D([], [], color=colour, ls=dashes, label=name) for name, colour, dashes in kinds]
