@@ -193,16 +193,19 @@ def read_damaged_file(number: int, kind: str | None = None) -> str:
 
 # --- camera --------------------------------------------------------------------------------------
 
-LENS = Intrinsics.from_fov(16, 12, math.pi / 2)
+LENSES = (
+    Intrinsics.from_fov(16, 12, math.pi / 2),
+    Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical"),
+)
 STAMPS = (0, 1, -1, 2**63 - 1, -(2**63), US_PER_S, 10**15)
 NUMBERS = (0.0, -1.0, 1e-320, 1e308, math.nan, math.inf, -math.inf, 8.0)
 SIDES = (0, 1, 2, 12, 16, 17, 255, 65_535)
 
 
-def hostile_frame(rng: np.random.Generator) -> bytes:
+def hostile_frame(rng: np.random.Generator, lens: Intrinsics = LENSES[0]) -> bytes:
     """Return the bytes of a depth frame: a sound one, or with something wrong in it."""
-    depth = rng.integers(0, 65_536, (LENS.height, LENS.width), np.uint16)
-    frame = bytearray(Frame(int(rng.integers(1 << 62)), 0, depth, LENS).to_bytes())
+    depth = rng.integers(0, 65_536, (lens.height, lens.width), np.uint16)
+    frame = bytearray(Frame(int(rng.integers(1 << 62)), 0, depth, lens).to_bytes())
     kind = int(rng.integers(8))
     if kind == 1:
         struct.pack_into("<q", frame, 12, STAMPS[int(rng.integers(len(STAMPS)))])
@@ -232,6 +235,7 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
         Exception: A frame broke something, or an action is no number.
     """
     rng = np.random.default_rng((number, 2))
+    lens = LENSES[number % len(LENSES)]
     policy, clock = GreedyPolicy(), SimClock()
     still = Kinematics(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     passed = 0
@@ -242,9 +246,9 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
             for _ in range(frames):
                 clock.advance(33_333)
                 if rng.random() < 0.1:
-                    publisher.send_multipart([hostile_frame(rng), hostile_frame(rng)])
+                    publisher.send_multipart([hostile_frame(rng, lens), hostile_frame(rng, lens)])
                 else:
-                    publisher.send(hostile_frame(rng))
+                    publisher.send(hostile_frame(rng, lens))
                 seen = source.wait(-1, 0.0)
                 if seen is None:
                     continue

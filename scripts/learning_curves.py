@@ -3,7 +3,7 @@
     python scripts/learning_curves.py [--configs NAME ...] [--seeds N] [--steps N] [--out DIR]
 
 By default the paper's algorithm exploration (DQN and PPO, with and without curriculum), and the
-default policy's training. Each run is
+`static-obstacles`' training. Each run is
 an `airl train` of its own that survives a kill: start the script again and it goes on where it was.
 The picture shows the success rate on the selection seeds, mean over the training seeds with a 95 %
 interval (Student's t); the table says after how many decisions each configuration reached 97 %, not
@@ -38,7 +38,7 @@ CONFIGS = (
     *("paper-dqn", "paper-dqn-curriculum", "paper-ppo", "paper-ppo-curriculum"),
     "static-obstacles",
 )
-"""The paper's exploration, and what the default policy was trained with."""
+"""The paper's exploration, and what `static-obstacles` was trained with."""
 
 REACHED = 0.97
 

@@ -38,7 +38,7 @@ def _gap(record: Record, target: str, reference: str, arena: str = DEFAULT) -> G
 
 
 _ON_THE_TARGET = {
-    "target": "default policy, Raspberry Pi",
+    "target": "`static-obstacles`, Raspberry Pi",
     "compensated": "... its latency compensated in flight",
     "compensated-pipelined": "... and decisions pipelined",
     "mitigated": "mitigated policy, Raspberry Pi",
@@ -58,7 +58,7 @@ def gap_short(records: Records) -> str:
         f"{energy_kj(a)} kJ",
         "",
     )
-    rows: list[tuple[str, ...]] = [("default policy, workstation", *first)]
+    rows: list[tuple[str, ...]] = [("`static-obstacles`, workstation", *first)]
     for role, title in _ON_THE_TARGET.items():
         rows.append((title, f"{rate(runs[role])} %", *_changes(_gap(record, role, "reference"))))
     trained = _gap(record, "mitigated", "training")
@@ -340,6 +340,19 @@ def compensation(records: Records) -> str:
         rows.append((late.replace("ms", " ms"), *cells))
     heads = ("as it is", "", "compensated", "", "compensated, pipelined", "")
     return table(("t2", *heads), rows, 6)
+
+
+@block("any-latency", "any-latency")
+def any_latency(records: Records) -> str:
+    record, name = records["any-latency"], "static-obstacles-any-latency"
+    rows = []
+    for late in ("1ms", *_LATE):
+        run = record.runs[f"{name}-{late}"]
+        gap = record.gaps.get(f"{name}-{late} against {name}-1ms")
+        longer = NONE if gap is None else percent(gap.flight_time_s)
+        flown = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
+        rows.append((late.replace("ms", " ms"), f"{rate(run)} %", *flown, longer))
+    return table(("t2", "success", "flight time", "distance", "time against 1 ms"), rows, 4)
 
 
 # --- degradation

@@ -28,7 +28,7 @@ def ladder_conditions(records: Records) -> str:
 def ladder_late(records: Records) -> str:
     rows = []
     for title, name in (
-        ("default policy", "ladder-late"),
+        ("`static-obstacles`", "ladder-late"),
         ("mitigated policy", "ladder-mitigated"),
     ):
         (gap,) = records[name].gaps.values()
@@ -58,7 +58,7 @@ def sitl(records: Records) -> str:
     return _levels((("", records["sitl"]),), "sitl")
 
 
-_PREDICTED = {"default policy": "predicted"}
+_PREDICTED = {"`static-obstacles`": "predicted"}
 """Results with flights that were predicted from a file of latencies, by what flew."""
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.published import load_published
-from published.blocks import DEFAULT, Records, block
+from airl_mav.scenario.model import DEFAULT_POLICY
+from published.blocks import Records, block
 from published.record import FlownRun
 from published.text import NONE, energy_kj, number, rate, table
 
@@ -14,11 +15,15 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "static-obstacles": ("generalisation", "static-obstacles-static-obstacles"),
     "static-obstacles-ppo": ("static-obstacles-ppo", "run"),
     "static-obstacles-fast": ("static-obstacles-fast", "run"),
+    "static-obstacles-any-latency": ("any-latency", "static-obstacles-any-latency-1ms"),
+    "static-obstacles-d435": ("static-obstacles-d435", "run"),
     "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
     "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
     "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
+    "dynamic-obstacles-fast": ("dynamic-obstacles-fast", "run"),
     "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
     "dense-obstacles-fast": ("dense-obstacles-fast", "run"),
+    "dense-obstacles-d435": ("dense-obstacles-d435", "run"),
     "crowded": ("generalisation", "crowded-crowded"),
     "crowded-pipelined": ("crowded-pipelined", "run"),
 }
@@ -43,7 +48,7 @@ def policies_short(records: Records) -> str:
         assert card is not None
         maker = _MAKERS[card.algorithm]
         late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
-        title = f"`{name}`" + (" (default)" if name == DEFAULT else "")
+        title = f"`{name}`" + (" (default)" if name == DEFAULT_POLICY else "")
         cells = (title, maker, f"`{run.arena}`{late}", f"{rate(run)} %")
         rows.append((*cells, f"{number(run.flight_time_s, 2)} s"))
     return table(("policy", "algorithm", "flown in", "success", "flight time"), rows)
@@ -59,7 +64,7 @@ def policies(records: Records) -> str:
         late = f", t2 = {run.t2_ms:.0f} ms" if run.t2_ms and run.t2_ms > 10 else ""
         rows.append(
             (
-                f"`{name}`" + (" (default)" if name == DEFAULT else ""),
+                f"`{name}`" + (" (default)" if name == DEFAULT_POLICY else ""),
                 maker,
                 "frame" if card.decisions == "pipelined" else f"{card.hold_s:g} s",
                 f"`{run.arena}`{late}",
@@ -132,3 +137,19 @@ def ablation(records: Records) -> str:
 
 def _told(success_percent: float | None) -> str:
     return NONE if success_percent is None else f"{success_percent:g}"
+
+
+# --- goals farther off than any that was learned
+
+
+@block("held-out-zone", "held-out-zone")
+def held_out_zone(records: Records) -> str:
+    runs, rows = records["held-out-zone"].runs, []
+    learned = {"near": "within 32 m", "everywhere": "everywhere"}
+    for zone in ("within", "beyond"):
+        for name, goals in learned.items():
+            run = runs[f"{zone}/{name}"]
+            flown = number(run.flight_time_s, 2), number(run.distance_m, 1)
+            rows.append((f"{zone} 32 m", goals, rate(run), *flown))
+    heads = "goals flown to", "goals learned", "success [%]", "flight time [s]", "distance [m]"
+    return table(heads, rows, 3)
