@@ -68,6 +68,7 @@ def render_all(out, position, attitude, focal, cx, cy, bounds, shape, center, ha
             focal,
             cx,
             cy,
+            False,
             RANGE_M,
             bounds,
             shape,

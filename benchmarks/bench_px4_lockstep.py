@@ -3,7 +3,7 @@
     python benchmarks/bench_px4_lockstep.py --px4-dir PX4-Autopilot [--seeds 3] [--threads 12]
     python benchmarks/bench_px4_lockstep.py
 
-Flies the default policy in static-obstacles (without --px4-dir: the tests' stand-in, which flies
+Flies static-obstacles in its arena (without --px4-dir: the tests' stand-in, which flies
 our own autopilot). All figures are for a simulated second of flight. Processor time does not
 depend on what else the host does; the multiple of real time, and how long threads that could run
 waited for a core, do. Linux only: from /proc.
@@ -127,6 +127,7 @@ def main() -> None:
         scenario = Scenario(
             firmware="px4",
             level="lockstep",
+            policy="static-obstacles",
             arena="static-obstacles",
             real={"px4_dir": str(px4), "instance": options.instance},
         )

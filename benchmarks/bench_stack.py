@@ -4,7 +4,7 @@
 
 On one core. (a) plant and flight controller in a hover with 20 Hz setpoints, (b) with the MAVLink
 streams of the onboard link, and of both links, packed as well, (c) whole flights in lockstep:
-real MAVSDK, depth camera, the default policy at two decisions a second. Prints multiples of real
+real MAVSDK, depth camera, `static-obstacles` at two decisions a second. Prints multiples of real
 time, the best of three, and where the time of a tick goes.
 """
 

@@ -223,6 +223,17 @@ def test_a_companion_with_another_key_is_told_so(key: Path, tmp_path: Path) -> N
         link.connect(1.0)
 
 
+def test_a_companion_without_the_key_is_told_so(key: Path) -> None:
+    (api,), _ = free_ports(1, 0)
+    url = f"udpin://{LOOPBACK}:{api}"
+    with (
+        closing(Flying(key, api)),
+        closing(MavsdkLink(url, WallClock(), threading.Event())) as link,
+        pytest.raises(LinkError, match=r"^no telemetry: .* wants signed messages .--signing-key."),
+    ):
+        link.connect(20.0)
+
+
 def test_the_proxy_signs_for_mavsdk_alone(key: Path) -> None:
     """Else any program on the companion computer could command the vehicle without the key."""
     (api,), _ = free_ports(1, 0)
