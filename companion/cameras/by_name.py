@@ -12,7 +12,15 @@ from companion.camera import FrameSource, open_camera
 from companion.cameras.driver import CameraThread, DepthCamera
 from companion.cameras.fitting import Fitting, check_coverage
 
-REALSENSE = "realsense"
+REALSENSE, ROS2, ROSBAG = "realsense", "ros2", "rosbag"
+"""Drivers that are shipped: words before a colon."""
+
+EXTRAS = {
+    REALSENSE: "librealsense (pip install pyrealsense2)",
+    ROS2: "Cyclone DDS and rosbags (pip install 'airl-mav[ros2]')",
+    ROSBAG: "rosbags (pip install 'airl-mav[ros2]')",
+}
+"""What they need."""
 
 
 class OpenCamera(FrameSource, Protocol):
@@ -33,7 +41,8 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
 
     Args:
         name: tcp://HOST:PORT or ipc://PATH; "realsense", "realsense:SERIAL" or
-            "realsense:FILE.bag"; FILE.py:NAME, MODULE:NAME or the entry point of a driver.
+            "realsense:FILE.bag"; "ros2:/TOPIC"; "rosbag:PATH" or "rosbag:PATH:/TOPIC";
+            FILE.py:NAME, MODULE:NAME or the entry point of a driver.
         clock: The companion's, for the stamps.
         wanted: What images of a driver are made into; an address sends what it sends.
         whose: Whose camera `wanted` is: "vehicle quad".
@@ -51,7 +60,7 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
             problem=f"drivers give images of a pinhole, the camera of {whose} is cylindrical;"
             " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
         )
-    camera = _driver(name)
+    camera = _driver(name, clock)
     fitting = Fitting(camera.lens, wanted)
     try:
         check_coverage(name, camera.lens, fitting, whose)
@@ -61,19 +70,18 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
     return CameraThread(name, camera, clock, fitting)
 
 
-def _driver(name: str) -> DepthCamera:
+def _driver(name: str, clock: Clock) -> DepthCamera:
     brand, _, which = name.partition(":")
-    if brand == REALSENSE:
+    if brand in EXTRAS:
         try:
-            # Imported when it is asked for: few companions have one.
-            from companion.cameras.realsense import open_realsense
+            return _shipped(brand, which, clock)
         except ImportError as error:
-            raise FieldError(
-                "camera", name, problem=f"needs librealsense (pip install pyrealsense2): {error}"
-            ) from None
-        return open_realsense(which)
+            raise FieldError("camera", name, problem=f"needs {EXTRAS[brand]}: {error}") from None
     if reference(CAMERAS, name) is None:
-        accepted = "tcp://HOST:PORT, ipc://PATH, realsense, FILE.py:NAME or MODULE:NAME"
+        accepted = (
+            "tcp://HOST:PORT, ipc://PATH, realsense, ros2:/TOPIC, rosbag:PATH, FILE.py:NAME or"
+            " MODULE:NAME"
+        )
         raise FieldError("camera", name, accepted)
     made = load_part(CAMERAS, name, lambda part: callable(getattr(part, "read", None)))
     try:
@@ -83,3 +91,20 @@ def _driver(name: str) -> DepthCamera:
         told = " ".join(f"{type(error).__name__}: {error}".split())
         raise FieldError("camera", name, problem=told) from error
     return camera
+
+
+def _shipped(brand: str, which: str, clock: Clock) -> DepthCamera:
+    """Open a camera of a driver that is shipped, imported when it is asked for: few have one."""
+    if brand == REALSENSE:
+        from companion.cameras.realsense import open_realsense
+
+        return open_realsense(which)
+    if not which.startswith("/") if brand == ROS2 else not which:
+        raise FieldError("camera", f"{brand}:{which}", "ros2:/TOPIC or rosbag:PATH")
+    if brand == ROS2:
+        from companion.cameras.ros2 import Ros2Camera
+
+        return Ros2Camera(which)
+    from companion.cameras.rosbag import RosBag
+
+    return RosBag(which, clock)

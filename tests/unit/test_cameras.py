@@ -264,7 +264,10 @@ def test_in_lockstep_the_camera_is_an_address() -> None:
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("usb", r"accepted: tcp://HOST:PORT, ipc://PATH, realsense, FILE.py:NAME or MODULE:NAME"),
+        (
+            "usb",
+            "accepted: tcp://HOST:PORT, ipc://PATH, realsense, ros2:/TOPIC, rosbag:PATH, FILE",
+        ),
         ("udp://1.2.3.4:5", "accepted: tcp://HOST:PORT, ipc://PATH"),
         ("{}/none.py:Mine", "none.py: no such file"),
         ("{}/mine.py:Blind", "a class with a lens and a method read"),

@@ -42,9 +42,12 @@ import importlib, importlib.util, pkgutil
 import companion
 names = [m.name for m in pkgutil.walk_packages(companion.__path__, "companion.")]
 assert len(names) >= 5, names
-# A driver that comes with an extra.
-if importlib.util.find_spec("pyrealsense2") is None:
-    names.remove("companion.cameras.realsense")
+# Drivers that come with an extra.
+for driver, needs in (
+    ("realsense", ["pyrealsense2"]), ("ros2", ["cyclonedds", "rosbags"]), ("rosbag", ["rosbags"])
+):
+    if None in map(importlib.util.find_spec, needs):
+        names.remove(f"companion.cameras.{driver}")
 for name in names:
     importlib.import_module(name)
 """

@@ -1,0 +1,225 @@
+"""Depth images that a ROS 2 node publishes, without ROS: over DDS, the protocol under it.
+
+ROS 2 sends a message of the topic /a/b and the type p/msg/T as a DDS sample of the topic rt/a/b and
+the type p::msg::dds_::T_ (ROS 2 design, "Topic and Service name mapping to DDS"). Cyclone DDS
+receives it, and rosbags reads it.
+"""
+
+# No annotations from the future: Cyclone DDS reads the types of fields when a class is made.
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import annotations as annotate
+from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+from rosbags.typesys import Stores, get_typestore
+
+from airl_mav.core.clock import utc_us
+from airl_mav.core.errors import FieldError, UsageError
+from companion.cameras.driver import DepthImage
+from companion.cameras.fitting import Lens
+from companion.cameras.ros_images import CAMERA_INFO, IMAGE, age_us, depth_mm, info_topic, lens_of
+
+DESCRIBED_S = 5.0
+"""A camera whose description has not come by then is not there [s]. ROS 2 nodes find each other
+within a second."""
+
+FAILED_S = 5.0
+"""A camera that sends nothing for so long has failed [s of waiting]."""
+
+MOST_DOMAIN = 232
+"""The greatest ROS_DOMAIN_ID: the ports of a greater one do not exist."""
+
+HERE_ALONE = """<CycloneDDS><Domain>
+<General><Interfaces><NetworkInterface name="lo"/></Interfaces>\
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>\
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+"""Cyclone DDS' configuration for what ROS_LOCALHOST_ONLY=1 asks for."""
+
+_messages = get_typestore(Stores.ROS2_HUMBLE)
+
+NEWEST = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(1))
+"""What fits every publisher: no image is sent again, and only the newest counts."""
+
+
+@dataclass
+@annotate.final
+@annotate.autoid("sequential")
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    """builtin_interfaces/Time."""
+
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+@annotate.final
+@annotate.autoid("sequential")
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    """std_msgs/Header."""
+
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+@annotate.final
+@annotate.autoid("sequential")
+class Image(IdlStruct, typename="sensor_msgs::msg::dds_::Image_"):
+    """sensor_msgs/Image."""
+
+    header: Header
+    height: uint32
+    width: uint32
+    encoding: str
+    is_bigendian: uint8
+    step: uint32
+    data: sequence[uint8]
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
+        """Read a sample. Cyclone DDS' own way makes a number in Python of every byte."""
+        return _messages.deserialize_cdr(data, IMAGE)
+
+
+@dataclass
+@annotate.final
+@annotate.autoid("sequential")
+class RegionOfInterest(IdlStruct, typename="sensor_msgs::msg::dds_::RegionOfInterest_"):
+    """sensor_msgs/RegionOfInterest."""
+
+    x_offset: uint32
+    y_offset: uint32
+    height: uint32
+    width: uint32
+    do_rectify: bool
+
+
+@dataclass
+@annotate.final
+@annotate.autoid("sequential")
+class CameraInfo(IdlStruct, typename="sensor_msgs::msg::dds_::CameraInfo_"):
+    """sensor_msgs/CameraInfo."""
+
+    header: Header
+    height: uint32
+    width: uint32
+    distortion_model: str
+    d: sequence[float64]
+    k: array[float64, 9]
+    r: array[float64, 9]
+    p: array[float64, 12]
+    binning_x: uint32
+    binning_y: uint32
+    roi: RegionOfInterest
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Any:
+        """Read a sample, as an image is read."""
+        return _messages.deserialize_cdr(data, CAMERA_INFO)
+
+
+class Ros2Camera:
+    """An image topic and its camera_info. Implements `driver.DepthCamera`."""
+
+    def __init__(self, topic: str, utc_now_us: Callable[[], int] = utc_us) -> None:
+        """Subscribe, and wait for the camera's description.
+
+        Args:
+            topic: Of the depth images, as `ros2 topic list` shows it.
+            utc_now_us: The host's calendar time [µs], by which ROS stamps images.
+
+        Raises:
+            FieldError: Nobody describes the camera, or it is no pinhole.
+        """
+        self._utc_now_us, self._silent_s = utc_now_us, 0.0
+        self._participant = _participant()
+        described = info_topic(topic)
+        about = self._reader(described, CameraInfo)
+        info = _next(about, DESCRIBED_S)
+        name = f"ros2:{topic}"
+        if info is None:
+            raise FieldError(
+                "camera",
+                name,
+                problem=f"no sensor_msgs/CameraInfo on {described} for {DESCRIBED_S:g} s"
+                f" (ROS_DOMAIN_ID {_domain()})",
+            )
+        try:
+            self._lens = lens_of(info)
+        except ValueError as error:
+            raise FieldError("camera", name, problem=f"{described}: {error}") from None
+        self._images = self._reader(topic, Image)
+
+    def _reader(self, topic: str, kind: type[Any]) -> DataReader[Any]:
+        return DataReader(
+            self._participant, Topic(self._participant, f"rt{topic}", kind), qos=NEWEST
+        )
+
+    @property
+    def lens(self) -> Lens:
+        """Return the lens that camera_info described at first."""
+        return self._lens
+
+    def read(self, timeout_s: float) -> DepthImage | None:
+        """Wait for the next image; see `driver.DepthCamera`.
+
+        Raises RuntimeError when none has come for 5 s, and ValueError for one that holds no depth.
+        """
+        message = _next(self._images, timeout_s)
+        if message is None:
+            self._silent_s += timeout_s
+            if self._silent_s >= FAILED_S:
+                raise RuntimeError(f"no image for {FAILED_S:g} s")
+            return None
+        self._silent_s = 0.0
+        return DepthImage(depth_mm(message), age_us(message, self._utc_now_us()))
+
+    def close(self) -> None:
+        """Leave the domain: with the participant go its readers."""
+        del self._images, self._participant
+
+
+def _next(reader: DataReader[Any], timeout_s: float) -> Any | None:
+    """Wait for the next sample; None: there is none in time."""
+    try:
+        return reader.take_one(timeout=duration(microseconds=round(timeout_s * 1e6)))
+    except StopIteration:
+        return None
+    except DDSException as error:
+        if error.code == DDSException.DDS_RETCODE_TIMEOUT:
+            return None
+        raise
+
+
+def _domain() -> int:
+    """Return the number of the domain that ROS 2's nodes here are in.
+
+    Raises:
+        UsageError: ROS_DOMAIN_ID is no such number.
+    """
+    told = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not told.isdecimal() or int(told) > MOST_DOMAIN:
+        raise UsageError(f"ROS_DOMAIN_ID {told}: accepted: a whole number from 0 to {MOST_DOMAIN}")
+    return int(told)
+
+
+_restricted: dict[int, Domain] = {}
+"""Domains that were configured for this computer alone; Cyclone DDS configures one once."""
+
+
+def _participant() -> DomainParticipant:
+    number = _domain()
+    alone = os.environ.get("ROS_LOCALHOST_ONLY") == "1"
+    if alone and "CYCLONEDDS_URI" not in os.environ and number not in _restricted:
+        _restricted[number] = Domain(number, HERE_ALONE)
+    return DomainParticipant(number)

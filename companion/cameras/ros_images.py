@@ -1,0 +1,100 @@
+"""Depth images and camera parameters of ROS 2 messages, however they came here.
+
+Messages are read by the names of their fields alone, so that those of rosbags, of `rclpy` and of
+any other decoder do.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.core.clock import NS_PER_US
+from airl_mav.core.constants import US_PER_S
+from companion.cameras.fitting import Lens
+
+IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+"""The types of the two topics of a camera."""
+
+MILLIMETRES, METRES = ("16UC1", "mono16"), ("32FC1",)
+"""Encodings of depth images, by their unit (ROS Enhancement Proposal 118)."""
+
+OLDEST_US = US_PER_S
+"""An image that seems to be older is stamped by another clock [µs]."""
+
+
+def depth_mm(message: Any) -> NDArray[np.uint16]:
+    """Return the depth image (height, width) of a sensor_msgs/Image [mm]; 0 = no return.
+
+    Depth is along the optical axis. Of metres, NaN, infinity and what is not positive are no
+    return (ROS Enhancement Proposal 117).
+
+    Raises:
+        ValueError: The message holds no depth image, or not the bytes that it announces.
+    """
+    if message.encoding not in (*MILLIMETRES, *METRES):
+        raise ValueError(
+            f"encoding {message.encoding!r}; accepted: {', '.join((*MILLIMETRES, *METRES))}"
+        )
+    order = ">" if message.is_bigendian else "<"
+    kind = np.dtype(f"{order}u2" if message.encoding in MILLIMETRES else f"{order}f4")
+    height, width, step = message.height, message.width, message.step
+    data = np.frombuffer(memoryview(message.data), np.uint8)
+    least = width * kind.itemsize
+    if not height or not width or step < least or len(data) != height * step:
+        raise ValueError(
+            f"{width} x {height} pixels of {kind.itemsize} bytes in rows of {step} bytes are not"
+            f" {len(data)} bytes"
+        )
+    rows = np.ascontiguousarray(data.reshape(height, step)[:, :least])
+    image = rows.view(kind)
+    if message.encoding in MILLIMETRES:
+        return image.astype(np.uint16)
+    with np.errstate(invalid="ignore", over="ignore"):
+        mm = np.rint(image * np.float32(MM_PER_M))
+        known = np.isfinite(image) & (mm > 0)
+    return np.where(known, np.minimum(mm, MAX_MM), 0).astype(np.uint16)
+
+
+def stamped_us(message: Any) -> int:
+    """Return the stamp of a message: calendar time since 1970 [µs], where nothing simulates it."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * US_PER_S + int(stamp.nanosec) // NS_PER_US
+
+
+def age_us(message: Any, now_us: int) -> int:
+    """Return how old an image is at a time since 1970 [µs]; 0 where its clock is another one."""
+    age = now_us - stamped_us(message)
+    return age if 0 <= age <= OLDEST_US else 0
+
+
+def lens_of(message: Any) -> Lens:
+    """Return the lens that a sensor_msgs/CameraInfo describes.
+
+    A camera without distortion is described by K. One with distortion is described by P, which
+    holds for its rectified images alone: those are what drivers are asked for.
+
+    Raises:
+        ValueError: It describes no pinhole, or images that are binned or cropped.
+    """
+    roi = message.roi
+    cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
+    if max(message.binning_x, message.binning_y) > 1 or cropped:
+        raise ValueError("binned or cropped images; accepted: whole ones")
+    distorts = any(abs(each) > 0.0 for each in message.d)
+    fx, cx, fy, cy = (
+        (message.p[0], message.p[2], message.p[5], message.p[6])
+        if distorts
+        else (message.k[0], message.k[2], message.k[4], message.k[5])
+    )
+    if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0 and message.width):
+        raise ValueError(f"a camera of focal lengths {fx:g} and {fy:g} px, which is no pinhole")
+    return Lens(message.width, message.height, fx, fy, cx, cy)
+
+
+def info_topic(image_topic: str) -> str:
+    """Return the topic that describes the camera of an image topic: its neighbour camera_info."""
+    return f"{image_topic.rpartition('/')[0]}/camera_info"
