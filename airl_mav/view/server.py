@@ -16,10 +16,10 @@ import viser
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.ports import LOOPBACK
 from airl_mav.view.controls import Controls
 from airl_mav.view.feed import Ends
 from airl_mav.view.handshake import Answer, Request
+from airl_mav.view.local_server import LocalServer
 from airl_mav.view.messages import Steering
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
@@ -90,7 +90,7 @@ def main() -> int:
     request = Request.model_validate_json(sys.stdin.buffer.readline())
     os.nice(NICENESS)
     warnings.simplefilter("ignore", DeprecationWarning)
-    server = viser.ViserServer(LOOPBACK, request.port or 0, verbose=False)
+    server = LocalServer(request.port or 0)
     port = server.get_port()
     if request.port not in (None, port):
         outgoing.write(Answer().model_dump_json().encode() + b"\n")

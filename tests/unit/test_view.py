@@ -6,6 +6,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -333,6 +334,88 @@ def test_compensation_is_switched_in_flight() -> None:
     images, seen = look()
     assert images is depth_mm
     assert seen is state
+
+
+# --- who may watch
+
+
+@pytest.mark.parametrize(
+    ("origin", "taken"),
+    [
+        (None, True),
+        ("http://127.0.0.1:{port}", True),
+        ("http://localhost:{port}", True),
+        ("http://example.org", False),
+        ("http://127.0.0.1.example.org:{port}", False),
+        ("https://example.org:{port}", False),
+        ("null", False),  # a file, or a sandboxed frame of any page
+    ],
+)
+def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -> None:
+    client = pytest.importorskip("websockets.sync.client")
+    viser = pytest.importorskip("viser")
+    from websockets.exceptions import InvalidStatus
+
+    from airl_mav.view.local_server import LocalServer
+
+    server = LocalServer(0)
+    port = server.get_port()
+    try:
+        with ExitStack() as stack:
+            if not taken:
+                stack.enter_context(pytest.raises(InvalidStatus, match="HTTP 403"))
+            with client.connect(
+                f"ws://127.0.0.1:{port}",
+                origin=origin and origin.format(port=port),
+                subprotocols=[f"viser-v{viser.__version__}"],
+                max_size=None,
+            ) as socket:
+                assert socket.recv(timeout=20)
+    finally:
+        server.stop()
+
+
+def test_no_tunnel_is_opened_whoever_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    viser = pytest.importorskip("viser")
+    client = pytest.importorskip("websockets.sync.client")
+    import msgspec
+    from viser import _messages, _viser
+
+    from airl_mav.view.local_server import LocalServer
+
+    opened, answered = threading.Event(), threading.Event()
+    answer = LocalServer.request_share_url
+
+    def open_tunnel(*_: Any) -> None:
+        opened.set()
+        raise RuntimeError("no network here")
+
+    def request_share_url(self: LocalServer, verbose: bool = True) -> None:
+        answer(self, verbose)
+        answered.set()
+
+    monkeypatch.setattr(_viser, "ViserTunnel", open_tunnel)
+    monkeypatch.setattr(LocalServer, "request_share_url", request_share_url)
+
+    def ask(server: Any) -> Any:
+        return client.connect(
+            f"ws://127.0.0.1:{server.get_port()}",
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+        )
+
+    request = msgspec.msgpack.encode(_messages.ShareUrlRequest().as_serializable_dict())
+    for server, done in (
+        (viser.ViserServer("127.0.0.1", 0, verbose=False), opened),
+        (LocalServer(0), answered),
+    ):
+        with ask(server) as socket:
+            socket.send(request)
+            assert done.wait(20.0)
+        server.stop()
+        if done is opened:
+            opened.clear()
+    assert not opened.is_set()
 
 
 # --- the scene, on a server that nobody watches
