@@ -14,6 +14,11 @@ def ladder(records: Records) -> str:
     return _levels((("", records["ladder"]),))
 
 
+@block("ladder-fast", "ladder-fast")
+def ladder_fast(records: Records) -> str:
+    return _levels((("", records["ladder-fast"]),))
+
+
 @block("ladder-conditions", "ladder-wind", "ladder-spread", "ladder-dense")
 def ladder_conditions(records: Records) -> str:
     parts = (
