@@ -67,9 +67,11 @@ def fly_in_lockstep(
         # Who gives turns is heard, however long the wall clock says that it was silent.
         closing(MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
     ):
-        link.set_timeout(ANSWER_TIMEOUT_S)
         waiting()
+        # On MAVSDK's own time-out: who answers nothing, as one that refuses what is not signed with
+        # its key, is given up soon, and an order to end is heard. To ask again changes nothing.
         link.connect(asked.connect_timeout, stop)
+        link.set_timeout(ANSWER_TIMEOUT_S)
         camera = TokenFrameSource(frames, turns, clock)
         with turns.taken(link):
             check_camera(mission.policy, camera, stop, mission.compensator)

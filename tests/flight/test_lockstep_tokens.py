@@ -303,6 +303,21 @@ def test_neither_lost_words_nor_a_key_change_the_flight(
     assert lanes | lanes_in(companion.text()) == reference.lanes
 
 
+def test_a_companion_without_the_key_can_be_interrupted(
+    reference: Reference, tmp_path: Path, key: Path
+) -> None:
+    """MAVSDK waits for answers that are refused; a command of it is given up after two seconds."""
+    ports = choose_ports()
+    with (
+        running(firmware_words(ports, "--signing-key", str(key)), tmp_path) as firmware,
+        running(companion_words(ports.api, ports.camera, reference), tmp_path) as companion,
+    ):
+        firmware.wait_for_text("frames refused")
+        companion.process.send_signal(signal.SIGINT)
+        assert companion.wait(30.0) != 0
+    assert "Traceback" not in companion.text()
+
+
 def test_companion_that_dies_ends_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
