@@ -104,5 +104,5 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
         except OSError as error:
             problem = f"cannot write: {error.strerror}"
             raise FieldError("png", f"{options.png}", problem=problem) from None
-        console.print(f"picture: {options.png}", soft_wrap=True, highlight=False)
+        console.print(f"picture: {options.png}", soft_wrap=True, markup=False, highlight=False)
     return 0

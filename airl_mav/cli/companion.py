@@ -82,7 +82,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
         save_arrays(options.log, result.log.columns())
     for note in result.notes:
         console.print(note, style="yellow", markup=False)
-    console.print(f"{result.reason}; {len(result.log)} decisions")
+    console.print(f"{result.reason}; {len(result.log)} decisions", markup=False)
     if result.reason == "goal reached":
         return 0
     return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN

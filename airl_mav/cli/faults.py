@@ -114,7 +114,7 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
         bar.close()
     replace_file(out / "faults.md", markdown(cells).encode())
     print_table(table_of(faults, phases, cells), console, wrap=True)
-    console.print(f"{out}", soft_wrap=True)
+    console.print(f"{out}", soft_wrap=True, markup=False)
     return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
 
 

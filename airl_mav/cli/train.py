@@ -49,7 +49,7 @@ def run(
     from airl_mav.envs.delay import injections_of, speed_bound
 
     voice = Voice(options, "airl train", console)
-    show = partial(voice.console.print, soft_wrap=True, highlight=False)
+    show = partial(voice.console.print, soft_wrap=True, markup=False, highlight=False)
     config = options.configured()
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -585,8 +585,10 @@ def run_cli(*args: str) -> str:
 
 
 def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
-    png = tmp_path / "a.png"
+    # What looks like the terminal's markup is printed as it is.
+    png = tmp_path / "a[bold].png"
     text = run_cli("dynamic-obstacles", "--seed", "12", "--zone", "1", "--png", str(png))
+    assert f"picture: {png}" in text
     arena = make(shipped("dynamic-obstacles"), 12, 1)
     assert "dynamic-obstacles, seed 12" in text
     assert "50 x 50 x 5 m" in text
