@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.footprints import Floats, bounding_half
 from airl_mav.arena.geometry import Obstacles, Shape
+from airl_mav.core.kernels import kernel
 from airl_mav.profiles.arena import SPHERE_OFFSET, StaticObstacles
+
+_BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
 
 
 @dataclass(frozen=True)
@@ -43,23 +46,55 @@ def draw_bodies(
     """
     allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
-    width = rng.uniform(*kind.half_width_m, size=(n, 2))
-    height = rng.uniform(*kind.height_m, size=n)
-    yaw = rng.uniform(-math.pi, math.pi, size=n)
-    offset = rng.uniform(-SPHERE_OFFSET, SPHERE_OFFSET, size=n)
-
-    radius = width[:, 0]
-    is_box, is_sphere = shape == Shape.BOX, shape == Shape.SPHERE
-    half_size = np.column_stack(
-        [radius, np.where(is_box, width[:, 1], radius), np.where(is_sphere, radius, height / 2.0)]
+    # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
+    numbers = rng.random(5 * n)
+    half_size, yaw, center_height = np.empty((n, 3)), np.empty(n), np.empty(n)
+    _size(
+        numbers, shape, kind.half_width_m, kind.height_m, altitude_m, half_size, yaw, center_height
     )
-    yaw = np.where(is_box, yaw, 0.0)
-    hung = np.maximum(radius, altitude_m + offset * radius)
-    center_height = np.where(is_sphere, hung, height / 2.0)
     half = bounding_half(shape, half_size, yaw)
-
-    order = np.argsort(-half.max(axis=1), kind="stable")
+    order = np.argsort(-np.maximum(half[:, 0], half[:, 1]), kind="stable")
     return Bodies(shape[order], half_size[order], yaw[order], center_height[order], half[order])
+
+
+@kernel
+def _size(
+    numbers: Floats,
+    shape: NDArray[np.int8],
+    half_width_m: tuple[float, float],
+    height_m: tuple[float, float],
+    altitude_m: float,
+    half_size: Floats,
+    yaw: Floats,
+    center_height: Floats,
+) -> None:
+    """Write sizes, headings and heights of bodies of a shape (n,), as the fields of `Bodies`.
+
+    Args:
+        numbers: (5 n,) uniform in [0, 1): n pairs of half widths, n heights, n headings, n offsets
+            of spheres from the flight altitude. Each becomes low + (high - low) number, which is
+            what `Generator.uniform` makes of it.
+        shape: (n,).
+        half_width_m: Range of half widths [m].
+        height_m: Range of heights [m].
+        altitude_m: Height above the floor that every sphere crosses [m].
+        half_size: (n, 3) [m], written.
+        yaw: (n,) [rad], written.
+        center_height: (n,) above the floor [m], written.
+    """
+    n, (narrow, wide), (flat, tall) = len(shape), half_width_m, height_m
+    for i in range(n):
+        radius = narrow + (wide - narrow) * numbers[2 * i]
+        half_size[i, 0] = half_size[i, 1] = radius
+        half_size[i, 2] = (flat + (tall - flat) * numbers[2 * n + i]) / 2.0
+        yaw[i], center_height[i] = 0.0, half_size[i, 2]
+        if shape[i] == _BOX:
+            half_size[i, 1] = narrow + (wide - narrow) * numbers[2 * i + 1]
+            yaw[i] = -math.pi + 2.0 * math.pi * numbers[3 * n + i]
+        elif shape[i] == _SPHERE:
+            offset = -SPHERE_OFFSET + 2.0 * SPHERE_OFFSET * numbers[4 * n + i]
+            half_size[i, 2] = radius
+            center_height[i] = max(radius, altitude_m + offset * radius)
 
 
 @lru_cache

@@ -13,6 +13,8 @@ from airl_mav.core.kernels import kernel
 
 Floats = NDArray[np.float64]
 
+_BOX = int(Shape.BOX)
+
 
 @dataclass(frozen=True)
 class Boxes:
@@ -50,13 +52,21 @@ def bounding_half(shape: NDArray[np.int8], half_size: Floats, yaw: Floats) -> Fl
 
     Arguments are as the fields of `Obstacles`.
     """
-    cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
-    along, across = half_size[:, 0], half_size[:, 1]
-    is_box = shape == Shape.BOX
     half = np.empty((len(shape), 2))
-    half[:, 0] = np.where(is_box, cos * along + sin * across, along)
-    half[:, 1] = np.where(is_box, sin * along + cos * across, across)
+    _bounding_half(shape, half_size, np.cos(yaw), np.sin(yaw), half)
     return half
+
+
+@kernel
+def _bounding_half(
+    shape: NDArray[np.int8], half_size: Floats, cos: Floats, sin: Floats, half: Floats
+) -> None:
+    for i in range(len(shape)):
+        along, across = half_size[i, 0], half_size[i, 1]
+        half[i, 0], half[i, 1] = along, across
+        if shape[i] == _BOX:
+            c, s = abs(cos[i]), abs(sin[i])
+            half[i, 0], half[i, 1] = c * along + s * across, s * along + c * across
 
 
 def bounding_boxes(obstacles: Obstacles) -> Boxes:
