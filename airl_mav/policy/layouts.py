@@ -179,16 +179,26 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     return None
 
 
-Shrink = Callable[[NDArray[np.uint16], int, int, NDArray[np.uint8]], NDArray[np.uint8]]
-"""From Z16 images (n, h, w), rows, columns and a byte for each value of `nearest_returns` to the
-images (n, rows, columns) of those bytes."""
+class Bytes(NamedTuple):
+    """How depths become the network's bytes."""
+
+    table: NDArray[np.uint8]
+    """(65536,) a byte for each value of `nearest_returns`."""
+    far_mm: float = 0.0
+    """Not 0: each of them is 255 (value + 1) / far_mm in single precision, rounded to the nearest
+    and 255 at most, which a compiler turns into vector instructions as it cannot a table."""
+
+
+Shrink = Callable[[NDArray[np.uint16], int, int, Bytes], NDArray[np.uint8]]
+"""From Z16 images (n, h, w), rows, columns and the bytes of depths to the images (n, rows, columns)
+of those bytes."""
 
 
 def shrink(
-    depth_mm: NDArray[np.uint16], rows: int, columns: int, table: NDArray[np.uint8]
+    depth_mm: NDArray[np.uint16], rows: int, columns: int, bytes_of: Bytes
 ) -> NDArray[np.uint8]:
     """Return what numpy makes of images; a `Shrink`."""
-    return table[nearest_returns(depth_mm, rows, columns)]
+    return bytes_of.table[nearest_returns(depth_mm, rows, columns)]
 
 
 def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shrink) -> Encoded:
@@ -214,8 +224,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
     if spec.layout not in SHIPPED:
         return _own_arrays(spec, seen)
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
-    table = _body_table if spec.layout == "body" else _paper_table
-    bytes_of = table(spec.range_m)
+    bytes_of = (_body_bytes if spec.layout == "body" else _paper_bytes)(spec.range_m)
     image = shrink(seen.depth_mm, spec.camera_rows, spec.width_px, bytes_of)
     if spec.layout == "body":
         safe = np.maximum(distance, 1e-6)
@@ -246,7 +255,7 @@ def _stacked(
     newest: NDArray[np.uint8],
     seen: Observation,
     shrink: Shrink,
-    bytes_of: NDArray[np.uint8],
+    bytes_of: Bytes,
 ) -> NDArray[np.uint8]:
     """Return the network's images (n, frames, height, width), the newest first."""
     stack = np.full((len(newest), spec.frames, *newest.shape[1:]), 255, np.uint8)
@@ -346,20 +355,25 @@ def _depths_m(range_m: float) -> NDArray[np.float64]:
 
 
 @cache
-def _body_table(range_m: float) -> NDArray[np.uint8]:
+def _body_bytes(range_m: float) -> Bytes:
     """Depth in proportion to the range: 0 is at the lens, 255 the range and beyond."""
     share = np.minimum(_depths_m(range_m) / range_m, 1.0)
-    return np.rint(255.0 * share).astype(np.uint8)
+    table = np.rint(255.0 * share).astype(np.uint8)
+    far_mm = range_m * MM_PER_M
+    values = np.arange(1, MAX_MM + 2).astype(np.float32)
+    ratios = np.float32(255.0) * values / np.float32(far_mm)
+    in_single = np.rint(np.minimum(ratios, np.float32(255.0))).astype(np.uint8)
+    return Bytes(table, far_mm if np.array_equal(in_single, table) else 0.0)
 
 
 @cache
-def _paper_table(range_m: float) -> NDArray[np.uint8]:
+def _paper_bytes(range_m: float) -> Bytes:
     """Air Learning's mapping (airlearning-rl, getScreenDepthVis).
 
     255 / max(1 m, depth) cut to a byte, inverted, to the tenth power of the byte's range.
     """
     byte = (255.0 / np.maximum(1.0, _depths_m(range_m))).astype(np.uint8)
-    return (255.0 * ((255.0 - byte) / 255.0) ** 10).astype(np.uint8)
+    return Bytes((255.0 * ((255.0 - byte) / 255.0) ** 10).astype(np.uint8))
 
 
 def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.envs import encoding
 from airl_mav.policy.layouts import (
     STRIP_ROWS,
+    Bytes,
     Encoded,
     ObservationSpec,
     ablated,
@@ -399,6 +400,15 @@ def test_the_compiled_images_are_those_of_numpy(rows: int, columns: int) -> None
     depth = rng.integers(0, 1 << 16, (5, 48, 64)).astype(np.uint16)
     depth[rng.random(depth.shape) < 0.2] = 0
     depth[0, :4] = (1 << 16) - 1
-    table = rng.integers(0, 256, 1 << 16).astype(np.uint8)
-    wanted = shrink(depth, rows, columns, table)
-    np.testing.assert_array_equal(encoding.shrink(depth, rows, columns, table), wanted)
+    bytes_of = Bytes(rng.integers(0, 256, 1 << 16).astype(np.uint8))
+    wanted = shrink(depth, rows, columns, bytes_of)
+    np.testing.assert_array_equal(encoding.shrink(depth, rows, columns, bytes_of), wanted)
+
+
+@pytest.mark.parametrize("range_m", [3.0, 5.0, 10.0, 12.5, 18.0, 20.0, 30.0, 65.0])
+def test_the_compiled_images_in_proportion_are_those_of_the_table(range_m: float) -> None:
+    """Of every depth that there is, at ranges that single precision serves and one (18 m) not."""
+    depth = np.arange(1 << 16, dtype=np.uint16).reshape(1, 256, 256)
+    layout = spec(height=256, width=256, range_m=range_m)
+    found = encode_layout(layout, seen(depth), encoding.shrink)["depth"]
+    np.testing.assert_array_equal(found, encode_layout(layout, seen(depth), shrink)["depth"])
