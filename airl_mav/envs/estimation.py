@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.saved_state import Stateful
@@ -87,18 +88,30 @@ def perturbed(
         errors: (..., 9).
     """
     turn = errors[..., ATTITUDE]
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-    axis = 0.5 * np.sinc(angle / (2.0 * np.pi)) * turn
-    estimated = _multiply(np.concatenate([np.cos(0.5 * angle), axis], axis=-1), quaternion)
+    angle = np.linalg.norm(turn, axis=-1)
+    share = 0.5 * np.sinc(angle / (2.0 * np.pi))
+    estimated = np.empty(quaternion.shape)
+    _turn(
+        np.cos(0.5 * angle).ravel(),
+        share.ravel(),
+        turn.reshape(-1, 3),
+        quaternion.reshape(-1, 4),
+        estimated.reshape(-1, 4),
+    )
     return position + errors[..., POSITION], velocity + errors[..., VELOCITY], estimated
 
 
-def _multiply(a: Array, b: Array) -> Array:
-    """Return the Hamilton product a ⊗ b of quaternions (..., 4)."""
-    w, v = a[..., :1], a[..., 1:]
-    s, u = b[..., :1], b[..., 1:]
-    scalar = w * s - np.sum(v * u, axis=-1, keepdims=True)
-    return np.concatenate([scalar, w * u + s * v + np.cross(v, u)], axis=-1)
+@kernel
+def _turn(cos: Array, share: Array, turn: Array, quaternion: Array, out: Array) -> None:
+    """Write the Hamilton products (n, 4) of turns cos, share turn (n, 3) and quaternions (n, 4)."""
+    for i in range(len(out)):
+        w = cos[i]
+        x, y, z = share[i] * turn[i, 0], share[i] * turn[i, 1], share[i] * turn[i, 2]
+        s, a, b, c = quaternion[i, 0], quaternion[i, 1], quaternion[i, 2], quaternion[i, 3]
+        out[i, 0] = w * s - (x * a + y * b + z * c)
+        out[i, 1] = w * a + s * x + (y * c - z * b)
+        out[i, 2] = w * b + s * y + (z * a - x * c)
+        out[i, 3] = w * c + s * z + (x * b - y * a)
 
 
 class Telemetry(Stateful):

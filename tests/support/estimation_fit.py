@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
+from airl_mav.core.frames import quat_multiply
 from airl_mav.envs.estimation import GROUPS, Array
-from airl_mav.envs.estimation import _multiply as multiply
 from airl_mav.profiles.vehicle import Estimation
 
 _LAGS = 40  # of the autocorrelation, evenly spaced on a logarithmic scale
@@ -23,7 +23,10 @@ def errors_between(
         truth: Position (..., 3), velocity (..., 3), quaternion (..., 4).
         estimate: The same, as estimated.
     """
-    turn = multiply(estimate[2], truth[2] * np.array([1.0, -1.0, -1.0, -1.0]))
+    back = truth[2] * np.array([1.0, -1.0, -1.0, -1.0])
+    turn = np.moveaxis(
+        quat_multiply(np.moveaxis(estimate[2], -1, 0), np.moveaxis(back, -1, 0)), 0, -1
+    )
     turn = turn * np.where(turn[..., :1] < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, turn[..., :1])
