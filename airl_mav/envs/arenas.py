@@ -102,9 +102,25 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
         batch.tour_points[i, j, :k] = tour.points
         batch.tour_period_s[i, j] = tour.times_s[-1]
         batch.center[i, arena.n_static + j, :2] = tour.points[0]
-        legs, passed_s = np.diff(tour.points, axis=0), np.diff(tour.times_s)
-        speed = math.sqrt(((legs * legs).sum(axis=1) / (passed_s * passed_s)).max())
-        batch.tour_speed[i] = max(batch.tour_speed[i], speed)
+        batch.tour_speed[i] = max(batch.tour_speed[i], _fastest(tour.times_s, tour.points))
+
+
+@kernel
+def _fastest(times_s: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """Return the greatest speed [m/s] of a tour, as the fields of `Tour`."""
+    greatest = 0.0
+    for k in range(len(times_s) - 1):
+        north, east = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+        passed = times_s[k + 1] - times_s[k]
+        greatest = max(greatest, (north * north + east * east) / (passed * passed))
+    return math.sqrt(greatest)
+
+
+@kernel
+def move_all_obstacles(batch: ArenaBatch, time_us: NDArray[np.int64]) -> None:
+    """Put the moving obstacles of all arenas where they are at a time (n,) of each episode."""
+    for i in range(len(time_us)):
+        move_obstacles(batch, i, time_us[i])
 
 
 @kernel

@@ -141,6 +141,11 @@ class Cameras(Stateful):
         found: NDArray[np.int64] = time_us - np.where(waits, arrived, healthy)
         return found
 
+    @property
+    def may_freeze(self) -> bool:
+        """Whether any camera may be stuck."""
+        return bool(self._freeze_us)
+
     def ticks_to_freeze(self, time_us: NDArray[np.int64]) -> NDArray[np.int64] | None:
         """Return the ticks (n,) until the next picture is kept, after these times [µs].
 

@@ -72,6 +72,7 @@ from airl_mav.envs.lanes import (
     unload,
     vec,
 )
+from airl_mav.envs.legs import Legs, next_leg
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import felt, felt_share, flight_power_w
@@ -105,6 +106,7 @@ def advance(
     vehicle: Vehicle,
     rules: Rules,
     air: NDArray[np.float64] | None,
+    legs: Legs | None = None,
 ) -> None:
     """Fly every vehicle whose verdict is FLYING for its number of ticks on its setpoint.
 
@@ -122,22 +124,18 @@ def advance(
         rules: What ends a flight.
         air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
             next, after the last one the first again. None: calm.
+        legs: What happens on the way, with a first leg of one tick at least; `ticks` are the sums
+            of its legs. That of vehicles that do not fly stays as it is. None: nothing happens.
     """
     weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
     # Made here with sizes that are constants: so the compiler knows that no two rows overlap.
     state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
     who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
+    leg = np.zeros(LANES, np.int64)
     # Those whose position loops are due at the same ticks fly together: one loop runs for all.
     todo, coming, odd, aloft = ticks.copy(), np.zeros(2, np.int64), 0, 0
     while True:
-        for j in range(LANES):
-            for other in range(2):
-                if who[j] == _NOBODY:
-                    who[j] = _next(todo, fleet.verdict, fleet.memory, odd ^ other, coming)
-                    if who[j] != _NOBODY:
-                        left[j], todo[who[j]] = todo[who[j]], 0
-                        load(fleet, who[j], state, j)
-                        aloft += 1
+        aloft += _fill(fleet, legs, todo, coming, odd, who, left, leg, state)
         if aloft == 0:
             return
         for j in range(LANES):
@@ -167,10 +165,46 @@ def advance(
                 )
                 left[j] -= 1
                 if left[j] == 0 or fleet.verdict[i] != _FLYING:
+                    if legs is not None:
+                        over = fleet.verdict[i] != _FLYING
+                        leg[j], left[j] = next_leg(legs, fleet, i, state, j, leg[j], over)
+                        if left[j] != 0:
+                            continue
                     move_obstacles(arenas, i, fleet.time_us[i])
                     unload(fleet, i, state, j)
                     who[j] = _NOBODY
                     aloft -= 1
+
+
+@kernel
+def _fill(
+    fleet: Fleet,
+    legs: Legs | None,
+    todo: NDArray[np.int64],
+    coming: NDArray[np.int64],
+    odd: int,
+    who: NDArray[np.int64],
+    left: NDArray[np.int64],
+    leg: NDArray[np.int64],
+    state: State,
+) -> int:
+    """Put the next vehicles into the empty lanes; return how many.
+
+    Arguments as of `_next` and `advance`, and of all lanes (LANES,): who is in each, how many ticks
+    are left, and of which leg.
+    """
+    found = 0
+    for j in range(LANES):
+        for other in range(2):
+            if who[j] == _NOBODY:
+                who[j] = _next(todo, fleet.verdict, fleet.memory, odd ^ other, coming)
+                if who[j] != _NOBODY:
+                    left[j], todo[who[j]] = todo[who[j]], 0
+                    if legs is not None:
+                        leg[j], left[j] = 0, legs.ticks[who[j], 0]
+                    load(fleet, who[j], state, j)
+                    found += 1
+    return found
 
 
 @kernel

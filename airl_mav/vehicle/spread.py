@@ -8,6 +8,11 @@ from airl_mav.profiles.conditions import Spread
 from airl_mav.vehicle.airframe import Airframe
 
 
+def spreads(shares: Spread) -> bool:
+    """Return whether any airframe differs from the nominal one."""
+    return any((shares.mass, shares.thrust, shares.drag, shares.rotor_lag))
+
+
 def draw_airframe(nominal: Airframe, shares: Spread, rng: np.random.Generator) -> Airframe:
     """Return an airframe of one episode; every quantity uniform within its share."""
     mass, thrust, drag, lag = (

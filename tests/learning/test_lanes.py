@@ -19,6 +19,7 @@ from airl_mav.envs.arenas import ArenaBatch, batch_of
 from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import NAN3, REPEAT_US, advance
 from airl_mav.envs.lanes import LANES
+from airl_mav.envs.legs import Legs
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile
@@ -192,6 +193,37 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
             advance(one_by_one, arenas, np.where(np.arange(n) == i, ticks, 0), VEHICLE, RULES, None)
     for together, single in zip(flown[0], one_by_one, strict=True):
         np.testing.assert_array_equal(together, single)
+
+
+@pytest.mark.parametrize("arena", ["no-obstacles", "dynamic-obstacles"])
+def test_legs_are_flights_one_after_the_other(arena: str) -> None:
+    """With the setpoint between them, and the pose for the camera; also where a flight ends."""
+    n = 5 * LANES + 2
+    at_once, parts = (fleet_of(n, np.random.default_rng(2)) for _ in range(2))
+    arenas, rng, ended = arenas_of(n, arena), np.random.default_rng(3), np.zeros(3, np.int64)
+    for _ in range(60):
+        setpoints = rng.uniform([0, -4, -0.3, -2], [8, 4, 0.3, 2], (n, 4))
+        ticks = rng.integers([1, 0, 0], [12, 9, 9], (n, 3))
+        flies = at_once.verdict == Verdict.FLYING
+        legs = Legs(ticks, setpoints, np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 4)))
+        advance(at_once, arenas, ticks.sum(axis=1), VEHICLE, RULES, None, legs)
+        for k in range(3):
+            before = parts.verdict.copy()
+            advance(parts, arenas, ticks[:, k].copy(), VEHICLE, RULES, None)
+            ended[k] += (parts.verdict != before).sum()
+            if k == 0:
+                parts.setpoint[flies], parts.repeat_us[flies] = (
+                    setpoints[flies],
+                    parts.time_us[flies],
+                )
+            elif k == 1:
+                for name in ("time_us", "position", "quaternion"):
+                    seen = getattr(legs, f"seen_{name.removeprefix('time_')}")
+                    np.testing.assert_array_equal(seen[flies], getattr(parts, name)[flies], name)
+                assert not legs.seen_quaternion[~flies].any()
+        for together, one in zip(at_once, parts, strict=True):
+            np.testing.assert_array_equal(together, one)
+    assert (ended > 0).all()
 
 
 def test_who_has_landed_is_left_alone() -> None:
