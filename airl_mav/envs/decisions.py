@@ -60,12 +60,15 @@ class Decisions:
         self._before: Flights | None = None
         """The flights at the present decision; None before the first reset."""
 
+    @property
+    def _present_zone(self) -> int | None:
+        if self._zone is None and self.curriculum is not None:
+            return self.curriculum.zone
+        return self._zone
+
     def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
         """Begin episodes in the zone asked for, else that of the curriculum, else the whole."""
-        zone = self._zone
-        if zone is None and self.curriculum is not None:
-            zone = self.curriculum.zone
-        self.navigation.begin(slots, seeds, zone)
+        self.navigation.begin(slots, seeds, self._present_zone)
         self._before = self.navigation.flights()
         return self._before
 

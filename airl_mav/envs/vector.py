@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,9 @@ from airl_mav.envs.saved_state import (
 )
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.policy.layouts import Encoded
+
+AHEAD = 32
+"""Arenas that are made ahead at a time."""
 
 
 class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
@@ -123,10 +127,19 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         if ended.any():
             final = self._final(seen, now, ended)
             slots = np.flatnonzero(ended).tolist()
-            now = self._begin(slots, draw_seeds(self.np_random, len(slots)))
+            now = self._begin(slots, self._next_seeds(len(slots)))
             for key, first in self.navigation.observe(slots).items():
                 seen[key][slots] = first
         return seen, reward, terminated, truncated, _masked(self._quality(now)) | final
+
+    def _next_seeds(self, n: int) -> list[int]:
+        """Draw the seeds of n episodes; when their arenas are missing, make those of more ahead."""
+        zone, seeds = self._present_zone, draw_seeds(self.np_random, n)
+        if not self.navigation.prepared(seeds, zone):
+            # As the generator will draw them; it stays where it is.
+            following = draw_seeds(deepcopy(self.np_random), AHEAD)
+            self.navigation.prepare([*seeds, *following], zone)
+        return seeds
 
     def _final(self, seen: Encoded, flights: Flights, ended: NDArray[np.bool_]) -> dict[str, Any]:
         """Return `final_obs` and `final_info` of the episodes that ended, and their masks."""
