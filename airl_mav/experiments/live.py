@@ -142,12 +142,12 @@ def _watched(
     """Show flights: give where they connect, and who tells of them and passes it on."""
     # Imported here: a run that nobody watches does without.
     from airl_mav.rehearsal.view_observer import ViewObserver
-    from airl_mav.view.viewer import Viewer, ViewError
+    from airl_mav.view.viewer import Viewer, ViewError, request_of
 
     onwards.waiting("starting the view")
     name = f"{scenario.policy.name} in {scenario.arena_name}, {scenario.level}"
     try:
-        started = Viewer(scenario, name, asked.port)
+        started = Viewer(request_of(scenario, name, asked.port))
     except ViewError as error:
         raise RehearsalError(str(error)) from None
     with closing(started) as viewer:

@@ -19,8 +19,12 @@ class Request(BaseModel):
     paced: bool
     """Whether the watchers may set the pace."""
     speed: float | None
+    steerable: bool
+    """Whether the watchers may set the latency."""
     compensable: bool
+    """Whether it can be compensated: the vehicle's response is known."""
     compensated: bool
+    """Whether it is."""
 
 
 class Answer(BaseModel):

@@ -220,8 +220,28 @@ class Said(Message):
     text: str
 
 
+class Trained(Message):
+    """What the newest decision came to, in a policy's training, and how far that is."""
+
+    kind: Literal["trained"] = "trained"
+    time_us: int
+    action: str
+    """What was chosen of the action set."""
+    reward: float
+    """Of the decision."""
+    returned: float
+    """Sum of the episode's rewards so far."""
+    steps: int = 0
+    """Decisions of all vehicles so far."""
+    success: float | None = None
+    """Share of the newest episodes that reached the goal, 0 to 1; None: none has ended."""
+    zone: int | None = None
+    """Open zone of the curriculum; None: there is none."""
+
+
 Told = Annotated[
-    Episode | Vehicle | Picture | Decided | Flight | Phase | Said, Field(discriminator="kind")
+    Episode | Vehicle | Picture | Decided | Flight | Phase | Said | Trained,
+    Field(discriminator="kind"),
 ]
 _TOLD: TypeAdapter[Told] = TypeAdapter(Told)
 

@@ -40,11 +40,14 @@ class Pace:
         self._steps: int | None = None
         self._left = 0
         """Single steps that were asked for and are not done."""
+        self._released = False
 
     def tick(self, time_us: int) -> None:
         """Return when the flight may go on; it is at simulated `time_us` [µs]."""
+        if self._released:
+            return
         asked = self._heard(self._asked.newest())
-        while asked.paused and not self._left:
+        while asked.paused and not self._left and not self._released:
             self._clock = None
             asked = self._heard(self._asked.newest(LOOK_S))
         if asked.speed is None:
@@ -59,6 +62,10 @@ class Pace:
     def decided(self) -> None:
         """A decision was sent: a single step ends here."""
         self._left = max(0, self._left - 1)
+
+    def let_go(self) -> None:
+        """Hold the flight back no longer, from any thread."""
+        self._released = True
 
     def close(self) -> None:
         """Disconnect."""

@@ -51,7 +51,8 @@ class View:
             compensated=request.compensated,
         )
         head = controls.add_pace if request.paced else lambda: None
-        self._panel = Panel(server, request.run, head=head, latency=knob)
+        latency = knob if request.steerable else lambda: None
+        self._panel = Panel(server, request.run, head=head, latency=latency)
         self._watchers = Watchers(server, controls.let_go)
         self._drawn = 0
 

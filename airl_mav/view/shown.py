@@ -20,6 +20,7 @@ from airl_mav.view.messages import (
     Picture,
     Said,
     Told,
+    Trained,
     Vehicle,
 )
 
@@ -57,6 +58,8 @@ class Shown:
     decided: Decided | None = None
     decided_mm: Depth | None = None
     """What the policy saw at that decision."""
+    trained: Trained | None = None
+    """What a training's newest decision came to; None: nothing is trained."""
     decisions: int = 0
     """How many were sent in this episode, as far as they were heard of."""
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
@@ -77,6 +80,8 @@ class Shown:
             self.phase = message.phase
         elif isinstance(message, Said):
             self.texts.append(message)
+        elif isinstance(message, Trained):
+            self.trained = message
         else:
             self.flight, self.phase = message, "booting"
 

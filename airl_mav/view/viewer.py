@@ -24,30 +24,30 @@ class ViewError(Exception):
     """The view cannot be shown; the message says why."""
 
 
+def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -> Request:
+    """Return what a view of a scenario's flights is asked for; arguments as of `Request`."""
+    paced = scenario.scenario.level == "lockstep"
+    return Request(
+        run=name,
+        port=port,
+        paced=paced,
+        speed=(scenario.speed or REAL_TIME) if paced else None,
+        steerable=True,
+        compensable=scenario.vehicle.response is not None,
+        compensated=scenario.pilot.compensate,
+    )
+
+
 class Viewer:
-    """A page that shows a run, until it is closed."""
+    """A page that shows flights, until it is closed."""
 
-    def __init__(self, scenario: ResolvedScenario, name: str, port: int | None = None) -> None:
+    def __init__(self, request: Request) -> None:
         """Start it and wait until it can be opened.
-
-        Args:
-            scenario: What is flown.
-            name: What the run is called.
-            port: TCP port of the page on the loopback address; None: any free one.
 
         Raises:
             FieldError: The port is taken.
             ViewError: Its process does not start.
         """
-        paced = scenario.scenario.level == "lockstep"
-        request = Request(
-            run=name,
-            port=port,
-            paced=paced,
-            speed=(scenario.speed or REAL_TIME) if paced else None,
-            compensable=scenario.vehicle.response is not None,
-            compensated=scenario.pilot.compensate,
-        )
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
         self._child = ChildProcess(
             [sys.executable, "-m", MODULE],
@@ -58,7 +58,7 @@ class Viewer:
             answer = self._answer(request)
             if answer.ends is None:
                 raise FieldError(
-                    "view_port", port, problem="the port is taken; accepted: a free one"
+                    "view_port", request.port, problem="the port is taken; accepted: a free one"
                 )
         except BaseException:
             self.close()

@@ -46,7 +46,7 @@ from airl_mav.view.messages import (
 from airl_mav.view.pace import Pace
 from airl_mav.view.pictures import NO_RETURN, depth_picture, numbers_html, texts_html
 from airl_mav.view.shown import STRIP_S, Shown
-from airl_mav.view.viewer import Viewer
+from airl_mav.view.viewer import Viewer, request_of
 from tests.support.ports import free_ports
 from tests.support.processes import run_alone, wait_until
 
@@ -530,7 +530,7 @@ def test_a_taken_port_is_one_line() -> None:
         taken.bind(("127.0.0.1", port))
         taken.listen()
         with pytest.raises(FieldError, match="the port is taken") as raised:
-            Viewer(resolve(Scenario(level="lockstep")), "a run", port)
+            Viewer(request_of(resolve(Scenario(level="lockstep")), "a run", port))
     assert raised.value.field == "view_port"
 
 
