@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Annotated
 
@@ -13,19 +14,22 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
-from airl_mav.core.errors import EXIT_INTERRUPTED
+from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
 from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
+from airl_mav.view.ends import ViewEnds
 
 
-class TrainOptions(Telling, TrainRequest):
+class TrainOptions(Telling, TrainRequest, Viewing):
     """Train a policy; the best weights are exported as policy.onnx with their card.
 
     Examples:
         airl train static-obstacles --out runs/mine
         airl train dense-obstacles --computer ras-pi-4 --workload template-5x32 --resume
         airl train my.toml --initial runs/mine --out runs/finer
+        airl train dynamic-obstacles --view
     """
 
     config: Annotated[str, POSITIONAL] = Field(
@@ -48,6 +52,7 @@ def run(
     """
     from airl_mav.envs.delay import injections_of, speed_bound
 
+    asked = view_of(options)
     voice = Voice(options, "airl train", console)
     show = partial(voice.console.print, soft_wrap=True, markup=False, highlight=False)
     config = options.configured()
@@ -64,8 +69,19 @@ def run(
         show(f"speed      {bound.describe()}")
     show(f"folder     {out}")
     show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
-    with voice:
+    with voice, ExitStack() as held:
         progress = voice.progress
+        view: ViewEnds | None = None
+        if asked is not None:
+            from airl_mav.training.watched import request_of
+            from airl_mav.view.viewer import Viewer, ViewError
+
+            try:
+                viewer = held.enter_context(closing(Viewer(request_of(stem, asked.port))))
+            except ViewError as error:
+                raise UsageError(str(error)) from None
+            view = viewer.ends
+            progress.note(f"view       {viewer.url}")
         try:
             with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
                 result = train(
@@ -75,6 +91,7 @@ def run(
                     resume=options.resume,
                     progress=TrainingBar(progress, config.steps),
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
+                    view=view,
                 )
         except KeyboardInterrupt:
             show(f"interrupted: airl train {options.config} --out {out} --resume continues")

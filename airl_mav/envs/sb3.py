@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,29 @@ QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "see
 """Keys of `info` that go into SB3's `episode` info, beside return, length and time."""
 
 
+class Watcher(Protocol):
+    """Looks on at the first of the vehicles, and changes nothing."""
+
+    def begun(self) -> None:
+        """All episodes begin now."""
+        ...
+
+    def decided(
+        self, seed: int, zone: int, action: NDArray[Any], reward: float, outcome: str | None
+    ) -> None:
+        """A decision was flown.
+
+        Args:
+            seed: Of the episode.
+            zone: That bounds its goal; -1: none does.
+            action: What was chosen.
+            reward: Of the decision.
+            outcome: How it has ended the episode, after which the next one has begun; None: the
+                episode goes on.
+        """
+        ...
+
+
 class NavigationVecEnv(Stateful, VecEnv):
     """Adapter of `NavigationVectorEnv`: SB3's auto-reset, `terminal_observation`, `episode`.
 
@@ -27,9 +50,10 @@ class NavigationVecEnv(Stateful, VecEnv):
     writes, so there is no need of one; its time `t` is that of the flight [s].
     """
 
-    def __init__(self, env: NavigationVectorEnv) -> None:
-        """Wrap a vectorised environment."""
+    def __init__(self, env: NavigationVectorEnv, watcher: Watcher | None = None) -> None:
+        """Wrap a vectorised environment; `watcher` looks on."""
         self.env = env
+        self._watcher = watcher
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: NDArray[Any] = np.zeros(0)
         self._expert: Expert | None = None
@@ -51,6 +75,8 @@ class NavigationVecEnv(Stateful, VecEnv):
         self._length[:] = 0
         if self._expert is not None:
             self._expert.begin(range(self.num_envs))
+        if self._watcher is not None:
+            self._watcher.begun()
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -59,6 +85,8 @@ class NavigationVecEnv(Stateful, VecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Fly one decision."""
+        flown = self.env.navigation
+        seed, zone = int(flown.seeds[0]), int(flown.zones[0])
         seen, reward, terminated, truncated, info = self.env.step(self._actions)
         self._return += reward
         self._length += 1
@@ -74,6 +102,9 @@ class NavigationVecEnv(Stateful, VecEnv):
                 "is_success": episode["success"],
                 "episode": episode | {"t": episode["flight_time_s"]},
             }
+        if self._watcher is not None:
+            outcome = str(info["final_info"]["outcome"][0]) if done[0] else None
+            self._watcher.decided(seed, zone, self._actions[0], float(reward[0]), outcome)
         self._return[done] = 0.0
         self._length[done] = 0
         if self._expert is not None and done.any():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections import deque
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from airl_mav.envs.delay import bounded
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
@@ -36,6 +37,7 @@ from airl_mav.training.export import export_sb3
 from airl_mav.training.initial import begin_with
 from airl_mav.training.recurrent import GreedyDecisions
 from airl_mav.training.store import BEST_MODEL, Evaluation, TrainingFolder, TrainingProgress
+from airl_mav.view.ends import ViewEnds
 
 RECENT = 200
 """Episodes in training that the shown success rate is of."""
@@ -68,6 +70,7 @@ def train(
     progress: TrainingProgress | None = None,
     device: str = "cpu",
     command: str = "airl_mav.training.run.train",
+    view: ViewEnds | None = None,
 ) -> TrainingResult:
     """Train a policy to the end and export its best weights.
 
@@ -79,6 +82,7 @@ def train(
         progress: Receives the progress.
         device: What learns, as torch calls it.
         command: What to note on the card as the command that made the policy.
+        view: Where a view shows flights of it; the weights are the same without.
 
     Returns:
         The run's folder, the best evaluation and the policy's card.
@@ -92,7 +96,14 @@ def train(
     progress = progress or TrainingProgress()
     with locked(out, progress.waiting):
         folder = TrainingFolder.begin(out, config, command, resume=resume)
-        best = fit(config, folder, progress, device)
+        if view is None:
+            best = fit(config, folder, progress, device)
+        else:
+            # Imported here: a training that nobody watches does without.
+            from airl_mav.training.watched import WatchedTraining
+
+            with closing(WatchedTraining(view, config.environment, progress)) as watched:
+                best = fit(config, folder, watched, device, watched)
         return TrainingResult(folder, best, export_best(folder, config, name))
 
 
@@ -101,6 +112,7 @@ def fit(
     folder: TrainingFolder,
     progress: TrainingProgress,
     device: str,
+    watcher: Watcher | None = None,
 ) -> Evaluation:
     """Train to the end in a locked folder, from the newest checkpoint if there is one.
 
@@ -112,7 +124,7 @@ def fit(
             no such weights to begin with.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
-    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment))
+    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment), watcher)
     env.seed(config.seed)
     model = make_model(config.algorithm, config.network, env, config.seed, device=device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))

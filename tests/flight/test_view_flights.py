@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.lockstep.flight import fly
@@ -23,13 +22,11 @@ from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Ends
 from airl_mav.view.messages import Decided, Episode, Flight, Phase, Picture, Steering, Vehicle
 from airl_mav.view.shown import Shown
-from tests.support.browser import CHROMIUM, Page, browser
+from tests.support.browser import CHROMIUM, browser
 from tests.support.lockstep_kit import SEED, demo_scenario
 from tests.support.ports import choose_ports
 from tests.support.processes import SITL_WITHOUT_REPORT, running, wait_until
-
-SCENE_PX = 540
-"""Width of the scene on the page; the panel is beside it."""
+from tests.support.scene import has_drawn
 
 
 class Watchers:
@@ -178,15 +175,3 @@ def told_time(text: str) -> str:
     """Return the flight's time as the panel tells it."""
     line = next((line for line in text.splitlines() if line.startswith("time")), "")
     return line.partition(" s")[0]
-
-
-def has_drawn(page: Page, shot: Path) -> bool:
-    """Return whether the scene has the colours of trail, commanded velocity and depth image."""
-    page.screenshot(shot)
-    with Image.open(shot) as image:
-        scene = np.asarray(image.convert("RGB"))[:, :SCENE_PX].astype(int)
-    red, green, blue = scene[..., 0], scene[..., 1], scene[..., 2]
-    trail = (blue > 150) & (red < 110) & (blue - red > 80)
-    command = (red > 200) & (green > 120) & (blue < 140)
-    depth = (green > 120) & (red < 90) & (blue < 160)
-    return bool(trail.sum() > 200 and command.sum() > 20 and depth.sum() > 50)

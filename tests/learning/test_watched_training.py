@@ -1,0 +1,231 @@
+"""A training that is watched learns the same, and shows the flights that it learns from."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from airl_mav.envs.sb3 import NavigationVecEnv
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.vector import NavigationVectorEnv
+from airl_mav.profiles.loading import load_profile
+from airl_mav.training import run
+from airl_mav.training.config import TrainingConfig
+from airl_mav.training.store import TrainingProgress
+from airl_mav.training.watched import Reflight, Taped, WatchedTraining
+from airl_mav.view.ends import ViewEnds
+from airl_mav.view.feed import Ends
+from airl_mav.view.messages import (
+    Decided,
+    Episode,
+    Flight,
+    Phase,
+    Picture,
+    Said,
+    Steering,
+    Told,
+    Trained,
+    Vehicle,
+)
+from airl_mav.view.shown import Shown
+from tests.support.browser import CHROMIUM, browser
+from tests.support.processes import running, wait_until
+from tests.support.scene import has_drawn
+
+SHORT = """
+description = "a short one"
+steps = 2_000
+vehicles = 8
+[environment]
+arena = "dynamic-obstacles"
+[environment.delay]
+latency = ["lognormal:150ms,30ms"]
+[environment.curriculum]
+[algorithm]
+learning_starts = 300
+[selection]
+every = 1_000
+episodes = 4
+"""
+
+BUSY = {
+    "arena": "dynamic-obstacles",
+    "delay": {"computer": "ras-pi-4", "workload": "template-5x32"},
+    "episode": {"time_limit_s": 12.0, "goal_radius_m": 5.0, "hover_after_s": 0.06},
+    "randomisation": {"mass": 0.2, "depth_noise": 0.02, "extra_delay_ms": [0, 100]},
+    "wind": {"random_m_s": 3.0, "gust_m_s": 1.0},
+    "frames": 2,
+}
+
+
+class Watchers:
+    """A view's end in this process, which wants to see as much as it can."""
+
+    def __init__(self, steering: Steering) -> None:
+        self.shown, self.told = Shown(), list[Told]()
+        self._steering = steering
+        self._ends, self._stop = Ends(), threading.Event()
+        self.ends: ViewEnds = self._ends.ends
+
+    @contextmanager
+    def watching(self) -> Iterator[Watchers]:
+        thread = threading.Thread(target=self._watch)
+        thread.start()
+        try:
+            yield self
+        finally:
+            self._stop.set()
+            thread.join()
+            self._ends.close()
+
+    def _watch(self) -> None:
+        while not self._stop.is_set():
+            self._ends.ask(self._steering)
+            for message, depth_mm in self._ends.take(0.02):
+                self.shown.take(message, depth_mm)
+                self.told.append(message)
+
+
+def weights(folder: Path) -> dict[str, str]:
+    """Return the digests of what a training has learned: of the best weights, and of the last."""
+    found = {}
+    for path in (folder / "best" / "model.zip", *sorted((folder / "checkpoints").rglob("*.zip"))):
+        with zipfile.ZipFile(path) as saved:
+            for name in ("policy.pth", "policy.optimizer.pth"):
+                if name in saved.namelist():
+                    key = f"{path.relative_to(folder)}/{name}"
+                    found[key] = hashlib.sha256(saved.read(name)).hexdigest()
+    return found
+
+
+def test_a_watched_training_learns_the_same(tmp_path: Path) -> None:
+    """Bit for bit, while somebody looks at it as fast as it goes."""
+    (tmp_path / "short.toml").write_text(SHORT, encoding="utf-8")
+    config = load_profile("training", str(tmp_path / "short.toml"), TrainingConfig)
+    run.train(config, tmp_path / "alone", name="one")
+    with Watchers(Steering(speed=None)).watching() as watchers:
+        run.train(config, tmp_path / "watched", name="one", view=watchers.ends)
+        wait_until(lambda: watchers.shown.trained is not None, "a decision")
+    alone = weights(tmp_path / "alone")
+    assert len(alone) >= 2
+    assert weights(tmp_path / "watched") == alone
+    kinds = {type(message) for message in watchers.told}
+    assert {Flight, Episode, Phase, Vehicle, Picture, Decided, Trained} <= kinds
+    trained = watchers.shown.trained
+    assert trained is not None
+    assert 0 < trained.steps <= config.steps
+    assert trained.zone == 0
+    assert trained.action.endswith("of 0 to 24")
+    assert any(isinstance(m, Said) and "evaluation after" in m.text for m in watchers.told)
+
+
+class Taping:
+    """Keeps all episodes, and where each was seen to end."""
+
+    def __init__(self) -> None:
+        self.done: list[Taped] = []
+        self._tape = Taped(0, 0, None)
+
+    def begun(self) -> None:
+        self._tape = Taped(0, 0, None)
+
+    def decided(
+        self, seed: int, zone: int, action: np.ndarray, reward: float, outcome: str | None
+    ) -> None:
+        tape = self._tape
+        tape.seed, tape.zone = seed, None if zone < 0 else zone
+        tape.actions.append(np.array(action))
+        tape.rewards.append(reward)
+        if outcome is not None:
+            tape.outcome = outcome
+            self.done.append(tape)
+            self._tape = Taped(len(self.done), 0, None)
+
+
+@pytest.mark.parametrize("decisions", ["sequential", "pipelined"])
+def test_what_is_shown_is_what_was_flown(decisions: str) -> None:
+    """The flights end alike, after as many decisions, at the same time and distance."""
+    knobs = {**BUSY, "decisions": decisions}
+    if decisions == "pipelined":
+        knobs["episode"] = {"time_limit_s": 12.0, "goal_radius_m": 5.0}
+    spec = EnvironmentSpec.model_validate(knobs)
+    taping = Taping()
+    env = NavigationVecEnv(NavigationVectorEnv(6, spec), taping)
+    env.seed(3)
+    env.reset()
+    rng, ends = np.random.default_rng(1), list[dict[str, Any]]()
+    while len(ends) < 3:
+        _, _, done, infos = env.step(rng.integers(0, 4, 6))
+        if done[0]:
+            ends.append(infos[0])
+    refly = Reflight(spec)
+    for tape, info in zip(taping.done, ends, strict=True):
+        moments = list(refly.moments(tape, 7_000_000))
+        times = [moment.time_us for moment in moments]
+        assert times == sorted(times)
+        episode = info["episode"]
+        assert tape.outcome == episode["outcome"]
+        fleet = refly.navigation.whole_truth().fleet
+        assert fleet.time_us[0] / 1e6 == episode["flight_time_s"]
+        assert fleet.distance[0] == episode["distance_m"]
+        assert fleet.energy[0] == episode["energy_j"]
+        told = [moment.message for moment in moments]
+        assert sum(isinstance(message, Decided) for message in told) == episode["l"]
+        last = [message for message in told if isinstance(message, Trained)][-1]
+        assert last.returned == pytest.approx(episode["r"], abs=1e-5)
+        vehicle = [message for message in told if isinstance(message, Vehicle)][-1]
+        assert vehicle.time_us == 7_000_000 + fleet.time_us[0]
+        assert vehicle.position == tuple(fleet.position[0])
+        # The network's image at the end, of bytes, as depths.
+        seen = info["terminal_observation"]["depth"]
+        assert seen.shape[0] == 2
+    image = next(moment.image for moment in moments if isinstance(moment.message, Decided))
+    assert image is not None
+    assert image.shape == (spec.image_height_px, spec.image_width_px)
+
+
+def test_a_training_that_goes_on_shows_whole_episodes() -> None:
+    """One that was under way when it was resumed is passed over: its beginning is not known."""
+    ends = Ends()
+    watched = WatchedTraining(ends.ends, EnvironmentSpec(), TrainingProgress())
+    watched.close()
+    action = np.array(3)
+    watched.decided(5, -1, action, 0.5, None)
+    watched.decided(5, -1, action, 0.5, "collision")
+    assert not watched._newest
+    watched.decided(6, -1, action, 0.5, None)
+    watched.decided(6, -1, action, 0.25, "success")
+    (tape,) = watched._newest
+    assert (tape.seed, tape.zone, tape.outcome, tape.rewards) == (6, None, "success", [0.5, 0.25])
+    ends.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+@pytest.mark.xdist_group("chromium")
+def test_a_browser_shows_the_training(tmp_path: Path) -> None:
+    pytest.importorskip("viser")
+    (tmp_path / "long.toml").write_text(SHORT.replace("2_000", "10_000_000"), encoding="utf-8")
+    words = ["-m", "airl_mav.cli.main", "train", "long.toml", "--view"]
+    with browser(tmp_path) as page, running([*words, "--out", "run"], tmp_path) as training:
+        page.resize(900, 600)
+        page.open(training.wait_for_text(r"view +(http://127\.0\.0\.1:\d+)")[1])
+        wait_until(lambda: "of 0 to 24" in page.text(), "a decision on the page")
+        text = page.text()
+        assert "of the newest episodes" in text
+        assert "reward" in text
+        assert "Set t2 by hand" not in text
+        assert page.press("Pause")
+        shot = tmp_path / "page.png"
+        wait_until(lambda: has_drawn(page, shot), "vehicle, trail and image")
+        with Image.open(shot) as image:
+            assert image.size == (900, 600)
