@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from functools import cache
 
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
@@ -47,6 +46,9 @@ def depth_picture(depth_mm: Depth, range_m: float) -> NDArray[np.uint8]:
 @cache
 def _colours() -> NDArray[np.uint8]:
     """Return matplotlib's viridis as RGB (256, 3)."""
+    # Imported here: it takes half a second, in which a page can be opened.
+    from matplotlib import colormaps
+
     colours: NDArray[np.uint8] = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
     return colours
 

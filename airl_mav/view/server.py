@@ -26,8 +26,8 @@ from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.watchers import Watchers
 
-DRAW_S = 1.0 / 30.0
-"""Time between two drawings of the scene [wall s]."""
+DRAW_US = 33_333
+"""Time between two drawings of the scene [wall µs]."""
 
 PICTURE_EVERY, PANEL_EVERY, STRIP_EVERY = 3, 4, 8
 """Drawings of the scene for one of the camera's image, of the panel, of the strip."""
@@ -65,9 +65,11 @@ class View:
             left_s = max(0.0, (due_us - clock.time_us()) / US_PER_S)
             for message, depth_mm in self._ends.take(left_s):
                 self._shown.take(message, depth_mm)
-            if clock.time_us() < due_us:
+            now_us = clock.time_us()
+            if now_us < due_us:
                 continue
-            due_us = clock.time_us() + round(DRAW_S * US_PER_S)
+            # Counted from when it was due, or what drawing takes would come on top each time.
+            due_us = max(due_us, now_us - DRAW_US) + DRAW_US
             # Nobody watches: nothing is drawn.
             if self._watchers.there:
                 self._draw()
