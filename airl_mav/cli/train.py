@@ -5,9 +5,10 @@ from __future__ import annotations
 import shlex
 import signal
 import sys
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 from rich.console import Console
@@ -19,7 +20,10 @@ from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
 from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
-from airl_mav.view.ends import ViewEnds
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.live import ViewRequest
+    from airl_mav.view.viewer import Viewer
 
 
 class TrainOptions(Telling, TrainRequest, Viewing):
@@ -69,18 +73,11 @@ def run(
         show(f"speed      {bound.describe()}")
     show(f"folder     {out}")
     show(f"curves     tensorboard --logdir {out / 'tensorboard'}")
-    with voice, ExitStack() as held:
+    with ExitStack() as held:
+        viewer = None if asked is None else held.enter_context(_viewer(stem, asked))
+        held.enter_context(voice)
         progress = voice.progress
-        view: ViewEnds | None = None
-        if asked is not None:
-            from airl_mav.training.watched import request_of
-            from airl_mav.view.viewer import Viewer, ViewError
-
-            try:
-                viewer = held.enter_context(closing(Viewer(request_of(stem, asked.port))))
-            except ViewError as error:
-                raise UsageError(str(error)) from None
-            view = viewer.ends
+        if viewer is not None:
             progress.note(f"view       {viewer.url}")
         try:
             with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
@@ -91,7 +88,7 @@ def run(
                     resume=options.resume,
                     progress=TrainingBar(progress, config.steps),
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
-                    view=view,
+                    view=None if viewer is None else viewer.ends,
                 )
         except KeyboardInterrupt:
             show(f"interrupted: airl train {options.config} --out {out} --resume continues")
@@ -106,3 +103,18 @@ def run(
         progress.tell(Exported(str(policy)))
         voice.finish(0, "complete", out, more=lines)
     return 0
+
+
+@contextmanager
+def _viewer(name: str, asked: ViewRequest) -> Iterator[Viewer]:
+    """Show a training for a while. Raises UsageError where it cannot be shown."""
+    # Imported here: a training that nobody watches does without.
+    from airl_mav.training.watched import request_of
+    from airl_mav.view.viewer import Viewer, ViewError
+
+    try:
+        viewer = Viewer(request_of(name, asked.port))
+    except ViewError as error:
+        raise UsageError(str(error)) from None
+    with closing(viewer):
+        yield viewer
