@@ -513,12 +513,12 @@ def of_sitl(out: Path) -> tuple[float, float, float]:
 
 TRAINING = """
 description = "a short one"
-steps = 12_000
+steps = 6_000
 vehicles = 32
 [environment]
 arena = "dynamic-obstacles"
 [algorithm]
-learning_starts = 1_000
+learning_starts = 500
 [selection]
 every = 100_000
 episodes = 1
