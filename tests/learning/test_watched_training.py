@@ -224,8 +224,9 @@ def test_a_browser_shows_the_training(tmp_path: Path) -> None:
         assert "of the newest episodes" in text
         assert "reward" in text
         assert "Set t2 by hand" not in text
-        assert page.press("Pause")
         shot = tmp_path / "page.png"
+        # While it flies on: at some moments nothing is near enough to be seen on the image.
         wait_until(lambda: has_drawn(page, shot), "vehicle, trail and image")
+        assert page.press("Pause")
         with Image.open(shot) as image:
             assert image.size == (900, 600)
