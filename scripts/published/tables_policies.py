@@ -25,6 +25,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "dense-obstacles-fast": ("dense-obstacles-fast", "run"),
     "crowded": ("generalisation", "crowded-crowded"),
     "crowded-pipelined": ("crowded-pipelined", "run"),
+    "crowded-fast": ("crowded-fast", "run"),
 }
 """Where the flights of each policy stand: in its own arena, as late as in its training."""
 
