@@ -9,6 +9,8 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter
+
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
@@ -38,6 +40,8 @@ from companion.signing_proxy import signed
 
 if TYPE_CHECKING:
     from companion.black_box import BlackBoxRecorder
+
+_SETUP = TypeAdapter(Setup)
 
 FLIGHT_S = 600.0
 """Longest navigation where nothing else is asked for [s]."""
@@ -144,7 +148,7 @@ def run_of(asked: StandAloneCompanion, mission: Mission) -> dict[str, Any]:
     """Return what flies, as `run.json` has it."""
     config = asked.model_dump(mode="json")
     config |= {"pilot": asdict(mission.pilot), "limits": mission.limits.model_dump(mode="json")}
-    return {"setup": asdict(mission.setup), "config": config}
+    return {"setup": _SETUP.dump_python(mission.setup, mode="json"), "config": config}
 
 
 def fly_alone(

@@ -37,7 +37,9 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.report.recorded_flight import episode_of
+from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import BlackBoxRecorder
+from companion.program import prepare, run_of
 from tests.support.full_disk import largest_file
 from tests.support.processes import running, wait_until
 from tests.support.recording_child import PERIOD_US, Straight
@@ -266,3 +268,13 @@ def test_foxglove_knows_the_fields_that_are_no_plain_numbers() -> None:
     assert decision["position"] == ("array", "number", None)
     assert image["data"] == ("string", "string", "base64")
     assert image["timestamp.nsec"] == ("integer", "integer", None)
+
+
+def test_a_latency_that_was_asked_for_is_written_with_the_rest(tmp_path: Path) -> None:
+    asked = StandAloneCompanion(
+        policy="greedy", goal=(9.0, 0.0), latency="lognormal:150ms,20ms", black_box=tmp_path
+    )
+    file = BlackBoxFile(tmp_path / "flight.mcap", run_of(asked, prepare(asked)))
+    file.finish()
+    setup = read_black_box(file.path).run["setup"]
+    assert setup["injection"]["latency"]["mean_ms"] == 150.0
