@@ -29,6 +29,7 @@ _EXPORTS = {
     "ladder": "airl_mav.experiments.ladder",
     "load_run": "airl_mav.experiments.run",
     "profile": "airl_mav.profiling.profile",
+    "refit": "airl_mav.refitting.refit",
     "rehearse": "airl_mav.experiments.fly",
     "roofline": "airl_mav.experiments.roofline",
 }
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from airl_mav.experiments.run import Run, load_run
     from airl_mav.profiling.profile import profile
     from airl_mav.profiling.request import ProfileRequest
+    from airl_mav.refitting.refit import refit
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
@@ -59,6 +61,7 @@ __all__ = [
     "ladder",
     "load_run",
     "profile",
+    "refit",
     "rehearse",
     "roofline",
 ]

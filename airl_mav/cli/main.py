@@ -34,6 +34,7 @@ SUBCOMMANDS: dict[str, str] = {
     "view": "replay the flights of a run in a browser",
     "export-log": "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
     "report": "a run's tables and page again, or a comparison of several runs",
+    "refit": "vehicle and computer profiles from a recorded flight",
     "refly": "rehearse a flight that was recorded, and compare the two",
     "arena": "look at an arena, or at what its profile draws",
     "parameters": "a vehicle's parameters as a file for firmware that you start",

@@ -352,6 +352,7 @@ EXTRAS = {
     "black-box": ("mcap",),
     "export": ("foxglove", "mcap"),
     "profile": ("onnx",),
+    "refit": ("mcap", "pyulog"),
     "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
     "view": ("viser",),

@@ -1,0 +1,108 @@
+"""`airl refit`: a vehicle and a computer profile from a recorded flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.fields import ProfileModel
+from airl_mav.report.table import NONE, Column, TableView, print_table
+
+if TYPE_CHECKING:
+    from airl_mav.refitting.estimate import Estimate
+    from airl_mav.refitting.refit import Refit
+
+
+class RefitOptions(ProfileModel):
+    """Fit a vehicle, a computer and the wind to a flight that --black-box has recorded.
+
+    With the flight controller's log (.ulg) also mass or thrust, and the time on the link. Writes
+    profiles that load as they are, and says what the flight does not tell.
+
+    Examples:
+        airl refit flights/20261123T172437.230467Z.mcap --ulg log_12.ulg --out refit
+        airl refly flights/20261123T172437.230467Z.mcap --refit refit
+    """
+
+    flight: Annotated[Path, POSITIONAL] = Field(description="black box of a flight (.mcap)")
+    ulg: Path | None = Field(
+        default=None, description="the flight controller's log of the same flight (.ulg)"
+    )
+    vehicle: str | None = Field(
+        default=None,
+        description="vehicle profile to refit: a shipped name, or a path to a .toml; by default the"
+        " one that the flight names",
+    )
+    known: Literal["thrust", "mass"] = Field(
+        default="thrust",
+        description="what the profile is right about: a flight tells only thrust per mass, and the"
+        " other one is fitted",
+    )
+    out: Path = Field(
+        description="new folder for vehicle.toml, computer.toml, latency.txt, scenario.toml and"
+        " refit.json"
+    )
+
+
+OPTIONS = RefitOptions
+
+
+def run(options: RefitOptions, console: Console | None = None) -> int:
+    """Refit. Returns exit status 0; raises UsageError as `refit` does."""
+    console = console or Console()
+    check_installed("sim", "refit")
+    # Imported here: MCAP and pyulog are extras.
+    from airl_mav.refitting.refit import refit
+
+    found = refit(
+        options.flight,
+        ulg=options.ulg,
+        vehicle=options.vehicle,
+        known=options.known,
+        out=options.out,
+    )
+    print_table(table_of(found), console)
+    for line in (*unobserved_lines(found), *found.notes, f"written: {options.out}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def table_of(found: Refit) -> TableView:
+    """Return the table of what was fitted."""
+    columns = (
+        Column("quantity", number=False),
+        Column("fitted"),
+        Column("95 % interval"),
+        Column("profile"),
+        Column("unit", number=False),
+    )
+    rows = tuple(
+        (
+            each.meaning,
+            _number(each, each.value),
+            f"{_number(each, each.low)} to {_number(each, each.high)}" if each.observed else NONE,
+            _number(each, each.profile),
+            "" if each.unit == "1" else each.unit,
+        )
+        for each in found.estimates
+    )
+    return TableView("refit", f"{found.base}, refitted", columns, rows)
+
+
+def unobserved_lines(found: Refit) -> list[str]:
+    """Return a line for each quantity that the flight does not tell."""
+    return [
+        f"not observable in this flight: {each.meaning}: {each.unobservable}"
+        for each in found.estimates
+        if not each.observed
+    ]
+
+
+def _number(estimate: Estimate, value: float | None) -> str:
+    if value is None:
+        return NONE
+    return f"{value:.1f}" if estimate.unit == "ms" else f"{value:.3f}"

@@ -1,0 +1,1 @@
+"""Vehicle and computer profiles from what a flight has recorded."""

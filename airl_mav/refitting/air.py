@@ -1,0 +1,258 @@
+"""Drag and wind, from how the vehicle leans, and what it gains of it.
+
+Rotors push along the body's axis, so what accelerates a vehicle across it is the air: with the
+drag D per mass, k = D / m, and the wind w, a velocity v is braked by k (v - w):
+
+    v' = g + f z - k (v - w)
+
+z is the body's up axis, f the thrust per mass, which the vertical part of the equation gives. The
+level part is linear in k and k w. It is averaged over windows of half a second.
+
+An error of the attitude, as of an accelerometer that is biased, looks like wind while the heading
+stays. It is estimated along with the rest, as a bias along the body's axes with a normal prior: of
+the profile's accelerometer until the vehicle has manoeuvred, and smaller after, when an estimator
+has told tilt and bias apart. So the interval of the wind is wide where the flight is short, or the
+drag small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.latency.autocorrelation import integrated_time
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.refitting.estimate import Array, Estimate, unobserved
+from airl_mav.refitting.flown import Flown
+
+WINDOW = 13
+"""Samples of a window: half a second of telemetry."""
+
+SETTLE_US = 2 * US_PER_S
+"""After so long in navigation an estimator has told tilt and bias apart [µs]."""
+
+SETTLED_SHARE = 0.4
+"""What is left of an accelerometer's bias in the attitude then."""
+
+SKEW_S = 0.01
+"""By how much attitude and velocity in telemetry may be of different moments [s]."""
+
+UNSEEN = 2.0
+"""Errors of an estimator and gusts change slower than a short flight shows: the variance is so many
+times that which the rows show. Twenty flights of known wind (benchmarks/bench_refit.py) are inside
+the intervals then as often as these say."""
+
+LEAST_ROWS = 4 * WINDOW
+DRAWS = 4000
+"""Of the posterior distribution: wind is a ratio."""
+
+WIDEST_DRAG, WIDEST_WIND_M_S = 0.5, 1.0
+"""Half widths of intervals, of the drag as a share, from which on nothing is observable."""
+
+ITERATIONS = 4
+"""For the noise of the rows, and for quadratic drag, which needs the wind."""
+
+_DRAG, _NORTH, _EAST = 0, 1, 2
+_AIR = 3
+"""Parameters of the air: k, k w north, k w east; biases follow."""
+
+
+@dataclass(frozen=True)
+class Air:
+    """What the air did."""
+
+    drag_1_s: Estimate
+    """Linear drag per mass."""
+    wind_north_m_s: Estimate
+    wind_east_m_s: Estimate
+    quadratic_1_m: float
+    """Quadratic drag per mass, as the profile has it."""
+
+    @property
+    def wind(self) -> tuple[float, float] | None:
+        """Steady wind towards north, east [m/s]; None: not observable."""
+        north, east = self.wind_north_m_s.value, self.wind_east_m_s.value
+        return None if north is None or east is None else (north, east)
+
+    def along_thrust(self, velocity: Array, quaternion: Array) -> Array:
+        """Return the drag per mass along the body's down axis (n,) [m/s²].
+
+        Args:
+            velocity: (n, 3) NED [m/s].
+            quaternion: (n, 4) body to world.
+        """
+        north, east = self.wind or (0.0, 0.0)
+        against = velocity - np.array([north, east, 0.0])
+        linear = self.drag_1_s.value or 0.0
+        speed = np.linalg.norm(against, axis=1, keepdims=True)
+        force = -(linear + self.quadratic_1_m * speed) * against
+        down = _rotation(quaternion)[:, :, 2]
+        return np.asarray(np.sum(force * down, axis=1))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Equations of accelerations: what is left = matrix @ parameters."""
+
+    matrix: Array
+    """(n, 2, 3 + biases)."""
+    left: Array
+    """(n, 2) [m/s²]."""
+    velocity: Array
+    """(n, 3) NED [m/s], for quadratic drag."""
+    axes: Array
+    """(n, 2, 3) how a force NED enters the two equations."""
+    prior: tuple[float, ...]
+    """Standard deviations of the biases [m/s²], and of how early the lean is [s]."""
+
+
+def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> Air:
+    """Fit drag and wind.
+
+    Args:
+        flown: The flight.
+        vehicle: As it was thought to be: its accelerometer, its quadratic drag.
+        rng: Draws from the posterior distribution.
+    """
+    mass_kg = vehicle.body.mass_kg
+    quadratic_1_m = vehicle.drag.quadratic_n_s2_m2 / mass_kg
+    known = vehicle.drag.linear_n_s_m / mass_kg
+    bias_m_s2 = vehicle.sensors.imu.accel_bias_m_s2
+    source = "lean and acceleration in telemetry"
+    rows = _rows(flown, bias_m_s2)
+    if rows is None:
+        return _nothing("the flight is too short", known, quadratic_1_m)
+    middle, covariance = _posterior(rows, quadratic_1_m)
+    drawn = rng.multivariate_normal(middle[:_AIR], covariance[:_AIR, :_AIR], DRAWS)
+    drag = _estimate(
+        "drag_1_s", "linear drag per mass", "1/s", middle[_DRAG], drawn[:, _DRAG], source, known
+    )
+    half = drag.half_width or 0.0
+    if middle[_DRAG] <= 0.0 or half > WIDEST_DRAG * middle[_DRAG]:
+        why = (
+            f"drag {middle[_DRAG]:.3f} +- {half:.3f} 1/s: too little of the flight is fast, or the"
+            " drag is too small"
+        )
+        return _nothing(why, known, quadratic_1_m)
+    wind = [
+        _estimate(key, meaning, "m/s", middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, 0], source)
+        for i, key, meaning in (
+            (_NORTH, "wind_north_m_s", "steady wind towards north"),
+            (_EAST, "wind_east_m_s", "steady wind towards east"),
+        )
+    ]
+    if (half := max(each.half_width or 0.0 for each in wind)) > WIDEST_WIND_M_S:
+        why = (
+            f"known to {half:.1f} m/s, {WIDEST_WIND_M_S:g} or better is needed: against this drag"
+            " an error of the attitude looks like it"
+        )
+        wind = [unobserved(each.key, each.meaning, each.unit, why, None) for each in wind]
+    return Air(drag, wind[0], wind[1], quadratic_1_m)
+
+
+def _nothing(why: str, known: float, quadratic_1_m: float) -> Air:
+    return Air(
+        unobserved("drag_1_s", "linear drag per mass", "1/s", why, known),
+        unobserved("wind_north_m_s", "steady wind towards north", "m/s", why, None),
+        unobserved("wind_east_m_s", "steady wind towards east", "m/s", why, None),
+        quadratic_1_m,
+    )
+
+
+def _estimate(
+    key: str,
+    meaning: str,
+    unit: str,
+    value: float,
+    drawn: Array,
+    source: str,
+    profile: float | None = None,
+) -> Estimate:
+    low, high = np.quantile(drawn, (0.025, 0.975))
+    return Estimate(key, meaning, unit, float(value), float(low), float(high), source, "", profile)
+
+
+def _rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
+    """Return the equations of telemetry: velocity gained in a window, against lean and drag.
+
+    Attitude and velocity of an estimator are not of quite the same moment. In a flight that goes
+    to and fro, a lean that is early by d looks like a drag of d w², w the angular frequency; so d
+    is estimated, too.
+    """
+    path = flown.path.between(*flown.airborne_us)
+    if len(path) < LEAST_ROWS:
+        return None
+    turn = _rotation(path.quaternion)
+    time_s = (path.time_us - path.time_us[:1]) / US_PER_S
+    lean = turn[:, :2, 2] / turn[:, 2:, 2]
+    sinking = path.velocity[:, 2:]
+    carried = (GRAVITY_M_S2 - _rate(sinking, time_s)) * lean
+    braked = sinking * lean - path.velocity[:, :2]
+    early = (path.time_us < flown.navigation_us + SETTLE_US)[:, None]
+    biases = [turn[:, :2, axis] * when for when in (early, ~early) for axis in (0, 1)]
+    length_s = time_s[WINDOW:] - time_s[:-WINDOW]
+
+    def mean(values: Array) -> Array:
+        steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time_s)[:, None]
+        sums = np.vstack([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
+        return np.asarray((sums[WINDOW:] - sums[:-WINDOW]) / length_s[:, None])
+
+    gained = (path.velocity[WINDOW:, :2] - path.velocity[:-WINDOW, :2]) / length_s[:, None]
+    ones = np.ones(len(length_s))
+    nothing = np.zeros(len(length_s))
+    wind = [np.stack([ones, nothing], axis=1), np.stack([nothing, ones], axis=1)]
+    skewed = [mean(_rate(carried, time_s))]
+    matrix = np.stack([mean(braked), *wind, *map(mean, biases), *skewed], axis=2)
+    middle = slice(WINDOW // 2, WINDOW // 2 + len(length_s))
+    axes = np.zeros((len(length_s), 2, 3))
+    axes[:, 0, 0] = axes[:, 1, 1] = 1.0
+    axes[:, :, 2] = -lean[middle]
+    settled_m_s2 = SETTLED_SHARE * bias_m_s2
+    prior = (bias_m_s2, bias_m_s2, settled_m_s2, settled_m_s2, SKEW_S)
+    return _Rows(matrix, gained + mean(carried), path.velocity[middle], axes, prior)
+
+
+def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
+    """Return mean and covariance of the parameters, given all equations.
+
+    Neighbouring rows depend on each other: n of them count as n over their integrated
+    autocorrelation time.
+    """
+    held = np.concatenate([[np.inf] * _AIR, rows.prior])
+    matrix = rows.matrix.reshape(-1, len(held))
+    middle: Array = np.zeros(len(held))
+    covariance: Array = np.eye(len(held))
+    noise = 1.0
+    for step in range(ITERATIONS):
+        left = rows.left - _quadratic(rows, middle, quadratic_1_m)
+        if step:
+            error = left - rows.matrix @ middle
+            slow = max(1.0, *(integrated_time(each) for each in error.T))
+            noise = UNSEEN * float(np.mean(error**2)) * slow
+        precision = np.diag(held**-2.0) + matrix.T @ matrix / noise
+        covariance = np.asarray(np.linalg.inv(precision), np.float64)
+        middle = np.asarray(covariance @ matrix.T @ left.reshape(-1) / noise, np.float64)
+    return middle, covariance
+
+
+def _quadratic(rows: _Rows, middle: Array, quadratic_1_m: float) -> Array:
+    """Return what quadratic drag does to the rows (n, 2) in the wind found so far [m/s²]."""
+    if quadratic_1_m == 0.0 or middle[_DRAG] <= 0.0:
+        return np.zeros_like(rows.left)
+    wind = np.array([*middle[_NORTH : _EAST + 1] / middle[_DRAG], 0.0])
+    against = rows.velocity - wind
+    force = -quadratic_1_m * np.linalg.norm(against, axis=1, keepdims=True) * against
+    return np.asarray(np.einsum("nij,nj->ni", rows.axes, force))
+
+
+def _rotation(quaternion: Array) -> Array:
+    """Return the matrices (n, 3, 3), body to world, of quaternions (n, 4) [w, x, y, z]."""
+    return np.asarray(Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+
+
+def _rate(values: Array, time_s: NDArray[np.float64]) -> Array:
+    return np.asarray(np.gradient(values, time_s, axis=0))

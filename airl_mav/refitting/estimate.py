@@ -1,0 +1,119 @@
+"""An estimate with its 95 % interval, or why a flight does not tell it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap, t
+
+Array = NDArray[np.float64]
+
+LEVEL = 0.95
+RESAMPLES = 999
+BLOCK_S = 1.0
+"""Residuals nearer than this may depend on each other, and are resampled together [s]."""
+
+LEAST_BLOCKS = 4
+"""A flight of fewer blocks has no interval."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One fitted quantity."""
+
+    key: str
+    meaning: str
+    unit: str
+    value: float | None
+    """None: not observable in this flight."""
+    low: float | None = None
+    high: float | None = None
+    """Ends of the 95 % interval."""
+    source: str = ""
+    """What it was fitted from."""
+    unobservable: str = ""
+    """Why it is not known; "" where it is."""
+    profile: float | None = None
+    """What the profile says, in the same unit; None: nothing."""
+
+    @property
+    def observed(self) -> bool:
+        """Whether the flight tells it."""
+        return self.value is not None
+
+    @property
+    def half_width(self) -> float | None:
+        """Half the width of the interval."""
+        if self.low is None or self.high is None:
+            return None
+        return 0.5 * (self.high - self.low)
+
+
+def unobserved(key: str, meaning: str, unit: str, why: str, profile: float | None) -> Estimate:
+    """Return a quantity that the flight does not tell, and why."""
+    return Estimate(key, meaning, unit, None, unobservable=why, profile=profile)
+
+
+def block_intervals(
+    jacobian: Array, residuals: Array, times_s: Array, rng: np.random.Generator
+) -> Array:
+    """Return how far the ends of the 95 % intervals are from a least-squares solution, (2, k).
+
+    Residuals of a flight depend on their neighbours, so seconds of them are resampled, not single
+    ones; each resample moves the solution by one Gauss-Newton step (the one-step bootstrap). The
+    interval is wider by Student's t, as the blocks are few.
+
+    Args:
+        jacobian: (n, k) of the residuals.
+        residuals: (n,) at the solution.
+        times_s: (n,) of the residuals [s].
+        rng: Draws the resamples.
+
+    Returns:
+        Lower and upper end, relative to the solution; infinite where nothing holds the parameter.
+    """
+    block = np.unique(np.floor((times_s - times_s.min()) / BLOCK_S), return_inverse=True)[1]
+    count = int(block.max()) + 1
+    parameters = jacobian.shape[1]
+    if count < LEAST_BLOCKS:
+        return np.array([[-math.inf] * parameters, [math.inf] * parameters])
+    slopes, squares = np.zeros((count, parameters)), np.zeros((count, parameters, parameters))
+    np.add.at(slopes, block, jacobian * residuals[:, None])
+    np.add.at(squares, block, jacobian[:, :, None] * jacobian[:, None, :])
+
+    def moved(chosen: NDArray[np.int64]) -> Array:
+        square = squares[chosen].sum(axis=0)
+        return -np.asarray(np.linalg.lstsq(square, slopes[chosen].sum(axis=0), rcond=None)[0])
+
+    return _widened(np.arange(count), moved, rng)
+
+
+def mean_interval(values: Array, times_s: Array, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of samples (n,) that depend on their neighbours."""
+    ones = np.ones((len(values), 1))
+    ends = block_intervals(-ones, values - values.mean(), times_s, rng)
+    return float(values.mean() + ends[0, 0]), float(values.mean() + ends[1, 0])
+
+
+def _widened(
+    blocks: NDArray[np.int64],
+    statistic: Callable[[NDArray[np.int64]], Array],
+    rng: np.random.Generator,
+) -> Array:
+    """Return the bootstrap interval of a statistic of blocks, as wide as Student's t makes it."""
+    found = bootstrap(
+        (blocks,),
+        statistic,
+        vectorized=False,
+        n_resamples=RESAMPLES,
+        confidence_level=LEVEL,
+        method="percentile",
+        rng=rng,
+    ).confidence_interval
+    tail = 0.5 + 0.5 * LEVEL
+    wider = t.ppf(tail, len(blocks) - 1) / t.ppf(tail, math.inf)
+    return np.asarray([found.low, found.high]) * wider

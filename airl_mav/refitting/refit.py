@@ -1,0 +1,189 @@
+"""A vehicle and a computer profile from a recorded flight."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.errors import FieldError
+from airl_mav.core.provenance import package_versions
+from airl_mav.profiles.computer import ComputerProfile, load_computer
+from airl_mav.profiles.conditions import Payload
+from airl_mav.profiles.loaded import loaded
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.refitting.air import Air, fit_air
+from airl_mav.refitting.estimate import Estimate
+from airl_mav.refitting.files import computer_profile, vehicle_toml, write_refit
+from airl_mav.refitting.flown import Flown, flown_of
+from airl_mav.refitting.latencies import Latencies, fit_latencies
+from airl_mav.refitting.overrides import Override, overrides_of, refitted
+from airl_mav.refitting.response import ResponseFit, fit_response
+from airl_mav.refitting.thrust import Known, Thrust, fit_thrust
+from airl_mav.vehicle_log.ulog import read_vehicle_log
+
+SCHEMA = 1
+"""Version of `refit.json`."""
+
+
+@dataclass(frozen=True)
+class Refit:
+    """What a flight says of its vehicle, its computer and the wind."""
+
+    black_box: Path
+    ulg: Path | None
+    base: str
+    """Profile that was refitted: a shipped name, or a path."""
+    known: Known
+    """Which of mass and thrust that profile was believed about."""
+    vehicle: VehicleProfile
+    """It, as the flight says that it is."""
+    overrides: tuple[Override, ...]
+    """Where the two differ."""
+    response: ResponseFit
+    thrust: Thrust
+    air: Air
+    latencies: Latencies
+    notes: tuple[str, ...]
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """All that was fitted, or was not."""
+        response, thrust, air, late = self.response, self.thrust, self.air, self.latencies
+        return (
+            *(response.dead_time_s, response.velocity_time_s, response.yaw_rate_time_s),
+            *(thrust.hover, thrust.ratio_m_s2, thrust.mass_kg, thrust.thrust_max_n),
+            *(air.drag_1_s, air.wind_north_m_s, air.wind_east_m_s),
+            *(late.t1_ms, late.t2_ms, late.link_ms),
+        )
+
+    def estimate(self, key: str) -> Estimate:
+        """Return one of them. Raises KeyError."""
+        return {each.key: each for each in self.estimates}[key]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `refit.json` has it."""
+        wind = self.air.wind
+        estimates = {each.key: asdict(each) for each in self.estimates}
+        for fields in estimates.values():
+            del fields["key"]
+        return {
+            "schema": SCHEMA,
+            "black_box": str(self.black_box),
+            "ulg": None if self.ulg is None else str(self.ulg),
+            "vehicle": self.base,
+            "known": self.known,
+            "estimates": estimates,
+            "wind": None if wind is None else {"north_m_s": wind[0], "east_m_s": wind[1]},
+            "overrides": [asdict(each) for each in self.overrides],
+            "notes": list(self.notes),
+            "versions": package_versions(),
+        }
+
+
+def refit(
+    path: Path,
+    *,
+    ulg: Path | None = None,
+    vehicle: str | None = None,
+    known: Known = "thrust",
+    out: Path | None = None,
+    seed: int = 1,
+) -> Refit:
+    """Fit what a flight says of its vehicle, its computer and the wind.
+
+    Args:
+        path: The black box.
+        ulg: The vehicle's own log of the flight; without it mass, thrust and link stay unknown.
+        vehicle: Profile to refit: a shipped name, or a path; None: the one that the flight names.
+        known: What the profile is right about: a flight tells only the greatest thrust per mass.
+        out: New folder for `vehicle.toml`, `computer.toml`, `latency.txt`, `scenario.toml` and
+            `refit.json`; None: nothing is written.
+        seed: Draws the resamples of the intervals.
+
+    Raises:
+        UsageError: A file cannot be read, or holds no navigation, or the log is of another flight.
+            `FieldError`s name the field.
+    """
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+    box = read_black_box(path)
+    log = None if ulg is None else read_vehicle_log(ulg)
+    config = box.run.get("config", {})
+    base = vehicle or str(config.get("vehicle", "quad"))
+    profile = load_vehicle(base)
+    board = load_computer(str(config.get("computer", "workstation")))
+    flying = loaded(profile, board, Payload())
+    flown = flown_of(box, log)
+    streams = np.random.default_rng(seed).spawn(4)
+    air = fit_air(flown, flying, streams[0])
+    thrust = fit_thrust(flown, flying, air, known, streams[1])
+    response = fit_response(flown, profile.response, streams[2])
+    logged = {} if log is None else log.parameters
+    overrides = overrides_of(profile, flying, response, thrust, air, logged)
+    found = Refit(
+        black_box=path,
+        ulg=ulg,
+        base=base,
+        known=known,
+        vehicle=refitted(profile, overrides),
+        overrides=overrides,
+        response=response,
+        thrust=thrust,
+        air=air,
+        latencies=fit_latencies(flown, streams[3]),
+        notes=_notes(flown, board),
+    )
+    if out is not None:
+        _write(found, box, out)
+    return found
+
+
+def _write(found: Refit, box: BlackBox, out: Path) -> None:
+    from_what = found.black_box.name + (f" and {found.ulg.name}" if found.ulg else "")
+    remarks = (f"airl refit {from_what}", *found.notes)
+    samples_ms = found.latencies.samples_ms
+    write_refit(
+        out,
+        found.as_json(),
+        vehicle_toml(
+            found.base,
+            f"{found.base}, refitted to the flight {found.black_box.stem}",
+            found.overrides,
+            remarks,
+        ),
+        computer_profile(box, len(samples_ms), f"airl refit {found.black_box.name}"),
+        samples_ms,
+        remarks,
+    )
+
+
+def _notes(flown: Flown, board: ComputerProfile) -> tuple[str, ...]:
+    notes = []
+    if not flown.box.whole:
+        notes.append("the recording ends early: only what it holds was fitted")
+    if flown.box.damaged:
+        notes.append("the recording is damaged: its checksum is wrong")
+    if flown.clocks is not None:
+        clocks = flown.clocks
+        notes.append(
+            "clocks aligned by attitude and velocity: what was told is"
+            f" {clocks.told_us / US_PER_MS:.1f} ms later in the recording than in the log,"
+            f" velocities agree to {clocks.error_m_s:.3f} m/s"
+        )
+    if flown.log is not None and len(flown.log.wind):
+        start_us, end_us = (flown.logged_us(each) for each in flown.airborne_us)
+        told = flown.log.wind.between(start_us, end_us)
+        if len(told):
+            north, east = told.values.mean(axis=0)
+            notes.append(
+                f"the flight controller's own estimate of the wind: {north:.1f} m/s towards north,"
+                f" {east:.1f} m/s towards east"
+            )
+    if board.onboard_mass_kg:
+        notes.append(f"the computer on board has {board.onboard_mass_kg:.3f} kg of the mass")
+    return tuple(notes)

@@ -1,0 +1,292 @@
+"""How the vehicle answered the setpoints: dead time, time constants of velocity and yaw rate.
+
+The model is that of `prediction.motion`: after a dead time the velocity follows the setpoint with
+one time constant, the yaw rate with another. Its velocity is the flight's when it is driven by the
+setpoints that were sent, turned by the heading that was flown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.frames import quats_to_euler
+from airl_mav.profiles.vehicle import Response
+from airl_mav.refitting.estimate import Array, Estimate, block_intervals, unobserved
+from airl_mav.refitting.flown import Flown, seconds
+
+STEP_S = 0.004
+"""Of the model [s]: the flight controller's own."""
+
+TELEMETRY_AGE_S = 0.010
+"""Mean age of the newest telemetry, which comes 50 times a second [s]; at most twice that."""
+
+DEAD_TIMES_S = (0.05, 0.15, 0.3)
+"""Where searches begin: the cost has more than one valley [s]."""
+
+LEAST_CHANGE_M_S, LEAST_CHANGE_RAD_S = 1.0, 0.2
+"""Root mean square change from setpoint to setpoint, below which the answer drowns in noise."""
+
+DIFFERENCES = (0.02, 0.02, 0.02)
+"""Steps of the numerical derivatives, as shares: the model is piecewise linear in the dead time."""
+
+LEAST_DECISIONS = 8
+WIDEST_S, WIDEST_SHARE = 0.05, 0.4
+"""A dead time that is known no better, or a time constant, is not observable."""
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """The answers of a vehicle."""
+
+    dead_time_s: Estimate
+    velocity_time_s: Estimate
+    yaw_rate_time_s: Estimate
+
+    def response(self, drag_1_s: float, known: Response | None) -> Response | None:
+        """Return the table for a profile; what was not observed is as it was known before.
+
+        None where that was not known either.
+        """
+        found = {
+            "dead_time_s": self.dead_time_s.value,
+            "velocity_time_s": self.velocity_time_s.value,
+            "yaw_rate_time_s": self.yaw_rate_time_s.value,
+        }
+        held = {} if known is None else known.model_dump()
+        merged = {name: held.get(name) if value is None else value for name, value in found.items()}
+        if any(value is None for value in merged.values()):
+            return None
+        return Response.model_validate({**merged, "drag_1_s": drag_1_s})
+
+
+@dataclass(frozen=True)
+class _Driven:
+    """What drives the model, and what it is compared with."""
+
+    grid_s: Array
+    """(m,) steps of the model [s]."""
+    commands: Array
+    """(m, 4) setpoint that was the newest to be sent."""
+    heading: Array
+    """(m,) that was flown [rad], without jumps."""
+    times_s: Array
+    """(n,) of the samples [s]."""
+    velocity: Array
+    """(n, 2) north, east [m/s]."""
+    turned: Array
+    """(n,) heading [rad], without jumps."""
+    begun_m_s: tuple[float, float]
+    """Velocity at the first step."""
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Of a least-squares problem with k parameters and n residuals."""
+
+    x: Array
+    """(k,)."""
+    fun: Array
+    """(n,) residuals."""
+    jac: Array
+    """(n, k)."""
+
+
+def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator) -> ResponseFit:
+    """Fit the response of a flight's vehicle.
+
+    With the vehicle's log the dead time counts from when the flight controller took the setpoint;
+    without, from when it was sent, and the link is a part of it.
+
+    Args:
+        flown: The flight.
+        known: What the profile says.
+        rng: Draws the resamples of the intervals.
+    """
+    velocity, turn = _describe(known)
+    if (why := _too_little(flown)) is not None:
+        fit = ResponseFit(*(replace(each, unobservable=why) for each in (*velocity, turn)))
+    else:
+        driven = _driven(flown)
+        fit = ResponseFit(
+            *_velocity(driven, flown, velocity, rng), _yaw_rate(driven, flown, turn, rng)
+        )
+    return fit
+
+
+def _describe(known: Response | None) -> tuple[tuple[Estimate, Estimate], Estimate]:
+    held = {} if known is None else known.model_dump()
+
+    def named(key: str, meaning: str) -> Estimate:
+        return unobserved(key, meaning, "s", "", held.get(key))
+
+    return (
+        named("dead_time_s", "dead time of the velocity"),
+        named("velocity_time_s", "time constant of the velocity"),
+    ), named("yaw_rate_time_s", "time constant of the yaw rate")
+
+
+def _too_little(flown: Flown) -> str | None:
+    if len(flown.sent_us) < LEAST_DECISIONS:
+        return f"{len(flown.sent_us)} decisions; {LEAST_DECISIONS} are needed"
+    change = np.diff(flown.setpoints[:, :2], axis=0)
+    rms = float(np.sqrt(np.mean(np.sum(change**2, axis=1))))
+    if rms < LEAST_CHANGE_M_S:
+        return f"setpoints change by {rms:.2f} m/s; {LEAST_CHANGE_M_S:g} are needed"
+    return None
+
+
+def _driven(flown: Flown) -> _Driven:
+    path, from_us = flown.path, flown.navigation_us
+    inside = (path.time_us >= from_us - US_PER_S // 2) & (path.time_us <= flown.ended_us)
+    times_s = seconds(path.time_us[inside], from_us)
+    heading = np.unwrap(quats_to_euler(path.quaternion[inside])[2])
+    velocity = path.velocity[inside, :2]
+    grid_s = np.arange(min(times_s[0], 0.0), times_s[-1], STEP_S)
+    newest = np.searchsorted(seconds(flown.sent_us, from_us), grid_s, side="right") - 1
+    sent = np.where(newest[:, None] >= 0, flown.setpoints[np.maximum(newest, 0)], 0.0)
+    navigated = times_s >= 0.0
+    return _Driven(
+        grid_s,
+        sent,
+        np.interp(grid_s, times_s, heading),
+        times_s[navigated],
+        velocity[navigated],
+        heading[navigated],
+        (float(velocity[0, 0]), float(velocity[0, 1])),
+    )
+
+
+def _velocity(
+    driven: _Driven, flown: Flown, known: tuple[Estimate, Estimate], rng: np.random.Generator
+) -> tuple[Estimate, Estimate]:
+    """Fit dead time and time constant to the velocities north and east together.
+
+    A third parameter is the time at which the heading turned the setpoint: that of its arrival,
+    which is before the answer.
+    """
+    grid = driven.grid_s
+
+    def residuals(of: Array) -> Array:
+        dead_s, lag_s, turned_s = of
+        forward, right = (np.interp(grid - dead_s, grid, driven.commands[:, k]) for k in (0, 1))
+        nose = np.exp(1j * np.interp(grid - turned_s, grid, driven.heading))
+        wanted = (forward + 1j * right) * nose
+        model = _lagged(wanted, lag_s, complex(*driven.begun_m_s))
+        at = (
+            np.interp(driven.times_s, grid, model.real),
+            np.interp(driven.times_s, grid, model.imag),
+        )
+        return np.concatenate([at[0] - driven.velocity[:, 0], at[1] - driven.velocity[:, 1]])
+
+    starts = [(dead_s, 0.4, dead_s) for dead_s in DEAD_TIMES_S]
+    found = _best(residuals, starts, high=(2.0, 5.0, 0.6))
+    ends = block_intervals(found.jac, found.fun, np.tile(driven.times_s, 2), rng)
+    dead, lag = known
+    shift_s, unsure_s, source = _link_share(flown)
+    low_s, high_s = (math.hypot(end, unsure_s) for end in ends[:, 0])
+    value = float(found.x[0]) - shift_s
+    dead = replace(dead, value=value, low=value - low_s, high=value + high_s, source=source)
+    lag = _with_interval(lag, float(found.x[1]), ends[:, 1], "velocity in telemetry")
+    return _known_to(dead, WIDEST_S), _known_to(lag, WIDEST_SHARE * float(found.x[1]))
+
+
+def _link_share(flown: Flown) -> tuple[float, float, str]:
+    """Return what of the time from sending to being told is not the vehicle's [s].
+
+    With how unsure that is (95 %), and where it comes from.
+    """
+    clocks = flown.clocks
+    if clocks is not None and clocks.accepted_range_us is not None:
+        low_us, high_us = clocks.accepted_range_us
+        round_trip_us = clocks.round_trip_us or 0.0
+        return (
+            round_trip_us / US_PER_S,
+            0.5 * (high_us - low_us) / US_PER_S,
+            "setpoints sent and velocity in telemetry, by the flight controller's clock"
+            f" ({round_trip_us / US_PER_MS:.0f} ms of link and telemetry taken off)",
+        )
+    return (
+        TELEMETRY_AGE_S,
+        TELEMETRY_AGE_S,
+        "setpoints sent and velocity in telemetry; the link's time is in it"
+        f" (taken off: {1e3 * TELEMETRY_AGE_S:.0f} ms, the mean age of telemetry)",
+    )
+
+
+def _yaw_rate(driven: _Driven, flown: Flown, known: Estimate, rng: np.random.Generator) -> Estimate:
+    """Fit the time constant of the yaw rate to the heading, with a dead time of its own."""
+    change = np.diff(flown.setpoints[:, 3])
+    rms = float(np.sqrt(np.mean(change**2)))
+    if rms < LEAST_CHANGE_RAD_S:
+        why = f"yaw rates change by {rms:.2f} rad/s; {LEAST_CHANGE_RAD_S:g} are needed"
+        return replace(known, unobservable=why)
+    grid = driven.grid_s
+
+    def residuals(of: Array) -> Array:
+        dead_s, lag_s, offset = of
+        wanted = np.interp(grid - dead_s, grid, driven.commands[:, 3])
+        heading = np.cumsum(_lagged(wanted, lag_s, 0.0).real) * STEP_S
+        return np.asarray(np.interp(driven.times_s, grid, heading) - driven.turned + offset)
+
+    starts = [(dead_s, 0.1, float(driven.turned[0])) for dead_s in DEAD_TIMES_S]
+    found = _best(residuals, starts, high=(2.0, 5.0, math.inf), free=2)
+    ends = block_intervals(found.jac, found.fun, driven.times_s, rng)
+    fitted = _with_interval(known, float(found.x[1]), ends[:, 1], "heading in telemetry")
+    return _known_to(fitted, WIDEST_SHARE * float(found.x[1]))
+
+
+def _lagged(wanted: NDArray[np.complex128] | Array, lag_s: float, begun: complex) -> Array:
+    """Return what follows a wanted value (m,) with a time constant [s], from `begun` on."""
+    left = math.exp(-STEP_S / lag_s)
+    start = np.array([begun], np.complex128)
+    return np.asarray(lfilter([0.0, 1.0 - left], [1.0, -left], wanted + 0j, zi=start)[0])
+
+
+def _best(
+    residuals: Callable[[Array], Array],
+    starts: list[tuple[float, float, float]],
+    high: tuple[float, float, float],
+    free: int = 3,
+) -> _Solution:
+    """Return the best least-squares solution of several starts; times are above zero.
+
+    Parameters from number `free` on have no lower bound either.
+    """
+    low = [0.0, 0.01, 0.0]
+    low[free:] = [-math.inf] * (3 - free)
+    found = [
+        least_squares(
+            residuals, start, bounds=(low, high), diff_step=DIFFERENCES, x_scale=(0.1, 0.2, 0.1)
+        )
+        for start in starts
+    ]
+    best = min(found, key=lambda each: float(each.cost))
+    return _Solution(np.asarray(best.x), np.asarray(best.fun), np.asarray(best.jac))
+
+
+def _with_interval(known: Estimate, value: float, ends: Array, source: str) -> Estimate:
+    return replace(
+        known,
+        value=value,
+        low=value + float(ends[0]),
+        high=value + float(ends[1]),
+        source=source,
+    )
+
+
+def _known_to(estimate: Estimate, widest: float) -> Estimate:
+    """Return an estimate, or that it is not observable where its interval is too wide."""
+    half = estimate.half_width
+    if half is not None and half <= widest:
+        return estimate
+    known = "not at all" if half is None or not math.isfinite(half) else f"to {half:.3f} s"
+    why = f"known {known}; {widest:.3f} s or better is needed"
+    return replace(estimate, value=None, low=None, high=None, unobservable=why)

@@ -1,0 +1,1 @@
+"""The flight controller's own log (PX4's .ulg) beside a companion's recording."""

@@ -1,0 +1,248 @@
+"""The clocks of a companion and a flight controller, by what both have recorded of one flight.
+
+Down: velocity and attitude that telemetry told are those of the log, later. The shift at which both
+agree best is the offset of the clocks plus the age of what was told: the time on the link, and that
+of the newest message. Up: a setpoint appears in the log between two samples, so each one that was
+sent bounds the offset and the time that it took; the shift that the most of these bounds contain is
+taken, as by Marzullo's algorithm (K. Marzullo, Maintaining the time in a distributed system, 1984).
+
+Neither alone tells the offset from the time on the link. Their sum is free of the offset: the round
+trip, from a setpoint that is sent to telemetry that could tell of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+from scipy.signal import correlate, correlation_lags
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.vehicle_log.ulog import Series, VehicleLog
+
+GRID_US = 40_000
+"""Step of the search over all shifts [µs]: the rate of the companion's recording."""
+
+FINE_US = 100_000
+"""The shift is refined so far around the best one of the search [µs]."""
+
+LEAST_CORRELATION = 0.8
+"""Velocities that agree less at their best shift are of different flights."""
+
+LEAST_SPEED_M_S = 0.5
+"""A flight that never gets faster cannot be told from its noise [m/s]."""
+
+LEAST_SETPOINTS = 3
+"""Fewer setpoints that both have do not tell how long they took."""
+
+SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
+"""Setpoints are the same when their speed and yaw rate differ by less: a heading turns neither."""
+
+LONGEST_LINK_US = US_PER_S
+"""Longest time that a setpoint takes [µs]."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the clocks of a recording and of a log of the same flight relate."""
+
+    told_us: float
+    """Companion's time at which something is told, less the flight controller's time of it [µs]."""
+    correlation: float
+    """Of the velocities at that shift, 0 to 1."""
+    error_m_s: float
+    """Root mean square difference of the velocities at that shift [m/s]."""
+    accepted_us: float | None
+    """Flight controller's time at which a setpoint is taken, less the companion's time of sending
+    it [µs]; None: too few setpoints were seen in the log."""
+    accepted_range_us: tuple[float, float] | None
+    """The bounds of it that the most setpoints agree on [µs]."""
+    setpoints: int
+    """So many agree on it."""
+
+    @property
+    def round_trip_us(self) -> float | None:
+        """From sending a setpoint to being told what it could have changed [µs].
+
+        Both ways on the link and the age of the telemetry, without the vehicle's own time.
+        """
+        return None if self.accepted_us is None else self.told_us + self.accepted_us
+
+
+def align(
+    path: Trajectory,
+    log: VehicleLog,
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+) -> Alignment:
+    """Return how the clocks of a recorded flight and of its vehicle's log relate.
+
+    Args:
+        path: What telemetry told, by the companion's clock.
+        log: The flight controller's.
+        sent_us: (k,) when the companion sent setpoints [µs].
+        setpoints: (k, 4) forward, right, down [m/s], yaw rate [rad/s].
+
+    Raises:
+        UsageError: The log is of another flight, or nothing moved.
+    """
+    told_us = _refined(path, log, _coarse(path, log))
+    flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
+    inside = _inside(path, log, told_us)
+    error = flown[inside] - logged[inside]
+    correlation = _correlation(flown[inside], logged[inside])
+    if correlation < LEAST_CORRELATION:
+        raise UsageError(
+            f"{log.path}: its velocities agree with those of the recording by {correlation:.2f} at "
+            f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
+        )
+    low_us, high_us, count = _accepted(sent_us, setpoints, log, told_us)
+    known = count >= LEAST_SETPOINTS
+    return Alignment(
+        told_us=told_us,
+        correlation=correlation,
+        error_m_s=float(np.sqrt(np.mean(np.sum(error**2, axis=1)))),
+        accepted_us=0.5 * (low_us + high_us) if known else None,
+        accepted_range_us=(low_us, high_us) if known else None,
+        setpoints=count,
+    )
+
+
+def _coarse(path: Trajectory, log: VehicleLog) -> float:
+    """Return the shift [µs], to a step of the grid, at which the velocities correlate best."""
+    times = [
+        np.arange(int(each[0]), int(each[-1]), GRID_US)
+        for each in (path.time_us, log.motion.time_us)
+    ]
+    told = np.stack([np.interp(times[0], path.time_us, each) for each in path.velocity.T])
+    logged = log.motion.at(times[1])[:, 3:].T
+    if min(len(each) for each in times) < 2 or np.abs(told).max() < LEAST_SPEED_M_S:
+        raise UsageError(
+            f"{log.path}: the clocks cannot be aligned; accepted: a flight with motion of "
+            f"{LEAST_SPEED_M_S:g} m/s or more"
+        )
+    score = sum(correlate(a, b) for a, b in zip(told, logged, strict=True))
+    lag = correlation_lags(len(times[0]), len(times[1]))[int(np.argmax(score))]
+    return float(times[0][0] - times[1][0] + lag * GRID_US)
+
+
+def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
+    """Return the shift [µs] at which attitude and velocity agree best, near a coarse one.
+
+    Each difference counts by how much the quantity changes in the flight.
+    """
+
+    def cost(shift_us: float) -> float:
+        inside = _inside(path, log, shift_us)
+        times = path.time_us[inside] - shift_us
+        leaning = _down_and_nose(path.quaternion[inside])
+        logged = _down_and_nose(log.attitude.at(times))
+        moved = path.velocity[inside] - log.motion.at(times)[:, 3:]
+        turned = (leaning - logged) / max(float(leaning.std()), 1e-3)
+        return float(np.mean(turned**2) + np.mean((moved / path.velocity[inside].std()) ** 2))
+
+    bounds = (coarse_us - FINE_US, coarse_us + FINE_US)
+    return float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 50.0}).x)
+
+
+def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where the body's down axis points, level, and its nose: (n, 4), without signs' jumps.
+
+    Interpolated quaternions may jump between q and -q; these products of two do not, where the
+    samples are dense against the turn.
+    """
+    w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            2.0 * (x * z + w * y),
+            2.0 * (y * z - w * x),
+            1.0 - 2.0 * (y * y + z * z),
+            2.0 * (x * y + w * z),
+        ],
+        axis=1,
+    )
+
+
+def _inside(path: Trajectory, log: VehicleLog, shift_us: float) -> NDArray[np.bool_]:
+    """Return which samples (n,) the log has, too."""
+    times = path.time_us - shift_us
+    first = max(log.motion.time_us[0], log.attitude.time_us[0])
+    last = min(log.motion.time_us[-1], log.attitude.time_us[-1])
+    inside: NDArray[np.bool_] = (times >= first) & (times <= last)
+    if not inside.any():
+        raise UsageError(f"{log.path}: accepted: the log of the same flight")
+    return inside
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    power = float(np.sum(a * a) * np.sum(b * b))
+    return float(np.sum(a * b) / np.sqrt(power)) if power > 0.0 else 0.0
+
+
+def _accepted(
+    sent_us: NDArray[np.int64],
+    setpoints: NDArray[np.float64],
+    log: VehicleLog,
+    told_us: float,
+) -> tuple[float, float, int]:
+    """Return the bounds [µs] of a setpoint's way, and how many of them agree."""
+    level = log.setpoint.values
+    # The heading turns neither speed nor yaw rate, so both are the same at both ends.
+    sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
+    seen = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
+    near = np.array([SAME_SPEED_M_S, SAME_RATE_RAD_S])
+    expected_us = np.asarray(sent_us - told_us, np.float64)
+    bounds = [
+        *_bounds(expected_us, sent, Series(log.setpoint.time_us, seen), near),
+        *_bounds(expected_us, sent[:, 1:], log.yaw_rate_setpoint, near[1:]),
+    ]
+    if not bounds:
+        return 0.0, 0.0, 0
+    low_us, high_us, count = marzullo(np.array(bounds, np.float64))
+    return low_us - told_us, high_us - told_us, count
+
+
+def _bounds(
+    expected_us: NDArray[np.float64],
+    sent: NDArray[np.float64],
+    seen: Series,
+    near: NDArray[np.float64],
+) -> list[tuple[float, float]]:
+    """Return between which times after the expected one each setpoint appears in the log [µs].
+
+    Args:
+        expected_us: (k,) when each would be there if it took no time, and telemetry none either.
+        sent: (k, m) what was sent.
+        seen: What was tracked, (n, m).
+        near: (m,) values that differ by less are the same.
+    """
+    bounds = []
+    for k in range(1, len(sent)):
+        if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():
+            continue  # The log shows no change.
+        window = slice(
+            int(np.searchsorted(seen.time_us, expected_us[k] - FINE_US)),
+            int(np.searchsorted(seen.time_us, expected_us[k] + LONGEST_LINK_US)),
+        )
+        same = (np.abs(seen.values[window] - sent[k]) < near).all(axis=1)
+        first = int(np.argmax(same)) if same.any() else 0
+        if first > 0:
+            times = seen.time_us[window][first - 1 : first + 1] - expected_us[k]
+            bounds.append((float(times[0]), float(times[1])))
+    return bounds
+
+
+def marzullo(bounds: NDArray[np.float64]) -> tuple[float, float, int]:
+    """Return the range that the most of some ranges (n, 2) contain, and how many do."""
+    edges = [(low, -1) for low in bounds[:, 0]] + [(high, 1) for high in bounds[:, 1]]
+    edges.sort()
+    open_now, best, found = 0, 0, (0.0, 0.0)
+    for i, (at, kind) in enumerate(edges):
+        open_now -= kind
+        if kind == -1 and open_now > best:
+            best, found = open_now, (float(at), float(edges[i + 1][0]))
+    return found[0], found[1], best

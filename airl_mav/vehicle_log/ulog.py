@@ -1,0 +1,174 @@
+"""Reading PX4's log of a flight, as far as a companion's recording lacks it.
+
+Topics and fields are those of PX4 1.14 to 1.16. Times are the flight controller's, from its boot
+[µs]; the world is NED, the body FRD.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+
+from airl_mav.core.errors import UsageError
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+MOTORS = 4
+"""Vehicles here have four."""
+
+_TOPICS = (
+    "actuator_motors",
+    "battery_status",
+    "sensor_combined",
+    "trajectory_setpoint",
+    "vehicle_acceleration",
+    "vehicle_attitude",
+    "vehicle_attitude_setpoint",
+    "vehicle_local_position",
+    "vehicle_local_position_setpoint",
+    "wind",
+)
+
+_BROKEN = (
+    EOFError,
+    IndexError,
+    KeyError,
+    TypeError,
+    UnicodeDecodeError,
+    ValueError,
+    struct.error,
+    ULogException,
+)
+"""What pyulog raises for a file that is none, or is damaged."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """n samples of one topic."""
+
+    time_us: Times
+    """(n,) increasing [µs]."""
+    values: Floats
+    """(n, k)."""
+
+    def __len__(self) -> int:
+        """Return n."""
+        return len(self.time_us)
+
+    def at(self, times_us: NDArray[Any]) -> Floats:
+        """Return the values (m, k) at times (m,) [µs], linear between samples."""
+        columns = [np.interp(times_us, self.time_us, column) for column in self.values.T]
+        return np.stack(columns, axis=1)
+
+    def between(self, start_us: float, end_us: float) -> Series:
+        """Return the samples from `start_us` to `end_us` [µs]."""
+        inside = (self.time_us >= start_us) & (self.time_us <= end_us)
+        return Series(self.time_us[inside], self.values[inside])
+
+
+def empty(width: int) -> Series:
+    """Return a topic that was not logged."""
+    return Series(np.zeros(0, np.int64), np.zeros((0, width)))
+
+
+@dataclass(frozen=True)
+class VehicleLog:
+    """What a flight controller logged of a flight; topics that it did not log are empty."""
+
+    path: Path
+    attitude: Series
+    """w, x, y, z, body to world."""
+    motion: Series
+    """Estimated north, east, down [m], then the velocities [m/s]."""
+    motors: Series
+    """Commands of the four motors, 0 to 1."""
+    specific_force: Series
+    """Forward, right, down [m/s²]; without the bias that the estimator knows of."""
+    raw_specific_force: Series
+    """The same as measured, with its bias."""
+    setpoint: Series
+    """Velocity that is tracked, north, east, down [m/s], and yaw rate [rad/s]."""
+    yaw_rate_setpoint: Series
+    """Yaw rate that is tracked [rad/s]; logged more often than `setpoint`."""
+    battery: Series
+    """Voltage [V], current [A], charge that is left 1 to 0."""
+    wind: Series
+    """Wind towards north, east, as the estimator believes [m/s]."""
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    """As they were when the log began."""
+
+
+def read_vehicle_log(path: Path) -> VehicleLog:
+    """Read a .ulg.
+
+    Raises:
+        UsageError: It cannot be read, is no ULog, or holds neither attitude nor velocity.
+    """
+    accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
+    try:
+        with path.open("rb") as file:
+            read = ULog(file, list(_TOPICS))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except _BROKEN:
+        raise UsageError(f"{path}: accepted: {accepted}") from None
+    topics = {each.name: each.data for each in reversed(read.data_list) if each.multi_id == 0}
+    attitude = _series(topics, "vehicle_attitude", _numbered("q", 4))
+    motion = _series(topics, "vehicle_local_position", ("x", "y", "z", "vx", "vy", "vz"))
+    if len(attitude) < 2 or len(motion) < 2:
+        raise UsageError(f"{path}: accepted: {accepted}")
+    return VehicleLog(
+        path=path,
+        attitude=_known(attitude),
+        motion=_known(motion),
+        motors=_known(_series(topics, "actuator_motors", _numbered("control", MOTORS))),
+        specific_force=_known(_series(topics, "vehicle_acceleration", _numbered("xyz", 3))),
+        raw_specific_force=_known(
+            _series(topics, "sensor_combined", _numbered("accelerometer_m_s2", 3))
+        ),
+        setpoint=_setpoint(topics),
+        yaw_rate_setpoint=_known(
+            _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))
+        ),
+        battery=_series(topics, "battery_status", ("voltage_v", "current_a", "remaining")),
+        wind=_known(_series(topics, "wind", ("windspeed_north", "windspeed_east"))),
+        parameters={name: float(value) for name, value in read.initial_parameters.items()},
+    )
+
+
+def _setpoint(topics: Mapping[str, Any]) -> Series:
+    """Return what was tracked, from the topic that has more samples of it."""
+    local = _series(topics, "vehicle_local_position_setpoint", ("vx", "vy", "vz", "yawspeed"))
+    trajectory = _series(topics, "trajectory_setpoint", (*_numbered("velocity", 3), "yawspeed"))
+    return max(local, trajectory, key=len)
+
+
+def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Series:
+    """Return fields of a topic; empty where it, or one of them, was not logged."""
+    data = topics.get(topic)
+    if data is None or any(name not in data for name in fields):
+        return empty(len(fields))
+    # What was estimated or felt is that of its sample, which was published later.
+    times = np.asarray(data.get("timestamp_sample", data["timestamp"]), np.int64)
+    later = np.diff(times, prepend=-1) > 0
+    values = np.stack([np.asarray(data[name], np.float64) for name in fields], axis=1)
+    return Series(times[later], values[later])
+
+
+def _known(series: Series) -> Series:
+    """Return the samples that are numbers: motors that stand still are NaN."""
+    there = np.isfinite(series.values).all(axis=1)
+    return Series(series.time_us[there], series.values[there])
+
+
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))

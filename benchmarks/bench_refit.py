@@ -1,0 +1,83 @@
+"""How near a refit comes to the truth, on flights whose truth is known.
+
+    .venv/bin/python benchmarks/bench_refit.py [--flights 20] [--keep FOLDER]
+
+Flies aircraft in lockstep whose mass, thrust, drag, link, latency and wind are not those of the
+profile, recorded by the companion's black box and the vehicle's log, refits each from both and from
+the black box alone, and prints the errors. 20 flights take about two minutes.
+
+The true dead time is that of the same model on the simulator's own path, from when the flight
+controller took each setpoint: what no recording knows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from airl_mav.refitting.refit import Refit, refit
+from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s
+
+ASKED = {"dead_s": 0.008, "mass": 0.03, "wind_m_s": 0.5, "t2": 0.02}
+"""Errors that are asked for."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--keep", type=Path, help="keep the recordings in this folder")
+    asked = parser.parse_args()
+    rows: dict[str, list[RefitErrors]] = {"with the vehicle's log": [], "black box alone": []}
+    print("seed  log  dead ms  lag %  mass %  drag %  wind m/s  t2 %")
+    with tempfile.TemporaryDirectory() as scratch:
+        for seed in range(1, asked.flights + 1):
+            truth = drawn_truth(seed)
+            folder = (asked.keep or Path(scratch)) / f"{seed:03d}"
+            flight = truth.fly(folder)
+            true_s = true_dead_time_s(flight)
+            for title, ulg in zip(rows, (flight.ulg, None), strict=True):
+                found: Refit = refit(flight.black_box, ulg=ulg)
+                errors = errors_of(found, truth, true_s, flight)
+                rows[title].append(errors)
+                print(f"{seed:4d}  {'ulg' if ulg else '-':4s}{_row(errors)}  {flight.reason}")
+    for title, errors_of_all in rows.items():
+        print(f"\n{title}:")
+        for name, bound in ASKED.items():
+            _summary(name, bound, errors_of_all)
+
+
+def _row(errors: RefitErrors) -> str:
+    def cell(value: float | None, width: int, scale: float, digits: int) -> str:
+        return f"{'-':>{width}s}" if value is None else f"{scale * value:{width}.{digits}f}"
+
+    return "".join(
+        (
+            cell(errors.dead_s, 8, 1e3, 1),
+            cell(errors.lag, 7, 100.0, 1),
+            cell(errors.mass, 8, 100.0, 2),
+            cell(errors.drag, 8, 100.0, 1),
+            cell(errors.wind_m_s, 10, 1.0, 2),
+            cell(errors.t2, 7, 100.0, 2),
+        )
+    )
+
+
+def _summary(name: str, bound: float, rows: list[RefitErrors]) -> None:
+    known = [(getattr(row, name), row.inside.get(name)) for row in rows]
+    values = np.abs([value for value, _ in known if value is not None])
+    inside = [within for value, within in known if value is not None and within is not None]
+    if not len(values):
+        print(f"  {name}: observed in no flight")
+        return
+    print(
+        f"  {name}: observed in {len(values)} of {len(rows)}; error median {np.median(values):.4f},"
+        f" greatest {values.max():.4f}; within {bound:g} in {int((values <= bound).sum())};"
+        f" 95 % interval holds the truth in {sum(inside)} of {len(inside)}"
+    )
+
+
+if __name__ == "__main__":
+    main()

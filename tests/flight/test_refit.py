@@ -1,0 +1,173 @@
+"""A vehicle that is not as its profile says flies in wind and late: what a refit makes of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from airl_mav.black_box.reading import read_black_box
+from airl_mav.cli.main import main
+from airl_mav.cli.refit import RefitOptions
+from airl_mav.cli.refit import run as airl_refit
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.latency.source import parse_latency
+from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.refitting.flown import flown_of
+from airl_mav.refitting.refit import Refit, refit
+from airl_mav.scenario.file import read_scenario_file
+from airl_mav.scenario.model import Scenario
+from airl_mav.vehicle_log.alignment import align
+from airl_mav.vehicle_log.ulog import Series, VehicleLog, read_vehicle_log
+from tests.support.recorded_flights import RecordedFlight
+from tests.support.refit_truths import Truth, drawn_truth, errors_of, true_dead_time_s, uplink_s
+
+TRUTH = drawn_truth(6)
+"""Late link, much drag, some wind: all that is asked for shows in one flight."""
+
+OTHER = replace(drawn_truth(10), gust_m_s=0.0)
+
+
+@dataclass
+class Refitted:
+    """A flight, and its refit with both logs."""
+
+    truth: Truth
+    flight: RecordedFlight
+    out: Path
+    found: Refit
+
+
+@pytest.fixture(scope="module")
+def refitted(tmp_path_factory: pytest.TempPathFactory) -> Refitted:
+    folder = tmp_path_factory.mktemp("refit")
+    flight = TRUTH.fly(folder / "flight")
+    assert flight.reason == "goal reached"
+    out = folder / "out"
+    return Refitted(TRUTH, flight, out, refit(flight.black_box, ulg=flight.ulg, out=out))
+
+
+@pytest.fixture(scope="module")
+def other(tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
+    return OTHER.fly(tmp_path_factory.mktemp("other") / "flight")
+
+
+def test_what_is_true_is_found(refitted: Refitted) -> None:
+    truth, flight = refitted.truth, refitted.flight
+    errors = errors_of(refitted.found, truth, true_dead_time_s(flight), flight)
+    assert errors.dead_s is not None and abs(errors.dead_s) < 0.008
+    assert errors.mass is not None and abs(errors.mass) < 0.03
+    assert errors.wind_m_s is not None and errors.wind_m_s < 0.5
+    assert errors.t2 is not None and abs(errors.t2) < 0.02
+    assert errors.drag is not None and abs(errors.drag) < 0.15
+    assert all(errors.inside.values()), errors.inside
+    # The way up, the age of the telemetry that the black box sampled, and a tick or two.
+    link_ms = refitted.found.estimate("link_ms").value
+    assert link_ms == pytest.approx(1e3 * uplink_s(flight) + 8.0, abs=10.0)
+
+
+def test_what_is_written_loads_as_it_is(refitted: Refitted) -> None:
+    out, found = refitted.out, refitted.found
+    text = (out / "vehicle.toml").read_text(encoding="utf-8")
+    assert "# 95 %: " in text and 'base = "quad"' in text
+    vehicle = load_vehicle(str(out / "vehicle.toml"))
+    assert vehicle.body.mass_kg == found.vehicle.body.mass_kg
+    assert vehicle.response == found.vehicle.response
+    computer = load_computer(str(out / "computer.toml"))
+    samples = computer.workloads["flown"].latency.samples_ms
+    assert samples == pytest.approx(found.latencies.samples_ms, abs=1e-3)
+    assert "measured in flight" in computer.workloads["flown"].source
+    injection = parse_latency(str(out / "latency.txt"))
+    assert injection.latency is not None and injection.latency.samples_ms == samples
+    scenario = Scenario(**read_scenario_file(out / "scenario.toml"), level="lockstep")
+    assert scenario.wind.north_m_s == found.estimate("wind_north_m_s").value
+    told = json.loads((out / "refit.json").read_text(encoding="utf-8"))
+    assert told["estimates"]["mass_kg"]["value"] == found.estimate("mass_kg").value
+    with pytest.raises(FieldError, match="a new or empty folder"):
+        refit(refitted.flight.black_box, out=out)
+
+
+def test_only_their_ratio_is_observable_so_the_profile_says_which(refitted: Refitted) -> None:
+    flight, truth = refitted.flight, refitted.truth
+    found = refit(flight.black_box, ulg=flight.ulg, known="mass")
+    thrust_n = found.estimate("thrust_max_n").value
+    assert thrust_n == pytest.approx(7.07 * truth.thrust / truth.mass, rel=0.03)
+    assert found.estimate("mass_kg").unobservable.startswith("only thrust per mass is observable")
+    assert found.vehicle.body.mass_kg == load_vehicle("quad").body.mass_kg
+
+
+def test_the_black_box_alone_tells_what_it_can(refitted: Refitted) -> None:
+    found = refit(refitted.flight.black_box)
+    assert "give the vehicle's log" in found.estimate("mass_kg").unobservable
+    assert "give the vehicle's log" in found.estimate("link_ms").unobservable
+    both = refitted.found
+    assert found.air.wind == both.air.wind
+    alone, with_log = (each.estimate("dead_time_s").value for each in (found, both))
+    assert alone is not None and with_log is not None
+    # Alone, the link's time is a part of it.
+    assert alone - with_log == pytest.approx(uplink_s(refitted.flight), abs=0.015)
+
+
+@pytest.mark.parametrize("shift_us", [-3_000_000, 123_456, 7_200_000_000])
+def test_clocks_are_aligned_wherever_they_began(refitted: Refitted, shift_us: int) -> None:
+    log = read_vehicle_log(refitted.flight.ulg)
+    flown = flown_of(read_black_box(refitted.flight.black_box), log)
+    there = align(flown.path, log, flown.sent_us, flown.setpoints)
+    moved = align(flown.path, shifted(log, shift_us), flown.sent_us, flown.setpoints)
+    assert moved.told_us == pytest.approx(there.told_us - shift_us, abs=500.0)
+    assert moved.round_trip_us == pytest.approx(there.round_trip_us, abs=1000.0)
+    assert there.round_trip_us is not None and there.correlation > 0.99
+
+
+def shifted(log: VehicleLog, shift_us: int) -> VehicleLog:
+    held: dict[str, Any] = vars(log)
+    for name, series in held.items():
+        if isinstance(series, Series):
+            later = Series(series.time_us + shift_us, series.values)
+            held = {**held, name: later}
+    return VehicleLog(**held)
+
+
+def test_the_log_of_another_flight_is_refused(refitted: Refitted, other: RecordedFlight) -> None:
+    with pytest.raises(UsageError, match="accepted: the log of the same flight"):
+        refit(refitted.flight.black_box, ulg=other.ulg)
+
+
+def test_the_command_prints_what_was_found_and_what_was_not(
+    other: RecordedFlight, tmp_path: Path
+) -> None:
+    console = Console(file=StringIO(), record=True, width=140)
+    options = RefitOptions(flight=other.black_box, out=tmp_path / "out")
+    assert airl_refit(options, console) == 0
+    text = console.export_text()
+    assert "time constant of the velocity" in text
+    assert "not observable in this flight: take-off mass: a black box holds no motor" in text
+    assert (tmp_path / "out" / "vehicle.toml").exists()
+
+
+def test_the_command_refuses_what_is_no_black_box(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"nothing")
+    with pytest.raises(SystemExit) as ended:
+        main(["refit", str(tmp_path / "x.mcap"), "--out", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    assert "accepted: a black box of airl-companion" in capsys.readouterr().err
+
+
+def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
+    again = refit(refitted.flight.black_box, ulg=refitted.flight.ulg)
+    assert [each.value for each in again.estimates] == [
+        each.value for each in refitted.found.estimates
+    ]
+    assert np.array_equal(
+        [each.low or 0.0 for each in again.estimates],
+        [each.low or 0.0 for each in refitted.found.estimates],
+    )

@@ -1,0 +1,186 @@
+"""The parts of a refit, against closed forms and simulations of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from airl_mav.black_box.reading import BlackBox
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.refitting.air import fit_air
+from airl_mav.refitting.estimate import block_intervals, mean_interval
+from airl_mav.refitting.flown import Flown
+from airl_mav.refitting.overrides import Override, refitted
+from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
+from airl_mav.vehicle_log.alignment import marzullo
+from airl_mav.vehicle_log.ulog import read_vehicle_log
+
+QUAD = load_vehicle("quad")
+STILL = np.zeros(0, np.int64)
+
+
+# --- intervals
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say_when_noise_lasts() -> None:
+    """A line through noise that depends on its neighbours, 150 times: 95 % +- three deviations."""
+    rng = np.random.default_rng(1)
+    times = np.arange(500) / 25.0
+    design = np.stack([np.ones_like(times), np.sin(times)], axis=1)
+    inside = 0
+    for _ in range(150):
+        noise = np.zeros(len(times))
+        white = rng.standard_normal(len(times))
+        for k in range(1, len(times)):
+            noise[k] = 0.8 * noise[k - 1] + white[k]
+        found = np.linalg.lstsq(design, design @ (1.0, 2.0) + noise, rcond=None)[0]
+        residuals = design @ found - (design @ (1.0, 2.0) + noise)
+        low, high = block_intervals(design, residuals, times, rng) + found
+        inside += int(low[1] <= 2.0 <= high[1])
+    assert 0.90 <= inside / 150 <= 0.99
+
+
+def test_the_interval_of_a_mean_is_students_where_samples_are_independent() -> None:
+    rng = np.random.default_rng(2)
+    values = rng.normal(3.0, 1.0, 1000)
+    low, high = mean_interval(values, np.arange(1000) / 25.0, rng)
+    assert low < values.mean() < high
+    # 40 blocks: t of 39 degrees of freedom is 3 % wider than the normal distribution's.
+    assert high - low == pytest.approx(2 * 2.02 / np.sqrt(1000), rel=0.25)
+
+
+def test_marzullo_finds_what_most_ranges_hold() -> None:
+    # The example of Marzullo's algorithm in Wikipedia: 8-12, 11-13, 14-15 give 11-12.
+    ranges = np.array([[8.0, 12.0], [11.0, 13.0], [14.0, 15.0]])
+    assert marzullo(ranges) == (11.0, 12.0, 2)
+    assert marzullo(ranges[:1]) == (8.0, 12.0, 1)
+
+
+# --- a flight that is made up
+
+
+def flown(path: Trajectory, sent_us: np.ndarray, setpoints: np.ndarray) -> Flown:
+    ended_us = int(path.time_us[-1])
+    stamps = {"sent_us": sent_us.astype(np.int64)}
+    return Flown(
+        BlackBox(Path("made-up.mcap"), {}), path, stamps, setpoints, 0, ended_us, (0, ended_us)
+    )
+
+
+def path_of(times: np.ndarray, velocity: np.ndarray, quaternion: np.ndarray) -> Trajectory:
+    time_us = np.round(times * US_PER_S).astype(np.int64)
+    return Trajectory(time_us, np.zeros_like(velocity), velocity, quaternion, np.zeros(len(times)))
+
+
+def in_wind(drag_1_s: float, wind: tuple[float, float], seconds: float = 20.0) -> Flown:
+    """A vehicle that leans as it likes, by the equations of motion alone (scipy's integrator)."""
+    nose = Rotation.from_euler("z", 0.7)
+
+    def attitude(t: float) -> Rotation:
+        lean = [0.15 * np.sin(1.1 * t), 0.2 * np.sin(0.8 * t + 1.0), 0.0]
+        return nose * Rotation.from_euler("xyz", lean)
+
+    def slope(t: float, velocity: np.ndarray) -> np.ndarray:
+        up = attitude(t).apply([0.0, 0.0, -1.0])
+        against = velocity - np.array([*wind, 0.0])
+        thrust = GRAVITY_M_S2 * (1.0 + 0.05 * np.sin(2.0 * t))
+        return np.array([0.0, 0.0, GRAVITY_M_S2]) + thrust * up - drag_1_s * against
+
+    times = np.arange(0.0, seconds, 0.04)
+    solved = solve_ivp(slope, (0.0, seconds), np.zeros(3), t_eval=times, rtol=1e-6, atol=1e-6)
+    turns = np.stack([attitude(t).as_quat(scalar_first=True) for t in times])
+    return flown(path_of(times, solved.y.T, turns), STILL, np.zeros((0, 4)))
+
+
+@pytest.mark.parametrize(("drag_1_s", "wind"), [(0.2, (3.0, -2.0)), (0.1, (0.0, 4.0))])
+def test_drag_and_wind_are_those_of_the_equations_of_motion(
+    drag_1_s: float, wind: tuple[float, float]
+) -> None:
+    air = fit_air(in_wind(drag_1_s, wind), QUAD, np.random.default_rng(0))
+    assert air.drag_1_s.value == pytest.approx(drag_1_s, rel=0.02)
+    assert air.wind == pytest.approx(wind, abs=0.1)
+
+
+def test_where_nothing_is_dragged_no_wind_is_claimed() -> None:
+    air = fit_air(in_wind(0.0, (3.0, 0.0)), QUAD, np.random.default_rng(0))
+    assert air.wind is None and air.drag_1_s.value is None
+    assert "the drag is too small" in air.drag_1_s.unobservable
+    short = fit_air(in_wind(0.2, (3.0, 0.0), seconds=1.5), QUAD, np.random.default_rng(0))
+    assert short.drag_1_s.unobservable == "the flight is too short"
+
+
+def stepped(dead_s: float, lag_s: float, turn_lag_s: float, noise_m_s: float) -> Flown:
+    """The closed form of a first-order lag behind steps, at 25 Hz, with a turning nose."""
+    rng = np.random.default_rng(4)
+    sent_s = np.arange(1.0, 12.0, 0.5)
+    setpoints = np.stack(
+        [rng.uniform(-4, 4, len(sent_s)), rng.uniform(-4, 4, len(sent_s)), 0.0 * sent_s,
+         rng.uniform(-1, 1, len(sent_s))], axis=1,
+    )  # fmt: skip
+    fine = np.arange(0.0, 12.5, 0.001)
+    at = np.searchsorted(sent_s + dead_s, fine, side="right") - 1
+    wanted = np.where(at[:, None] >= 0, setpoints[np.maximum(at, 0)], 0.0)
+    rate, heading, velocity = 0.0, 0.0, 0j
+    rows = np.zeros((len(fine), 3))
+    for k in range(len(fine)):
+        rows[k] = velocity.real, velocity.imag, heading
+        rate += 0.001 / turn_lag_s * (wanted[k, 3] - rate)
+        heading += 0.001 * rate
+        goal = (wanted[k, 0] + 1j * wanted[k, 1]) * np.exp(1j * heading)
+        velocity += 0.001 / lag_s * (goal - velocity)
+    told = rows[::40]
+    noisy = np.column_stack([told[:, :2] + noise_m_s * rng.standard_normal((len(told), 2)),
+                             np.zeros(len(told))])  # fmt: skip
+    turns = Rotation.from_euler("z", told[:, 2:]).as_quat(scalar_first=True)
+    path = path_of(fine[::40], noisy, turns)
+    return flown(path, np.round(sent_s * US_PER_S), setpoints)
+
+
+def test_the_response_is_that_of_the_model() -> None:
+    fit = fit_response(stepped(0.18, 0.45, 0.15, 0.05), QUAD.response, np.random.default_rng(0))
+    # Where no log is, the mean age of telemetry is taken off.
+    assert fit.dead_time_s.value == pytest.approx(0.18 - TELEMETRY_AGE_S, abs=0.005)
+    assert fit.velocity_time_s.value == pytest.approx(0.45, rel=0.02)
+    assert fit.yaw_rate_time_s.value == pytest.approx(0.15, rel=0.1)
+    assert "the link's time is in it" in fit.dead_time_s.source
+    table = fit.response(0.2, None)
+    assert table is not None and table.drag_1_s == 0.2
+
+
+def test_setpoints_that_do_not_change_tell_no_response() -> None:
+    steady = stepped(0.18, 0.45, 0.15, 0.05)
+    steady = replace(steady, setpoints=np.tile([2.0, 0.0, 0.0, 0.0], (len(steady.sent_us), 1)))
+    fit = fit_response(steady, QUAD.response, np.random.default_rng(0))
+    assert fit.dead_time_s.unobservable == "setpoints change by 0.00 m/s; 1 are needed"
+    assert QUAD.response is not None
+    assert fit.response(0.2, QUAD.response) == QUAD.response.model_copy(update={"drag_1_s": 0.2})
+    assert fit.response(0.2, None) is None
+
+
+# --- files
+
+
+def test_a_refitted_profile_that_could_not_hover_is_refused() -> None:
+    heavy = Override("body", "mass_kg", 3.0, "")
+    with pytest.raises(UsageError, match="cannot hover"):
+        refitted(QUAD, [heavy])
+    light = refitted(QUAD, [Override("body", "mass_kg", 1.2, "")])
+    assert isinstance(light, VehicleProfile) and light.body.mass_kg == 1.2
+
+
+@pytest.mark.parametrize("content", [b"", b"not a log at all", b"ULog\x01\x12\x35\x01" + bytes(40)])
+def test_what_is_no_log_is_refused_in_a_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "x.ulg"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match=r"x\.ulg: accepted: a ULog"):
+        read_vehicle_log(path)
+    with pytest.raises(UsageError, match="No such file"):
+        read_vehicle_log(tmp_path / "none.ulg")
