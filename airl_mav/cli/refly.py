@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import utc_now
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import show_comparison
+from airl_mav.report.table import NONE, Column, TableView, print_table
 from airl_mav.scenario.model import GREATEST_SEED
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.refitted_reflight import PartFlown
+    from airl_mav.experiments.refly import Changes
 
 
 class ReflyOptions(ProfileModel):
@@ -26,6 +34,7 @@ class ReflyOptions(ProfileModel):
     Examples:
         airl refly flights/20261123T172437.230467Z.mcap
         airl refly flights/20261123T172437.230467Z.mcap --arena yard.toml
+        airl refly flights/20261123T172437.230467Z.mcap --refit refit --parts
     """
 
     flight: Annotated[Path, POSITIONAL] = Field(description="black box of a flight (.mcap)")
@@ -49,6 +58,32 @@ class ReflyOptions(ProfileModel):
         description="policy to rehearse: a name, or a path; by default the one that flew, where it"
         " lay then",
     )
+    refit: Path | None = Field(
+        default=None,
+        description="folder of a refit (airl refit --out): its vehicle and its wind are rehearsed",
+    )
+    parts: bool = Field(
+        default=False,
+        description="with a refit: rehearse also with its latency, its vehicle and its wind alone,"
+        " and with nothing of it, on the same seeds: what explains the flight",
+    )
+    vehicle: str | None = Field(
+        default=None,
+        description="vehicle profile to rehearse: a shipped name, or a path to a .toml; by default"
+        " that of the refit, or the one that the flight names",
+    )
+    latency: str | None = Field(
+        default=None,
+        description="latency t2 to rehearse, as airl-sitl takes it; by default that of the flight,"
+        " decision by decision",
+    )
+    computer: str | None = Field(
+        default=None,
+        description="computer profile whose latency is rehearsed in the place of the flight's",
+    )
+    workload: str | None = Field(
+        default=None, description="workload of that computer profile, as airl-sitl takes it"
+    )
     trust: bool = Field(default=False, description="run code that the policy or the arena names")
     out: Path | None = Field(
         default=None,
@@ -64,23 +99,87 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
     """Rehearse the flight. Returns exit status 0; raises UsageError as `refly` does."""
     console = console or Console()
     check_installed("black-box", "sim")
+    _check(options)
     # Imported here: MCAP is an extra.
     from airl_mav.experiments.refly import FLOWN, REHEARSED, refly
 
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-refly"
-    found = refly(
-        options.flight,
-        out,
-        arena=options.arena,
-        arena_seed=options.arena_seed,
-        episodes=options.episodes,
-        policy=options.policy,
-        trust=options.trust,
-        progress=True,
-    )
+    flown: dict[str, Any] = {
+        "arena": options.arena,
+        "arena_seed": options.arena_seed,
+        "episodes": options.episodes,
+        "policy": options.policy,
+        "trust": options.trust,
+        "progress": True,
+    }
+    parts: tuple[PartFlown, ...] = ()
+    if options.parts and options.refit is not None:
+        check_installed("refit")
+        from airl_mav.experiments.refitted_reflight import refly_parts
+
+        found, parts = refly_parts(options.flight, out, options.refit, **flown)
+    else:
+        found = refly(options.flight, out, changes=_changes(options), **flown)
     comparison, runs = compare_folders([out / REHEARSED, out / FLOWN], (REHEARSED, FLOWN))
     show_comparison(comparison, runs, out, console)
     console.print()
     for sentence in found.sentences:
         console.print(sentence, markup=False)
+    if parts:
+        print_table(parts_table(parts, found.flown_s), console)
     return 0
+
+
+def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
+    """Return what the flight and its rehearsals differ by, with each part of a refit."""
+    columns = (
+        Column("rehearsed with", number=False),
+        Column("goal reached"),
+        Column("time, median", "s"),
+        Column("against the flight", "%"),
+        Column("path apart, median", "m"),
+    )
+    rows = tuple(
+        (
+            each.part,
+            f"{each.reached} of {each.rehearsals}",
+            NONE if each.time_s is None else f"{each.time_s:.2f}",
+            NONE if each.time_share is None else f"{100.0 * each.time_share:+.1f}",
+            f"{each.apart_m:.2f}",
+        )
+        for each in parts
+    )
+    return TableView("parts", f"the flight took {flown_s:.2f} s", columns, rows)
+
+
+def _check(options: ReflyOptions) -> None:
+    """Raise FieldError for options that do not go together."""
+    if options.parts and options.refit is None:
+        raise FieldError("parts", options.parts, "with --refit")
+    if options.workload is not None and options.computer is None:
+        raise FieldError("workload", options.workload, "with --computer")
+    if options.computer is not None and options.latency is not None:
+        raise FieldError("latency", options.latency, "without --computer")
+    if options.parts:
+        for name in ("vehicle", "latency", "computer"):
+            if (value := getattr(options, name)) is not None:
+                raise FieldError(name, value, "without --parts, which flies those of the refit")
+
+
+def _changes(options: ReflyOptions) -> Changes:
+    """Return what the rehearsals have otherwise than the flight's settings say."""
+    from airl_mav.experiments.refly import AS_FLOWN
+
+    changes = AS_FLOWN
+    if options.refit is not None:
+        check_installed("refit")
+        from airl_mav.experiments.refitted_reflight import changes_of
+
+        changes = changes_of(options.refit)
+    return replace(
+        changes,
+        vehicle=options.vehicle or changes.vehicle,
+        latency=options.latency,
+        computer=options.computer,
+        workload=options.workload,
+    )

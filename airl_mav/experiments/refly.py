@@ -24,6 +24,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, RunInfo
 from airl_mav.report.recorded_flight import episode_of, info_of, settings_of
 from airl_mav.scenario.model import Decisions, Scenario
@@ -44,6 +45,26 @@ SAME_GOAL_M = 1.0
 
 
 @dataclass(frozen=True)
+class Changes:
+    """What rehearsals of a flight have otherwise than the flight's own settings say."""
+
+    vehicle: str | None = None
+    """Vehicle profile, by name or path."""
+    wind: WindSettings | None = None
+    """In the flight's own directions; None: calm."""
+    latency: str | None = None
+    """As `Scenario.latency`; None: that of the flight, decision by decision."""
+    computer: str | None = None
+    """With a workload: where the latency is from, in the place of the flight's."""
+    workload: str | None = None
+    prompt: bool = False
+    """Whether nothing is injected: decisions take what a desktop computer takes."""
+
+
+AS_FLOWN = Changes()
+
+
+@dataclass(frozen=True)
 class Reflight:
     """What a flight did, and what its rehearsals did."""
 
@@ -57,6 +78,13 @@ class Reflight:
     apart_m: NDArray[np.float64]
     """(n,) horizontal distance of the points of the flown path from the nearest one of all
     rehearsed paths [m]."""
+    each_apart_m: tuple[float, ...] = ()
+    """The median of that from each rehearsed path by itself [m]."""
+
+    @property
+    def rehearsed_time_s(self) -> float | None:
+        """Median time of the rehearsals that reached the goal [s]; None: none did."""
+        return float(np.median(self.rehearsed_s)) if self.rehearsed_s else None
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -85,6 +113,7 @@ def refly(
     episodes: int = 20,
     policy: str | None = None,
     trust: bool = False,
+    changes: Changes = AS_FLOWN,
     progress: bool = False,
 ) -> Reflight:
     """Rehearse a recorded flight, several times.
@@ -105,6 +134,7 @@ def refly(
         episodes: Number of rehearsals, each with sensors of its own.
         policy: Policy to rehearse; None: the one that flew, by the name that it had then.
         trust: See `Scenario.trust`.
+        changes: What they have otherwise than the flight's settings say.
         progress: Whether to draw a bar on standard error.
 
     Raises:
@@ -120,7 +150,9 @@ def refly(
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
     out.mkdir(parents=True, exist_ok=True)
     _write_latencies(episode, out / LATENCIES_FILE)
+    wind = changes.wind
     if arena is None:
+        wind = None if wind is None else turned_wind(wind, -_first_yaw(episode))
         episode = from_its_start(episode)
         arena = _plain(episode, out / ARENA_FILE)
     flew = str(box.run["config"].get("policy"))
@@ -134,7 +166,7 @@ def refly(
         "trust": trust,
         "episodes": episodes,
     }
-    scenario = _scenario(box, out / LATENCIES_FILE, given)
+    scenario = _scenario(box, out / LATENCIES_FILE, given | _changed(changes, wind))
     _check_goal(scenario, episode)
     record = replace(
         episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
@@ -155,6 +187,7 @@ def refly(
         len(run.episodes),
         tuple(each.flight_time_s for each in successful(run.episodes)),
         np.min(paths, axis=0),
+        tuple(float(np.median(each)) for each in paths),
     )
 
 
@@ -164,11 +197,8 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
     Heights stay.
     """
     path, record = episode.trajectory, episode.record
-    before = int(np.searchsorted(path.time_us, record.navigation_us or 0, side="right")) - 1
-    begun = max(before, 0)
-    origin = path.position[begun] * (1.0, 1.0, 0.0)
-    yaw = quat_yaw(path.quaternion[begun])
-    turn = Rotation.from_euler("z", -yaw)
+    origin = path.position[_begun(episode)] * (1.0, 1.0, 0.0)
+    turn = Rotation.from_euler("z", -_first_yaw(episode))
     goal = turn.apply(np.array([*record.goal, 0.0]) - origin)
     attitude = turn * Rotation.from_quat(path.quaternion, scalar_first=True)
     moved = replace(
@@ -180,6 +210,38 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
     return replace(
         episode, trajectory=moved, record=replace(record, goal=(float(goal[0]), float(goal[1])))
     )
+
+
+def turned_wind(wind: WindSettings, angle_rad: float) -> WindSettings:
+    """Return a wind whose direction is turned by an angle about down [rad]."""
+    north, east = wind.north_m_s, wind.east_m_s
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    turned = {"north_m_s": cos * north - sin * east, "east_m_s": sin * north + cos * east}
+    return wind.model_copy(update=turned)
+
+
+def _begun(episode: FlownEpisode) -> int:
+    """Return the number of the newest sample when navigation began."""
+    navigation_us = episode.record.navigation_us or 0
+    before = int(np.searchsorted(episode.trajectory.time_us, navigation_us, side="right")) - 1
+    return max(before, 0)
+
+
+def _first_yaw(episode: FlownEpisode) -> float:
+    """Return the heading with which navigation began [rad]."""
+    return quat_yaw(episode.trajectory.quaternion[_begun(episode)])
+
+
+def _changed(changes: Changes, wind: WindSettings | None) -> dict[str, Any]:
+    """Return changes as fields of a scenario."""
+    late: dict[str, Any] = {}
+    if changes.prompt or changes.computer is not None:
+        late = {"latency": None}
+    named = {"latency": changes.latency, "computer": changes.computer, "vehicle": changes.vehicle}
+    if changes.computer is not None:
+        named["workload"] = changes.workload
+    given = {name: value for name, value in named.items() if value is not None}
+    return {**late, **given, **({} if wind is None else {"wind": wind})}
 
 
 def distances(flown: Trajectory, rehearsed: Trajectory) -> NDArray[np.float64]:

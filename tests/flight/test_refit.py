@@ -17,8 +17,19 @@ from airl_mav.cli.main import main
 from airl_mav.cli.refit import RefitOptions
 from airl_mav.cli.refit import run as airl_refit
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.experiments.refitted_reflight import (
+    ALL,
+    LATENCY,
+    NOTHING,
+    VEHICLE,
+    WIND,
+    refly_parts,
+)
+from airl_mav.experiments.refly import turned_wind
+from airl_mav.experiments.run import load_run
 from airl_mav.latency.source import parse_latency
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.flown import flown_of
 from airl_mav.refitting.refit import Refit, refit
@@ -171,3 +182,55 @@ def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
         [each.low or 0.0 for each in again.estimates],
         [each.low or 0.0 for each in refitted.found.estimates],
     )
+
+
+# --- rehearsed on what was fitted
+
+
+@pytest.mark.slow
+def test_rehearsed_on_what_was_fitted_it_is_the_flight(refitted: Refitted, tmp_path: Path) -> None:
+    """Once each: with all of the refit, with its parts, and with nothing of it."""
+    path, out = refitted.flight.black_box, tmp_path / "out"
+    whole, parts = refly_parts(path, out, refitted.out, arena="static-obstacles", episodes=1)
+    by_name = {each.part: each for each in parts}
+    assert set(by_name) == {NOTHING, LATENCY, VEHICLE, WIND, ALL}
+    everything, nothing = by_name[ALL], by_name[NOTHING]
+    assert everything.reached == 1 and everything.apart_m < 0.5
+    assert everything.time_share is not None and nothing.time_share is not None
+    assert abs(everything.time_share) < 0.03 < abs(nothing.time_share)
+    assert whole.rehearsed_time_s == everything.time_s
+    told = json.loads((out / "parts.json").read_text(encoding="utf-8"))
+    assert [each["part"] for each in told["parts"]] == list(by_name)
+    # The seeds are the same, the vehicle and the wind are not.
+    runs = {part: load_run(out / "parts" / part / "rehearsed") for part in (NOTHING, VEHICLE)}
+    assert runs[NOTHING].info.seeds == runs[VEHICLE].info.seeds
+    flown_as = {part: run.info.config["vehicle_body"]["mass_kg"] for part, run in runs.items()}
+    assert flown_as[VEHICLE] == refitted.found.vehicle.body.mass_kg != flown_as[NOTHING]
+    wind = load_run(out / "rehearsed").info.config["wind"]
+    assert wind["north_m_s"] == refitted.found.estimate("wind_north_m_s").value
+
+
+def test_the_wind_turns_with_the_flight() -> None:
+    """A quarter turn to the right makes a wind towards north one towards east."""
+    turned = turned_wind(WindSettings(north_m_s=3.0, east_m_s=1.0, gust_m_s=0.5), np.pi / 2)
+    assert (turned.north_m_s, turned.east_m_s) == pytest.approx((-1.0, 3.0))
+    assert turned.gust_m_s == 0.5
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--parts"], "--parts True: accepted: with --refit"),
+        (["--workload", "flown"], "accepted: with --computer"),
+        (["--computer", "ras-pi-4", "--latency", "20ms"], "accepted: without --computer"),
+        (["--parts", "--refit", "x", "--vehicle", "quad"], "accepted: without --parts"),
+        (["--refit", "nowhere"], "no refit of a flight here"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["refly", str(tmp_path / "x.mcap"), *words])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err

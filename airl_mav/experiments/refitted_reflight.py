@@ -1,0 +1,153 @@
+"""A recorded flight, rehearsed on what was fitted to it, as a whole and part by part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, TypeAdapter
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import read_typed, write_json
+from airl_mav.experiments.refly import Changes, Reflight, refly
+from airl_mav.profiles.conditions import WindSettings
+from airl_mav.refitting.files import REFIT_FILE, VEHICLE_FILE
+from airl_mav.refitting.refit import SCHEMA
+
+PARTS_FOLDER, PARTS_FILE = "parts", "parts.json"
+"""Of the rehearsals with one part each, and of what came of them."""
+
+NOTHING, LATENCY, VEHICLE, WIND, ALL = "nothing", "latency", "vehicle", "wind", "all"
+"""What of a refit a rehearsal has; `nothing`: the profile in calm air, decided at once."""
+
+PARTS_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class _Wind:
+    """As `refit.json` has it."""
+
+    north_m_s: Annotated[float, Field(ge=-50, le=50)]
+    east_m_s: Annotated[float, Field(ge=-50, le=50)]
+
+
+@dataclass(frozen=True)
+class _Refit:
+    """What of `refit.json` a rehearsal needs."""
+
+    vehicle: str
+    wind: _Wind | None
+
+
+@dataclass(frozen=True)
+class PartFlown:
+    """Rehearsals with a part of a refit, beside the flight."""
+
+    part: str
+    rehearsals: int
+    reached: int
+    """So many came to the goal."""
+    time_s: float | None
+    """Their median time [s]; None: none came."""
+    time_share: float | None
+    """How far that is from the flight's, as a share of it."""
+    apart_m: float
+    """Median distance of the flown path from a rehearsed one [m], median of the rehearsals."""
+
+
+def changes_of(folder: Path) -> Changes:
+    """Return what rehearsals have by a refit. Raises UsageError where the folder holds none."""
+    told = _read(folder)
+    wind = None if told.wind is None else WindSettings(**vars(told.wind))
+    return Changes(vehicle=str(folder / VEHICLE_FILE), wind=wind)
+
+
+def refly_parts(
+    path: Path,
+    out: Path,
+    folder: Path,
+    *,
+    arena: str | None = None,
+    arena_seed: int | None = None,
+    episodes: int = 20,
+    policy: str | None = None,
+    trust: bool = False,
+    progress: bool = False,
+) -> tuple[Reflight, tuple[PartFlown, ...]]:
+    """Rehearse a recorded flight with all of a refit, with each part of it, and with nothing.
+
+    All fly the same seeds. What a part alone takes of the difference to the flight is what that
+    part explains; the parts need not add up.
+
+    Args:
+        path: The black box.
+        out: New folder: as of `refly`, and `parts` with the rest.
+        folder: Of the refit.
+        arena: See `refly`.
+        arena_seed: See `refly`.
+        episodes: Rehearsals of each.
+        policy: See `refly`.
+        trust: See `refly`.
+        progress: Whether to draw a bar on standard error.
+
+    Returns:
+        The rehearsals with all of it, and the figures of each part.
+
+    Raises:
+        UsageError: As `refly`; the folder holds no refit.
+    """
+    everything, base = changes_of(folder), _read(folder).vehicle
+    nothing = Changes(vehicle=base, prompt=True)
+    parts = {
+        NOTHING: nothing,
+        LATENCY: replace(nothing, prompt=False),
+        VEHICLE: replace(nothing, vehicle=everything.vehicle),
+        WIND: replace(nothing, wind=everything.wind),
+    }
+
+    def flown(into: Path, changes: Changes) -> Reflight:
+        return refly(
+            path,
+            into,
+            arena=arena,
+            arena_seed=arena_seed,
+            episodes=episodes,
+            policy=policy,
+            trust=trust,
+            changes=changes,
+            progress=progress,
+        )
+
+    whole = flown(out, everything)
+    found = [
+        _figures(part, flown(out / PARTS_FOLDER / part, changes)) for part, changes in parts.items()
+    ]
+    figures = (*found, _figures(ALL, whole))
+    data = {
+        "schema": PARTS_SCHEMA,
+        "flown_s": whole.flown_s,
+        "parts": [vars(each) for each in figures],
+    }
+    write_json(out / PARTS_FILE, data)
+    return whole, figures
+
+
+def _read(folder: Path) -> _Refit:
+    told = read_typed(folder / REFIT_FILE, TypeAdapter(_Refit), SCHEMA, "refit of a flight")
+    if not (folder / VEHICLE_FILE).is_file():
+        raise UsageError(f"{folder}: accepted: the folder of a refit, with {VEHICLE_FILE}")
+    return told
+
+
+def _figures(part: str, flown: Reflight) -> PartFlown:
+    time_s = flown.rehearsed_time_s
+    return PartFlown(
+        part=part,
+        rehearsals=flown.rehearsals,
+        reached=len(flown.rehearsed_s),
+        time_s=time_s,
+        time_share=None if time_s is None else (time_s - flown.flown_s) / flown.flown_s,
+        apart_m=float(np.median(flown.each_apart_m)),
+    )
