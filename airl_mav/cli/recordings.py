@@ -8,15 +8,15 @@ from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import check_installed
 
 
-def folder_of(path: Path) -> Path:
-    """Return the folder of a run; a black box becomes one.
+def folder_of(path: Path, ulg: Path | None = None) -> Path:
+    """Return the folder of a run; a black box becomes one, with the vehicle's log where given.
 
     Raises UsageError where it cannot be read, or what reads it is not installed.
     """
     if path.suffix != SUFFIX or path.is_dir():
         return path
-    check_installed("black-box")
+    check_installed("black-box" if ulg is None else "refit")
     # Imported here: MCAP is an extra.
     from airl_mav.report.recorded_flight import take_in
 
-    return take_in(path)
+    return take_in(path, ulg)

@@ -8,6 +8,7 @@ from typing import Annotated
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.recordings import folder_of
 from airl_mav.core.clock import utc_now
@@ -31,6 +32,7 @@ class ReportOptions(ProfileModel):
         airl report runs/20261122T101530Z-sitl-static-obstacles
         airl report runs/A runs/B --names before after --out runs/before-after
         airl report flights/20261123T101530.123456Z.mcap
+        airl report flights/20261123T101530.123456Z.mcap --ulg log_12.ulg
     """
 
     runs: Annotated[tuple[Path, ...], POSITIONAL] = Field(
@@ -47,6 +49,11 @@ class ReportOptions(ProfileModel):
         default=None,
         description="folder of a comparison; by default runs/<UTC time>-compare. A report goes into"
         " its run's own folder",
+    )
+    ulg: Path | None = Field(
+        default=None,
+        description="with one black box: the flight controller's own log of that flight (.ulg); the"
+        " path, power and motor outputs are those of the log then",
     )
     trust: bool = Field(
         default=False,
@@ -66,7 +73,11 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     console = console or Console()
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")
-    options = options.model_copy(update={"runs": tuple(map(folder_of, options.runs))})
+    recorded = [path for path in options.runs if path.suffix == SUFFIX and not path.is_dir()]
+    if options.ulg is not None and len(recorded) != 1:
+        raise FieldError("ulg", f"{options.ulg}", "with one black box of a flight (.mcap)")
+    folders = [folder_of(path, options.ulg if path in recorded else None) for path in options.runs]
+    options = options.model_copy(update={"runs": tuple(folders)})
     first = options.runs[0]
     if options.trust:
         for folder in options.runs:

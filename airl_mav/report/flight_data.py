@@ -68,6 +68,7 @@ def flight_data(
         "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
         "errors": None if flight.errors is None else _lines(flight.errors, keep),
         "power": steps_of(flight.power_w[keep], 1.0),
+        "motors": None if flight.motors is None else _outputs(flight.motors[keep]),
         "altitude": flight.altitude_m,
         "commands": {
             "sent": steps_of(commands.sent_s, 0.001),
@@ -83,6 +84,11 @@ def flight_data(
 def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
     """Return each array of a dataclass by its name."""
     return {name: steps_of(values[keep], _unit(name)) for name, values in vars(of).items()}
+
+
+def _outputs(motors: NDArray[np.float64]) -> list[Steps]:
+    """Return the outputs (n, 4) of the motors, one after the other."""
+    return [steps_of(column, 0.002) for column in motors.T]
 
 
 def _unit(name: str) -> float:

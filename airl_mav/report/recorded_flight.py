@@ -15,7 +15,7 @@ from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status,
 from airl_mav.black_box.reading import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import typed
+from airl_mav.core.files import sha256_of, typed
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
@@ -37,6 +37,9 @@ NAVIGATING = "navigating"
 
 LEAST_NORM = 0.5
 """A quaternion shorter than this says nothing."""
+
+MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
+"""Columns of a flight with the vehicle's log: (n,) [µs] and (n, 4), 0 to 1, in PX4's order."""
 
 DIGEST = "recording_sha256"
 """Setting of the run that tells which file it was made of."""
@@ -76,23 +79,43 @@ def settings_of(box: BlackBox) -> FlownSettings:
     return typed(_SETTINGS, box.run.get("config", {}), box.path)
 
 
-def take_in(path: Path) -> Path:
+WITH_LOG = "-with-log"
+"""Ends the name of the run folder of a flight with the vehicle's own log."""
+
+
+def take_in(path: Path, ulg: Path | None = None) -> Path:
     """Make the run folder of a black box, beside it, and return it; it may be there already.
 
+    Args:
+        path: The black box.
+        ulg: The vehicle's own log of the flight; None: what the companion recorded is all.
+
     Raises:
-        UsageError: The file is no black box, or the folder holds something else.
+        UsageError: The file is no black box, the log is of another flight, or the folder holds
+            something else.
     """
     box = read_black_box(path)
-    folder = path.with_suffix("")
+    folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if ulg is not None:
+        # Imported here: pyulog is an extra.
+        from airl_mav.vehicle_log.ulog import read_vehicle_log
+
+        log = read_vehicle_log(ulg)
+        digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
     if (folder / RUN_FILE).exists():
         if load_info(folder).config.get(DIGEST) != digest:
             raise UsageError(
                 f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
             )
         return folder
-    info = info_of(box, digest)
-    RunFolder.adopt(folder, info).save_episodes([episode_of(box)])
+    if ulg is None:
+        episode = episode_of(box)
+    else:
+        from airl_mav.report.logged_flight import logged_episode_of
+
+        episode = logged_episode_of(box, log)
+    RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
     return folder
 
 
@@ -103,14 +126,21 @@ def info_of(box: BlackBox, digest: str = "") -> RunInfo:
     return replace(info, config={**info.config, DIGEST: digest})
 
 
-def episode_of(box: BlackBox) -> FlownEpisode:
-    """Return the flight: its path is the one that the flight controller told.
+def episode_of(
+    box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
+) -> FlownEpisode:
+    """Return the flight.
+
+    Args:
+        box: The recording.
+        path: Its path, where it is known better; None: the one that the flight controller told.
+        remarks: Notes of the flight, in front of those of the recording.
 
     Raises:
         UsageError: The black box does not hold its settings.
     """
     asked = settings_of(box)
-    path = path_of(box)
+    path = path_of(box) if path is None else path
     stamps = stamps_of(box.all_of(Decision))
     started_us = int(path.time_us[0]) if len(path) else 0
     phases = box.all_of(Phase)
@@ -150,7 +180,7 @@ def episode_of(box: BlackBox) -> FlownEpisode:
         slipped_us=0,
         battery_remaining=next((b for b in reversed(batteries) if b is not None), None),
         quality=quality,
-        notes=notes,
+        notes=(*remarks, *notes),
         companion_use=_use(box.all_of(Resources)),
     )
     return FlownEpisode(record, path, stamps)

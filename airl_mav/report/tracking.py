@@ -15,6 +15,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.worst import flown_path
+from airl_mav.report.recorded_flight import MOTOR_OUTPUTS, MOTOR_TIMES
 
 Floats = NDArray[np.float64]
 
@@ -76,6 +77,8 @@ class TrackedFlight:
     altitude_m: float | None
     """Height that was to be held."""
     power_w: Floats
+    motors: Floats | None
+    """(m, 4) motor outputs 0 to 1, in PX4's order; None: not recorded."""
 
 
 def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
@@ -102,7 +105,17 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         commands=commands_of(stamps, zero_us),
         altitude_m=run.info.config.get("pilot", {}).get("altitude_m"),
         power_w=path.power_w,
+        motors=_motors(stamps, path.time_us),
     )
+
+
+def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
+    """Return the motor outputs (m, 4) at times (m,); zero before and after they are known."""
+    times, outputs = stamps.get(MOTOR_TIMES), stamps.get(MOTOR_OUTPUTS)
+    if times is None or outputs is None or len(times) < 2:
+        return None
+    columns = [np.interp(time_us, times, column, left=0.0, right=0.0) for column in outputs.T]
+    return np.stack(columns, axis=1)
 
 
 def commands_of(stamps: Arrays, zero_us: int) -> Commands:

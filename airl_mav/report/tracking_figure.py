@@ -116,6 +116,8 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
         away = [_Line(errors.aside_m, ESTIMATED), _Line(errors.height_m, ESTIMATED, ":")]
         rows.append(("error of est.\n[m], height:\ndotted", away))
     rows.append(("power\n[W]", [_Line(flight.power_w, FLOWN)]))
+    if flight.motors is not None:
+        rows.append(("motor\noutputs", [_Line(each, FLOWN, "-", 0.7) for each in flight.motors.T]))
     return rows
 
 

@@ -16,6 +16,8 @@ from airl_mav.black_box.reading import read_black_box
 from airl_mav.cli.main import main
 from airl_mav.cli.refit import RefitOptions
 from airl_mav.cli.refit import run as airl_refit
+from airl_mav.cli.report import ReportOptions
+from airl_mav.cli.report import run as report
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments.refitted_reflight import (
     ALL,
@@ -33,6 +35,9 @@ from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.flown import flown_of
 from airl_mav.refitting.refit import Refit, refit
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.recorded_flight import take_in
+from airl_mav.report.tracking import track
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
 from airl_mav.vehicle_log.alignment import align
@@ -234,3 +239,55 @@ def test_options_that_do_not_go_together_are_refused(
         main(["refly", str(tmp_path / "x.mcap"), *words])
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+
+
+# --- the page of a flight with the vehicle's log
+
+
+def test_the_page_has_of_the_vehicles_log_what_the_black_box_lacks(refitted: Refitted) -> None:
+    flight = refitted.flight
+    console = Console(file=StringIO(), record=True, width=120)
+    assert report(ReportOptions(runs=(flight.black_box,), ulg=flight.ulg), console) == 0
+    folder = flight.black_box.with_name(f"{flight.black_box.stem}-with-log")
+    assert (folder / "report.html").is_file()
+    run = load_run(folder)
+    (record,) = run.episodes
+    began_us, ended_us = record.navigation_us or 0, record.ended_us
+    assert "path, power and motor outputs are those of flight.ulg" in record.notes[0]
+    path, true = run.trajectories[0], flight.part("trajectory")
+    # In lockstep both clocks are one: the log's times become the simulator's, nearly.
+    inside = (path.time_us > began_us) & (path.time_us < ended_us)
+    late_ms = np.arange(-60, 61, 4)
+    misses = [
+        np.abs(path.velocity[inside] - at(true, "velocity", path.time_us[inside] - 1000 * late))
+        for late in late_ms
+    ]
+    assert abs(late_ms[int(np.argmin([miss.mean() for miss in misses]))]) <= 24
+    # The way up was 40 ms and the way down none: half of the difference remains in the clocks.
+    there = at(true, "position", path.time_us[inside] - 20_000)
+    assert np.linalg.norm(path.position[inside] - there, axis=1).max() < 0.3
+    assert np.diff(path.time_us).max() <= 40_000
+    true_j = float(np.sum(np.interp(path.time_us, true["time_us"], true["power_w"])[inside]))
+    assert float(np.sum(path.power_w[inside])) == pytest.approx(true_j, rel=0.02)
+    outputs = run.stamps[0]["motors/output"]
+    hover = outputs[run.stamps[0]["motors/time_us"] < began_us][-10:].mean()
+    assert hover == pytest.approx(refitted.found.estimate("hover_thrust").value, rel=0.05)
+    tracked = track(load(folder), record)
+    assert tracked is not None and tracked.motors is not None
+    assert tracked.motors[tracked.time_s > 0.0].mean() == pytest.approx(hover, rel=0.05)
+    # The page of the black box alone is another one.
+    assert take_in(flight.black_box) != take_in(flight.black_box, flight.ulg) == folder
+
+
+def at(true: dict[str, Any], name: str, times_us: np.ndarray) -> np.ndarray:
+    columns = [np.interp(times_us, true["time_us"], column) for column in true[name].T]
+    return np.stack(columns, axis=1)
+
+
+def test_a_log_goes_with_one_black_box(refitted: Refitted, other: RecordedFlight) -> None:
+    console = Console(file=StringIO())
+    boxes = (refitted.flight.black_box, other.black_box)
+    with pytest.raises(FieldError, match="with one black box of a flight"):
+        report(ReportOptions(runs=boxes, ulg=other.ulg), console)
+    with pytest.raises(UsageError, match="the log of the same flight"):
+        report(ReportOptions(runs=boxes[1:], ulg=refitted.flight.ulg), console)
