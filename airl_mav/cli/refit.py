@@ -75,18 +75,18 @@ def table_of(found: Refit) -> TableView:
     """Return the table of what was fitted."""
     columns = (
         Column("quantity", number=False),
+        Column("unit", number=False),
         Column("fitted"),
         Column("95 % interval"),
         Column("profile"),
-        Column("unit", number=False),
     )
     rows = tuple(
         (
             each.meaning,
+            "" if each.unit == "1" else each.unit,
             _number(each, each.value),
             f"{_number(each, each.low)} to {_number(each, each.high)}" if each.observed else NONE,
             _number(each, each.profile),
-            "" if each.unit == "1" else each.unit,
         )
         for each in found.estimates
     )

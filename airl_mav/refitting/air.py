@@ -129,7 +129,7 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     middle, covariance = _posterior(rows, quadratic_1_m)
     drawn = rng.multivariate_normal(middle[:_AIR], covariance[:_AIR, :_AIR], DRAWS)
     drag = _estimate(
-        "drag_1_s", "linear drag per mass", "1/s", middle[_DRAG], drawn[:, _DRAG], source, known
+        "drag_1_s", "drag per mass", "1/s", middle[_DRAG], drawn[:, _DRAG], source, known
     )
     half = drag.half_width or 0.0
     if middle[_DRAG] <= 0.0 or half > WIDEST_DRAG * middle[_DRAG]:
@@ -141,8 +141,8 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     wind = [
         _estimate(key, meaning, "m/s", middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, 0], source)
         for i, key, meaning in (
-            (_NORTH, "wind_north_m_s", "steady wind towards north"),
-            (_EAST, "wind_east_m_s", "steady wind towards east"),
+            (_NORTH, "wind_north_m_s", "wind towards north"),
+            (_EAST, "wind_east_m_s", "wind towards east"),
         )
     ]
     if (half := max(each.half_width or 0.0 for each in wind)) > WIDEST_WIND_M_S:
@@ -156,9 +156,9 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
 
 def _nothing(why: str, known: float, quadratic_1_m: float) -> Air:
     return Air(
-        unobserved("drag_1_s", "linear drag per mass", "1/s", why, known),
-        unobserved("wind_north_m_s", "steady wind towards north", "m/s", why, None),
-        unobserved("wind_east_m_s", "steady wind towards east", "m/s", why, None),
+        unobserved("drag_1_s", "drag per mass", "1/s", why, known),
+        unobserved("wind_north_m_s", "wind towards north", "m/s", why, None),
+        unobserved("wind_east_m_s", "wind towards east", "m/s", why, None),
         quadratic_1_m,
     )
 

@@ -49,7 +49,7 @@ def fit_latencies(flown: Flown, rng: np.random.Generator) -> Latencies:
     return Latencies(
         _mean(
             "t1_ms",
-            "t1: frame exposed until decoded, mean",
+            "t1, mean",
             t1_us / US_PER_MS,
             stamps_of.format(len(t1_us)),
             "the camera does not stamp by the companion's clock",
@@ -57,7 +57,7 @@ def fit_latencies(flown: Flown, rng: np.random.Generator) -> Latencies:
         ),
         _mean(
             "t2_ms",
-            "t2: inference, mean",
+            "t2, mean",
             samples_ms,
             stamps_of.format(len(samples_ms)),
             "no decision was recorded",
@@ -92,7 +92,7 @@ def _mean(
 
 
 def _link(flown: Flown) -> Estimate:
-    key, meaning = "link_ms", "link: setpoint up, telemetry down and its age"
+    key, meaning = "link_ms", "link, both ways"
     clocks = flown.clocks
     if clocks is None:
         why = "a black box knows neither end of it: give the vehicle's log"

@@ -171,9 +171,9 @@ def _notes(flown: Flown, board: ComputerProfile) -> tuple[str, ...]:
     if flown.clocks is not None:
         clocks = flown.clocks
         notes.append(
-            "clocks aligned by attitude and velocity: what was told is"
-            f" {clocks.told_us / US_PER_MS:.1f} ms later in the recording than in the log,"
-            f" velocities agree to {clocks.error_m_s:.3f} m/s"
+            "clocks aligned by attitude and velocity: telemetry of the log's time t is in the"
+            f" recording at t {clocks.told_us / US_PER_MS:+.1f} ms, velocities agree to"
+            f" {clocks.error_m_s:.3f} m/s"
         )
     if flown.log is not None and len(flown.log.wind):
         start_us, end_us = (flown.logged_us(each) for each in flown.airborne_us)

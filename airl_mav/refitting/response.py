@@ -128,9 +128,9 @@ def _describe(known: Response | None) -> tuple[tuple[Estimate, Estimate], Estima
         return unobserved(key, meaning, "s", "", held.get(key))
 
     return (
-        named("dead_time_s", "dead time of the velocity"),
-        named("velocity_time_s", "time constant of the velocity"),
-    ), named("yaw_rate_time_s", "time constant of the yaw rate")
+        named("dead_time_s", "dead time"),
+        named("velocity_time_s", "velocity's time constant"),
+    ), named("yaw_rate_time_s", "yaw rate's time constant")
 
 
 def _too_little(flown: Flown) -> str | None:
@@ -195,7 +195,7 @@ def _velocity(
     value = float(found.x[0]) - shift_s
     dead = replace(dead, value=value, low=value - low_s, high=value + high_s, source=source)
     lag = _with_interval(lag, float(found.x[1]), ends[:, 1], "velocity in telemetry")
-    return _known_to(dead, WIDEST_S), _known_to(lag, WIDEST_SHARE * float(found.x[1]))
+    return _known_to(dead, WIDEST_S), _known_to(lag, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
 
 def _link_share(flown: Flown) -> tuple[float, float, str]:
@@ -240,7 +240,7 @@ def _yaw_rate(driven: _Driven, flown: Flown, known: Estimate, rng: np.random.Gen
     found = _best(residuals, starts, high=(2.0, 5.0, math.inf), free=2)
     ends = block_intervals(found.jac, found.fun, driven.times_s, rng)
     fitted = _with_interval(known, float(found.x[1]), ends[:, 1], "heading in telemetry")
-    return _known_to(fitted, WIDEST_SHARE * float(found.x[1]))
+    return _known_to(fitted, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
 
 def _lagged(wanted: NDArray[np.complex128] | Array, lag_s: float, begun: complex) -> Array:

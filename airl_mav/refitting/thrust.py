@@ -54,18 +54,16 @@ def fit_thrust(
         rng: Draws the resamples of the interval.
     """
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
-    blank = unobserved("thrust_per_mass_m_s2", "greatest thrust per mass", "m/s²", "", ratio)
+    blank = unobserved("thrust_per_mass_m_s2", "thrust per mass", "m/s²", "", ratio)
     found = _ratio(flown, vehicle, air, blank, rng)
     values = found.value, found.low, found.high
     if found.value is None:
         why = found.unobservable
         return Thrust(
             found,
-            unobserved("hover_thrust", "thrust in a hover", "1", why, GRAVITY_M_S2 / ratio),
+            unobserved("hover_thrust", "hover thrust, share", "1", why, GRAVITY_M_S2 / ratio),
             unobserved("mass_kg", "take-off mass", "kg", why, vehicle.body.mass_kg),
-            unobserved(
-                "thrust_max_n", "greatest thrust of a rotor", "N", why, vehicle.rotor.thrust_max_n
-            ),
+            unobserved("thrust_max_n", "thrust of a rotor", "N", why, vehicle.rotor.thrust_max_n),
         )
     numbers = np.array(values, np.float64)
     low_last = [0, 2, 1]
@@ -75,10 +73,10 @@ def fit_thrust(
     only = "only thrust per mass is observable; {} is taken from the profile"
     heard = Thrust(
         found,
-        _of("hover_thrust", "thrust in a hover", "1", hover, found.source, GRAVITY_M_S2 / ratio),
+        _of("hover_thrust", "hover thrust, share", "1", hover, found.source, GRAVITY_M_S2 / ratio),
         _of("mass_kg", "take-off mass", "kg", mass, found.source, vehicle.body.mass_kg),
         _of(
-            *("thrust_max_n", "greatest thrust of a rotor", "N", rotor, found.source),
+            *("thrust_max_n", "thrust of a rotor", "N", rotor, found.source),
             vehicle.rotor.thrust_max_n,
         ),
     )

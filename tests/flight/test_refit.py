@@ -163,7 +163,7 @@ def test_the_command_prints_what_was_found_and_what_was_not(
     options = RefitOptions(flight=other.black_box, out=tmp_path / "out")
     assert airl_refit(options, console) == 0
     text = console.export_text()
-    assert "time constant of the velocity" in text
+    assert "velocity's time constant" in text
     assert "not observable in this flight: take-off mass: a black box holds no motor" in text
     assert (tmp_path / "out" / "vehicle.toml").exists()
 
