@@ -39,6 +39,7 @@ SUBCOMMANDS: dict[str, str] = {
     "arena": "look at an arena, or at what its profile draws",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
     "conformance": "does a flight controller do what the rehearsal assumes?",
+    "computers": "computer profiles: what each was timed with, by whom, and how late it decides",
     "list": "shipped vehicles, arenas, policies, computers, sweeps",
 }
 """Subcommands, and what each is for; module `airl_mav.cli.<name>`."""

@@ -359,7 +359,7 @@ EXTRAS = {
 }
 """What the extras install, by their names in pyproject.toml."""
 
-LIGHT = ("companion", "conformance", "export", "listing", "profile", "train")
+LIGHT = ("companion", "computers", "conformance", "export", "listing", "profile", "train")
 """Commands whose modules need no simulator; those of the others cannot be imported without."""
 
 

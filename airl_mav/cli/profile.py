@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, RENAMED, check_installed
-from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
+from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.progress import RichProgress
-from airl_mav.profiling.measurement import ProfilingError
+from airl_mav.profiling.measurement import ProfilingError, share
 from airl_mav.profiling.profile import profile
 from airl_mav.profiling.report import print_measurement
 from airl_mav.profiling.request import ProfileRequest
@@ -25,7 +26,7 @@ class ProfileOptions(ProfileRequest):
     Examples:
         airl profile --on my-pi --watts 6.4
         airl profile --network 5x32
-        airl profile --soak 10min
+        airl profile --soak 10min --share my-pi.toml
         airl profile static-obstacles --level sitl
         airl profile --level hil --connect udpin://0.0.0.0:14540 --camera tcp://192.168.1.10:5600
     """
@@ -36,6 +37,18 @@ class ProfileOptions(ProfileRequest):
     out: Path = Field(
         default=Path("computers"), description="folder of the profile and its samples"
     )
+    share: Path | None = Field(
+        default=None,
+        description="also write one file (.toml) to be passed on, which another machine flies with"
+        " --computer FILE: samples, state of the machine, soak, versions, digest",
+    )
+
+    @field_validator("share")
+    @classmethod
+    def _toml(cls, share: Path | None) -> Path | None:
+        if share is not None and share.suffix != ".toml":
+            raise FieldError("share", f"{share}", "a file whose name ends in .toml")
+        return share
 
 
 OPTIONS = ProfileOptions
@@ -53,7 +66,7 @@ def run(options: ProfileOptions, console: Console | None = None) -> int:
         check_installed("sim")
     if options.network is not None:
         check_installed("profile")
-    request = ProfileRequest.model_validate(options.model_dump(exclude={"out"}))
+    request = ProfileRequest.model_validate(options.model_dump(exclude={"out", "share"}))
     with RichProgress(console) as progress:
         try:
             measured = profile(request, out=options.out, progress=progress)
@@ -65,5 +78,7 @@ def run(options: ProfileOptions, console: Console | None = None) -> int:
                 "interrupted: nothing was written; the same command starts over", "yellow"
             )
             return EXIT_INTERRUPTED
+    if options.share is not None:
+        measured = replace(measured, files=(*measured.files, share(measured, options.share)))
     print_measurement(measured, console)
     return EXIT_INTERRUPTED if measured.soak is not None and measured.soak.interrupted else 0

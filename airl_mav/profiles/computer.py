@@ -5,13 +5,14 @@ A computer has latencies per workload (a network on a runtime), never one number
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
@@ -95,6 +96,30 @@ class Latency(ProfileModel):
         return self
 
 
+class Measured(ProfileModel):
+    """How a workload was timed, in a profile that was written to be passed on."""
+
+    date_utc: str = Field(description="when")
+    machine: str = Field(description="operating system, architecture and Python")
+    state: dict[str, str] = Field(
+        description="governor, frequency, temperature, throttling and load before the measurement"
+    )
+    soak: str = Field(default="", description="how the latency changed while it got warm")
+    versions: dict[str, str] = Field(description="versions of the packages that took part")
+    samples_sha256: str = Field(
+        description="SHA-256 of the samples, one a line in ms with three decimals"
+    )
+
+
+def samples_digest(samples_ms: Sequence[float]) -> str:
+    """Return the SHA-256 of samples [ms], as `Measured.samples_sha256` has it."""
+    return hashlib.sha256("".join(f"{each:.3f}\n" for each in samples_ms).encode()).hexdigest()
+
+
+Origin = Literal["measured", "published"]
+"""Samples of a machine, or moments that somebody has published."""
+
+
 class Workload(ProfileModel):
     """One network on one runtime, as this computer ran it."""
 
@@ -105,6 +130,33 @@ class Workload(ProfileModel):
     latency: Latency
     source: str = Field(description="where the latency comes from")
     assumed: str = Field(default="", description="what the source does not give and we assume")
+    measured: Measured | None = Field(
+        default=None, description="how it was timed, in a profile that airl profile --share wrote"
+    )
+
+    @model_validator(mode="after")
+    def _as_measured(self) -> Workload:
+        if self.measured is None:
+            return self
+        samples_ms = self.latency.samples_ms
+        if samples_ms is None:
+            raise ValueError("measured: accepted: with latency.samples_ms, which it is about")
+        if samples_digest(samples_ms) != self.measured.samples_sha256:
+            raise ValueError("measured.samples_sha256: is not that of latency.samples_ms")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Profiles that do not tell keep their digests.
+        data: dict[str, Any] = dump(self)
+        if self.measured is None:
+            data.pop("measured", None)
+        return data
+
+    @property
+    def origin(self) -> Origin:
+        """Where the latency comes from."""
+        return "measured" if self.latency.distribution == "samples" else "published"
 
 
 class ComputerProfile(ProfileModel):

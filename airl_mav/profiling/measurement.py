@@ -24,7 +24,9 @@ from airl_mav.policy.card import PolicyCard
 from airl_mav.profiles.computer import (
     ComputerProfile,
     Latency,
+    Measured,
     Network,
+    samples_digest,
     with_workload,
     write_profile,
     write_samples,
@@ -192,6 +194,36 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
     except OSError as error:
         raise UsageError(f"--out {path.parent}: {error.strerror}") from None
     return path, samples, arrays, facts, *more
+
+
+def share(measured: ComputerMeasurement, path: Path) -> Path:
+    """Write one file that another machine flies as: the computer, this workload, its samples.
+
+    With how it was measured: the machine's state, the soak, versions, and a digest of the samples.
+
+    Raises:
+        UsageError: The file cannot be written.
+    """
+    workload = measured.profile.workloads[measured.workload]
+    samples_ms = tuple(round(each, 3) for each in workload.latency.samples_ms or ())
+    machine, soaked = measured.machine, measured.soak
+    how = Measured(
+        date_utc=utc_now().isoformat(timespec="seconds"),
+        machine=f"{machine['os']}, {machine['architecture']}, {machine['python']}",
+        state=dict(measured.before.rows()),
+        soak="" if soaked is None else soaked.sentence(),
+        versions=package_versions(),
+        samples_sha256=samples_digest(samples_ms),
+    )
+    inline = Latency(distribution="samples", samples_ms=samples_ms)
+    told = workload.model_copy(update={"latency": inline, "measured": how})
+    profile = measured.profile.model_copy(update={"workloads": {measured.workload: told}})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_profile(path, profile)
+    except OSError as error:
+        raise UsageError(f"--share {path}: {error.strerror}") from None
+    return path
 
 
 def _save_soak(measured: ComputerMeasurement, soaked: Soak, series: Path) -> tuple[Path, ...]:

@@ -1,0 +1,76 @@
+"""`airl computers`: what computer profiles know, and where they have it from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from rich.console import Console
+from rich.table import Table
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.fields import ProfileModel
+from airl_mav.profiles.computer import Latency, Workload, load_computer
+from airl_mav.profiles.loading import list_profiles
+
+SAYS = (
+    "measured: samples of that machine, replayed in their order. published: mean and spread that"
+    " its source gives. Any other policy is estimated by its multiply-accumulates: --workload"
+    " estimate."
+)
+
+
+class ComputersOptions(ProfileModel):
+    """List computer profiles with their workloads: measured or published, how late, from where.
+
+    Examples:
+        airl computers
+        airl computers computers/my-pi.toml shared/jetson.toml
+    """
+
+    profiles: Annotated[tuple[str, ...], POSITIONAL] = Field(
+        default=(),
+        description="shipped names, or paths to .toml files; by default all shipped ones",
+    )
+
+
+OPTIONS = ComputersOptions
+
+
+def run(options: ComputersOptions, console: Console | None = None) -> int:
+    """Print the table. Returns exit status 0; raises UsageError for a profile that is none."""
+    console = console or Console()
+    names = options.profiles or tuple(list_profiles("computers"))
+    console.print(_table(names))
+    console.print(SAYS, markup=False, highlight=False)
+    return 0
+
+
+def _table(names: Sequence[str]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for title in ("computer", "workload", "origin"):
+        table.add_column(title, overflow="fold")
+    table.add_column("t2, mean ms", justify="right")
+    table.add_column("source", overflow="fold")
+    for name in names:
+        profile = load_computer(name)
+        table.add_row(name, "", "", "", f"{profile.cpu}; {profile.watts:g} W", style="dim")
+        for key, work in profile.workloads.items():
+            mean_ms = f"{_mean_ms(work.latency):.3g}"
+            table.add_row("", key, work.origin, mean_ms, _source(work))
+    return table
+
+
+def _mean_ms(latency: Latency) -> float:
+    if latency.samples_ms is not None:
+        return float(np.mean(latency.samples_ms))
+    return latency.mean_ms or 0.0
+
+
+def _source(work: Workload) -> str:
+    how = work.measured
+    if how is None:
+        return work.source
+    return f"{work.source}; {how.machine}; samples {how.samples_sha256[:12]}"
