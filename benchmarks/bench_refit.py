@@ -1,10 +1,11 @@
 """How near a refit comes to the truth, on flights whose truth is known.
 
-    .venv/bin/python benchmarks/bench_refit.py [--flights 20] [--keep FOLDER]
+    .venv/bin/python benchmarks/bench_refit.py [--flights 20] [--keep FOLDER] [--rehearsals 4]
 
 Flies aircraft in lockstep whose mass, thrust, drag, link, latency and wind are not those of the
 profile, recorded by the companion's black box and the vehicle's log, refits each from both and from
-the black box alone, and prints the errors. 20 flights take about two minutes.
+the black box alone, and prints the errors. 20 flights take about two minutes. With --rehearsals
+each is flown again on its refit, as a whole and part by part: a minute or two more for each.
 
 The true dead time is that of the same model on the simulator's own path, from when the flight
 controller took each setpoint: what no recording knows.
@@ -18,7 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from airl_mav.experiments.refitted_reflight import PartFlown, refly_parts
 from airl_mav.refitting.refit import Refit, refit
+from airl_mav.scenario.model import DEFAULT_ARENA
+from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s
 
 ASKED = {"dead_s": 0.008, "mass": 0.03, "wind_m_s": 0.5, "t2": 0.02}
@@ -29,7 +33,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--flights", type=int, default=20)
     parser.add_argument("--keep", type=Path, help="keep the recordings in this folder")
+    parser.add_argument("--rehearsals", type=int, default=0, help="of each flight, on its refit")
     asked = parser.parse_args()
+    parts: dict[str, list[PartFlown]] = {}
     rows: dict[str, list[RefitErrors]] = {"with the vehicle's log": [], "black box alone": []}
     print("seed  log  dead ms  lag %  mass %  drag %  wind m/s  t2 %")
     with tempfile.TemporaryDirectory() as scratch:
@@ -40,6 +46,8 @@ def main() -> None:
             true_s = true_dead_time_s(flight)
             for title, ulg in zip(rows, (flight.ulg, None), strict=True):
                 found: Refit = refit(flight.black_box, ulg=ulg)
+                if ulg and asked.rehearsals:
+                    _rehearse(flight, folder / "again", asked.rehearsals, parts)
                 errors = errors_of(found, truth, true_s, flight)
                 rows[title].append(errors)
                 print(f"{seed:4d}  {'ulg' if ulg else '-':4s}{_row(errors)}  {flight.reason}")
@@ -47,6 +55,27 @@ def main() -> None:
         print(f"\n{title}:")
         for name, bound in ASKED.items():
             _summary(name, bound, errors_of_all)
+    for part, flown in parts.items():
+        apart_m = [each.apart_m for each in flown]
+        shares = np.abs([each.time_share for each in flown if each.time_share is not None])
+        print(
+            f"rehearsed with {part}: time off by {np.median(shares):.2%} (median), by 2 % or less"
+            f" in {int((shares <= 0.02).sum())} of {len(flown)}; path {np.median(apart_m):.2f} m"
+            f" apart (median), {max(apart_m):.2f} m at most"
+        )
+
+
+def _rehearse(
+    flight: RecordedFlight, folder: Path, episodes: int, parts: dict[str, list[PartFlown]]
+) -> None:
+    """Fly again on the refit, and keep the figures of each part."""
+    out = folder / "refit"
+    refit(flight.black_box, ulg=flight.ulg, out=out)
+    _, flown = refly_parts(
+        flight.black_box, folder / "flown", out, arena=DEFAULT_ARENA, episodes=episodes
+    )
+    for each in flown:
+        parts.setdefault(each.part, []).append(each)
 
 
 def _row(errors: RefitErrors) -> str:

@@ -13,7 +13,7 @@ from airl_mav.core.fields import ProfileModel
 from airl_mav.report.table import NONE, Column, TableView, print_table
 
 if TYPE_CHECKING:
-    from airl_mav.refitting.estimate import Estimate
+    from airl_mav.refitting.quantity import FittedQuantity
     from airl_mav.refitting.refit import Refit
 
 
@@ -102,7 +102,7 @@ def unobserved_lines(found: Refit) -> list[str]:
     ]
 
 
-def _number(estimate: Estimate, value: float | None) -> str:
+def _number(estimate: FittedQuantity, value: float | None) -> str:
     if value is None:
         return NONE
     return f"{value:.1f}" if estimate.unit == "ms" else f"{value:.3f}"

@@ -133,11 +133,11 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
 def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
     """Return what the flight and its rehearsals differ by, with each part of a refit."""
     columns = (
-        Column("rehearsed with", number=False),
-        Column("goal reached"),
-        Column("time, median", "s"),
-        Column("against the flight", "%"),
-        Column("path apart, median", "m"),
+        Column("with", number=False),
+        Column("reached"),
+        Column("time", "s"),
+        Column("off", "%"),
+        Column("path apart", "m"),
     )
     rows = tuple(
         (
@@ -149,7 +149,8 @@ def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
         )
         for each in parts
     )
-    return TableView("parts", f"the flight took {flown_s:.2f} s", columns, rows)
+    title = f"rehearsed part by part, medians; the flight took {flown_s:.2f} s"
+    return TableView("parts", title, columns, rows)
 
 
 def _check(options: ReflyOptions) -> None:

@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.refitting.estimate import Array, Estimate, unobserved
 from airl_mav.refitting.flown import Flown
+from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
 
 WINDOW = 13
 """Samples of a window: half a second of telemetry."""
@@ -65,10 +65,10 @@ _AIR = 3
 class Air:
     """What the air did."""
 
-    drag_1_s: Estimate
+    drag_1_s: FittedQuantity
     """Linear drag per mass."""
-    wind_north_m_s: Estimate
-    wind_east_m_s: Estimate
+    wind_north_m_s: FittedQuantity
+    wind_east_m_s: FittedQuantity
     quadratic_1_m: float
     """Quadratic drag per mass, as the profile has it."""
 
@@ -171,9 +171,11 @@ def _estimate(
     drawn: Array,
     source: str,
     profile: float | None = None,
-) -> Estimate:
+) -> FittedQuantity:
     low, high = np.quantile(drawn, (0.025, 0.975))
-    return Estimate(key, meaning, unit, float(value), float(low), float(high), source, "", profile)
+    return FittedQuantity(
+        key, meaning, unit, float(value), float(low), float(high), source, "", profile
+    )
 
 
 def _rows(flown: Flown, bias_m_s2: float) -> _Rows | None:

@@ -11,8 +11,8 @@ from scipy.stats import bootstrap
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.refitting.estimate import LEVEL, RESAMPLES, Estimate, unobserved
 from airl_mav.refitting.flown import Flown
+from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity, unobserved
 
 LEAST = 5
 """Decisions below which a mean has no interval."""
@@ -22,11 +22,11 @@ LEAST = 5
 class Latencies:
     """How late the decisions of a flight were."""
 
-    t1_ms: Estimate
+    t1_ms: FittedQuantity
     """Mean time from a frame's exposure until it was decoded."""
-    t2_ms: Estimate
+    t2_ms: FittedQuantity
     """Mean time from the start of an inference until its action was ready."""
-    link_ms: Estimate
+    link_ms: FittedQuantity
     """Round trip: setpoint up, telemetry down, and its age."""
     samples_ms: tuple[float, ...]
     """t2 of the decisions, in their order."""
@@ -75,23 +75,23 @@ def _mean(
     source: str,
     none: str,
     rng: np.random.Generator,
-) -> Estimate:
+) -> FittedQuantity:
     """Return the mean with its interval, wider by how much decisions depend on each other."""
     if len(values_ms) < LEAST:
         why = f"{len(values_ms)} decisions; {LEAST} are needed" if len(values_ms) else none
         return unobserved(key, meaning, "ms", why, None)
     mean = float(values_ms.mean())
     if np.ptp(values_ms) == 0.0:
-        return Estimate(key, meaning, "ms", mean, mean, mean, source)
+        return FittedQuantity(key, meaning, "ms", mean, mean, mean, source)
     found = bootstrap(
         (values_ms,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, rng=rng
     ).confidence_interval
     wider = float(np.sqrt(max(1.0, integrated_time(values_ms))))
     low, high = (mean + wider * (float(end) - mean) for end in (found.low, found.high))
-    return Estimate(key, meaning, "ms", mean, low, high, source)
+    return FittedQuantity(key, meaning, "ms", mean, low, high, source)
 
 
-def _link(flown: Flown) -> Estimate:
+def _link(flown: Flown) -> FittedQuantity:
     key, meaning = "link_ms", "link, both ways"
     clocks = flown.clocks
     if clocks is None:
@@ -105,4 +105,4 @@ def _link(flown: Flown) -> Estimate:
     value_ms, low_ms, high_ms = (
         each / US_PER_MS for each in (clocks.round_trip_us, low_us, high_us)
     )
-    return Estimate(key, meaning, "ms", value_ms, low_ms, high_ms, source)
+    return FittedQuantity(key, meaning, "ms", value_ms, low_ms, high_ms, source)

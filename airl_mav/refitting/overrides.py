@@ -10,7 +10,7 @@ from airl_mav.core.fields import validated
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.air import Air
-from airl_mav.refitting.estimate import Estimate
+from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.response import ResponseFit
 from airl_mav.refitting.thrust import Thrust
 
@@ -69,7 +69,7 @@ def overrides_of(
         found.append(Override("drag", "linear_n_s_m", _round(drag_1_s * mass_kg), remark))
     table = response.response(drag_1_s, profile.response)
     if table is not None:
-        fitted: dict[str, Estimate] = {
+        fitted: dict[str, FittedQuantity] = {
             "dead_time_s": response.dead_time_s,
             "velocity_time_s": response.velocity_time_s,
             "yaw_rate_time_s": response.yaw_rate_time_s,
@@ -102,7 +102,7 @@ def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Ov
     ]
 
 
-def _remark(estimate: Estimate) -> str:
+def _remark(estimate: FittedQuantity) -> str:
     if estimate.value is None:
         return f"not observable in this flight, as it was: {estimate.unobservable}"
     return (

@@ -17,11 +17,11 @@ from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import Air, fit_air
-from airl_mav.refitting.estimate import Estimate
 from airl_mav.refitting.files import computer_profile, vehicle_toml, write_refit
 from airl_mav.refitting.flown import Flown, flown_of
 from airl_mav.refitting.latencies import Latencies, fit_latencies
 from airl_mav.refitting.overrides import Override, overrides_of, refitted
+from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.response import ResponseFit, fit_response
 from airl_mav.refitting.thrust import Known, Thrust, fit_thrust
 from airl_mav.vehicle_log.ulog import read_vehicle_log
@@ -51,7 +51,7 @@ class Refit:
     notes: tuple[str, ...]
 
     @property
-    def estimates(self) -> tuple[Estimate, ...]:
+    def estimates(self) -> tuple[FittedQuantity, ...]:
         """All that was fitted, or was not."""
         response, thrust, air, late = self.response, self.thrust, self.air, self.latencies
         return (
@@ -61,7 +61,7 @@ class Refit:
             *(late.t1_ms, late.t2_ms, late.link_ms),
         )
 
-    def estimate(self, key: str) -> Estimate:
+    def estimate(self, key: str) -> FittedQuantity:
         """Return one of them. Raises KeyError."""
         return {each.key: each for each in self.estimates}[key]
 

@@ -19,8 +19,8 @@ from scipy.signal import lfilter
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.profiles.vehicle import Response
-from airl_mav.refitting.estimate import Array, Estimate, block_intervals, unobserved
 from airl_mav.refitting.flown import Flown, seconds
+from airl_mav.refitting.quantity import Array, FittedQuantity, block_intervals, unobserved
 
 STEP_S = 0.004
 """Of the model [s]: the flight controller's own."""
@@ -46,9 +46,9 @@ WIDEST_S, WIDEST_SHARE = 0.05, 0.4
 class ResponseFit:
     """The answers of a vehicle."""
 
-    dead_time_s: Estimate
-    velocity_time_s: Estimate
-    yaw_rate_time_s: Estimate
+    dead_time_s: FittedQuantity
+    velocity_time_s: FittedQuantity
+    yaw_rate_time_s: FittedQuantity
 
     def response(self, drag_1_s: float, known: Response | None) -> Response | None:
         """Return the table for a profile; what was not observed is as it was known before.
@@ -121,10 +121,12 @@ def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator)
     return fit
 
 
-def _describe(known: Response | None) -> tuple[tuple[Estimate, Estimate], Estimate]:
+def _describe(
+    known: Response | None,
+) -> tuple[tuple[FittedQuantity, FittedQuantity], FittedQuantity]:
     held = {} if known is None else known.model_dump()
 
-    def named(key: str, meaning: str) -> Estimate:
+    def named(key: str, meaning: str) -> FittedQuantity:
         return unobserved(key, meaning, "s", "", held.get(key))
 
     return (
@@ -165,8 +167,11 @@ def _driven(flown: Flown) -> _Driven:
 
 
 def _velocity(
-    driven: _Driven, flown: Flown, known: tuple[Estimate, Estimate], rng: np.random.Generator
-) -> tuple[Estimate, Estimate]:
+    driven: _Driven,
+    flown: Flown,
+    known: tuple[FittedQuantity, FittedQuantity],
+    rng: np.random.Generator,
+) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
     A third parameter is the time at which the heading turned the setpoint: that of its arrival,
@@ -221,7 +226,9 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
     )
 
 
-def _yaw_rate(driven: _Driven, flown: Flown, known: Estimate, rng: np.random.Generator) -> Estimate:
+def _yaw_rate(
+    driven: _Driven, flown: Flown, known: FittedQuantity, rng: np.random.Generator
+) -> FittedQuantity:
     """Fit the time constant of the yaw rate to the heading, with a dead time of its own."""
     change = np.diff(flown.setpoints[:, 3])
     rms = float(np.sqrt(np.mean(change**2)))
@@ -272,7 +279,7 @@ def _best(
     return _Solution(np.asarray(best.x), np.asarray(best.fun), np.asarray(best.jac))
 
 
-def _with_interval(known: Estimate, value: float, ends: Array, source: str) -> Estimate:
+def _with_interval(known: FittedQuantity, value: float, ends: Array, source: str) -> FittedQuantity:
     return replace(
         known,
         value=value,
@@ -282,7 +289,7 @@ def _with_interval(known: Estimate, value: float, ends: Array, source: str) -> E
     )
 
 
-def _known_to(estimate: Estimate, widest: float) -> Estimate:
+def _known_to(estimate: FittedQuantity, widest: float) -> FittedQuantity:
     """Return an estimate, or that it is not observable where its interval is too wide."""
     half = estimate.half_width
     if half is not None and half <= widest:

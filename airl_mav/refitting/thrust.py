@@ -15,8 +15,8 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.refitting.air import Air
-from airl_mav.refitting.estimate import Array, Estimate, mean_interval, unobserved
 from airl_mav.refitting.flown import Flown
+from airl_mav.refitting.quantity import Array, FittedQuantity, mean_interval, unobserved
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 Known = Literal["thrust", "mass"]
@@ -31,13 +31,13 @@ WIDEST = 0.15
 class Thrust:
     """What the rotors had to carry."""
 
-    ratio_m_s2: Estimate
+    ratio_m_s2: FittedQuantity
     """Greatest thrust per mass."""
-    hover: Estimate
+    hover: FittedQuantity
     """Thrust in a hover as a share of the greatest."""
-    mass_kg: Estimate
+    mass_kg: FittedQuantity
     """Take-off mass; not observable where the profile is right about the mass."""
-    thrust_max_n: Estimate
+    thrust_max_n: FittedQuantity
     """Of one rotor; not observable where the profile is right about the thrust."""
 
 
@@ -90,17 +90,19 @@ def fit_thrust(
     return Thrust(found, heard.hover, held, heard.thrust_max_n)
 
 
-def _of(key: str, meaning: str, unit: str, values: Array, source: str, known: float) -> Estimate:
+def _of(
+    key: str, meaning: str, unit: str, values: Array, source: str, known: float
+) -> FittedQuantity:
     value, low, high = map(float, values)
-    return Estimate(key, meaning, unit, value, low, high, source, "", known)
+    return FittedQuantity(key, meaning, unit, value, low, high, source, "", known)
 
 
 def _ratio(
-    flown: Flown, vehicle: VehicleProfile, air: Air, blank: Estimate, rng: np.random.Generator
-) -> Estimate:
+    flown: Flown, vehicle: VehicleProfile, air: Air, blank: FittedQuantity, rng: np.random.Generator
+) -> FittedQuantity:
     log = flown.log
 
-    def without(why: str) -> Estimate:
+    def without(why: str) -> FittedQuantity:
         return unobserved(blank.key, blank.meaning, blank.unit, why, blank.profile)
 
     if log is None:
@@ -123,7 +125,7 @@ def _ratio(
     if 0.5 * (high - low) > WIDEST * value:
         return without(f"known to {0.5 * (high - low) / value:.0%}; {WIDEST:.0%} is needed")
     source = "motor commands and accelerometer in the vehicle's log"
-    return Estimate(
+    return FittedQuantity(
         blank.key, blank.meaning, blank.unit, value, low, high, source, "", blank.profile
     )
 

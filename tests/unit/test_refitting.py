@@ -16,9 +16,9 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import fit_air
-from airl_mav.refitting.estimate import block_intervals, mean_interval
 from airl_mav.refitting.flown import Flown
 from airl_mav.refitting.overrides import Override, refitted
+from airl_mav.refitting.quantity import block_intervals, mean_interval
 from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
 from airl_mav.vehicle_log.alignment import marzullo
 from airl_mav.vehicle_log.ulog import read_vehicle_log

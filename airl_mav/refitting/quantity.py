@@ -22,7 +22,7 @@ LEAST_BLOCKS = 4
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedQuantity:
     """One fitted quantity."""
 
     key: str
@@ -53,9 +53,11 @@ class Estimate:
         return 0.5 * (self.high - self.low)
 
 
-def unobserved(key: str, meaning: str, unit: str, why: str, profile: float | None) -> Estimate:
+def unobserved(
+    key: str, meaning: str, unit: str, why: str, profile: float | None
+) -> FittedQuantity:
     """Return a quantity that the flight does not tell, and why."""
-    return Estimate(key, meaning, unit, None, unobservable=why, profile=profile)
+    return FittedQuantity(key, meaning, unit, None, unobservable=why, profile=profile)
 
 
 def block_intervals(
