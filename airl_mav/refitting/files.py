@@ -18,7 +18,6 @@ from airl_mav.profiles.computer import (
     Latency,
     Network,
     Workload,
-    load_computer,
     write_samples,
 )
 from airl_mav.refitting.overrides import Override
@@ -45,7 +44,9 @@ def vehicle_toml(
     return "\n".join(lines) + "\n"
 
 
-def computer_profile(box: BlackBox, samples: int, source: str) -> ComputerProfile | None:
+def computer_profile(
+    box: BlackBox, board: ComputerProfile, samples: int, source: str
+) -> ComputerProfile | None:
     """Return the computer that flew, with the latency of its policy as a workload.
 
     None where the policy has no network, or is not here, so that its size is not known.
@@ -54,7 +55,6 @@ def computer_profile(box: BlackBox, samples: int, source: str) -> ComputerProfil
     network = _network(str(config.get("policy")), str(config.get("runtime", "onnx")), box)
     if network is None:
         return None
-    asked = load_computer(str(config.get("computer", "workstation")))
     machine = box.run.get("machine", {})
     setup = box.run.get("setup", {})
     injected = setup.get("injection", {}).get("origin") != "measured"
@@ -66,10 +66,10 @@ def computer_profile(box: BlackBox, samples: int, source: str) -> ComputerProfil
         source=f"measured in flight: {samples} decisions, {source}",
         assumed=f"latency in that flight: {how}",
     )
-    cpu = asked.cpu if injected else f"{machine.get('cores', 1)} x {machine.get('cpu', 'unknown')}"
-    return asked.model_copy(
+    cpu = board.cpu if injected else f"{machine.get('cores', 1)} x {machine.get('cpu', 'unknown')}"
+    return board.model_copy(
         update={
-            "description": f"{asked.description}, as measured in flight",
+            "description": f"{board.description}, as measured in flight",
             "cpu": cpu,
             "workloads": {WORKLOAD: workload},
         }

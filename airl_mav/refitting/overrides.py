@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -89,7 +90,10 @@ def refitted(profile: VehicleProfile, overrides: Sequence[Override]) -> VehicleP
 
 
 def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Override]:
-    """Return the gains and limits that the flight controller had, where the profile has others."""
+    """Return the gains and limits that the flight controller had, where the profile has others.
+
+    Values out of PX4's ranges, which it stores all the same, are left out: no profile has such.
+    """
     held = parameter_values(profile.parameters)
     remark = "as the flight controller's log has it"
     return [
@@ -97,7 +101,7 @@ def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Ov
         for spec in SPECS
         if spec.is_used
         and spec.name.startswith(TUNED)
-        and spec.name in logged
+        and spec.low <= logged.get(spec.name, math.nan) <= spec.high
         and abs(logged[spec.name] - held[spec.name]) > 1e-6 * max(1.0, abs(held[spec.name]))
     ]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from airl_mav.black_box.reading import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.provenance import package_versions
 from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload
@@ -28,6 +28,9 @@ from airl_mav.vehicle_log.ulog import read_vehicle_log
 
 SCHEMA = 1
 """Version of `refit.json`."""
+
+DEFAULT_COMPUTER = "workstation"
+"""Stays on the ground: has no part in the vehicle's mass."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,7 @@ def refit(
     config = box.run.get("config", {})
     base = vehicle or str(config.get("vehicle", "quad"))
     profile = load_vehicle(base)
-    board = load_computer(str(config.get("computer", "workstation")))
+    board, remarks = _board(str(config.get("computer", DEFAULT_COMPUTER)))
     flying = loaded(profile, board, Payload())
     flown = flown_of(box, log)
     streams = np.random.default_rng(seed).spawn(4)
@@ -136,14 +139,23 @@ def refit(
         thrust=thrust,
         air=air,
         latencies=fit_latencies(flown, streams[3]),
-        notes=_notes(flown, board),
+        notes=(*remarks, *_notes(flown, board)),
     )
     if out is not None:
-        _write(found, box, out)
+        _write(found, box, board, out)
     return found
 
 
-def _write(found: Refit, box: BlackBox, out: Path) -> None:
+def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:
+    """Return the computer that flew; where its profile is not on this machine, a note says so."""
+    try:
+        return load_computer(name), ()
+    except UsageError as error:
+        note = f"the computer's mass is not known here, it counts to the vehicle's: {error}"
+        return load_computer(DEFAULT_COMPUTER), (note,)
+
+
+def _write(found: Refit, box: BlackBox, board: ComputerProfile, out: Path) -> None:
     from_what = found.black_box.name + (f" and {found.ulg.name}" if found.ulg else "")
     remarks = (f"airl refit {from_what}", *found.notes)
     samples_ms = found.latencies.samples_ms
@@ -156,7 +168,7 @@ def _write(found: Refit, box: BlackBox, out: Path) -> None:
             found.overrides,
             remarks,
         ),
-        computer_profile(box, len(samples_ms), f"airl refit {found.black_box.name}"),
+        computer_profile(box, board, len(samples_ms), f"airl refit {found.black_box.name}"),
         samples_ms,
         remarks,
     )

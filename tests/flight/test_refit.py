@@ -131,6 +131,17 @@ def test_the_black_box_alone_tells_what_it_can(refitted: Refitted) -> None:
     assert alone - with_log == pytest.approx(uplink_s(refitted.flight), abs=0.015)
 
 
+def test_a_computer_whose_profile_is_elsewhere_is_told_and_stops_nothing(
+    refitted: Refitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = read_black_box(refitted.flight.black_box)
+    box.run["config"]["computer"] = "/home/pi/computers/my-pi.toml"
+    monkeypatch.setattr("airl_mav.refitting.refit.read_black_box", lambda _: box)
+    found = refit(refitted.flight.black_box, ulg=refitted.flight.ulg)
+    assert found.notes[0].startswith("the computer's mass is not known here")
+    assert found.estimate("mass_kg") == refitted.found.estimate("mass_kg")
+
+
 @pytest.mark.parametrize("shift_us", [-3_000_000, 123_456, 7_200_000_000])
 def test_clocks_are_aligned_wherever_they_began(refitted: Refitted, shift_us: int) -> None:
     log = read_vehicle_log(refitted.flight.ulg)

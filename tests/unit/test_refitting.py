@@ -17,9 +17,10 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import fit_air
 from airl_mav.refitting.flown import Flown
-from airl_mav.refitting.overrides import Override, refitted
+from airl_mav.refitting.overrides import Override, overrides_of, refitted
 from airl_mav.refitting.quantity import block_intervals, mean_interval
 from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
+from airl_mav.refitting.thrust import fit_thrust
 from airl_mav.vehicle_log.alignment import marzullo
 from airl_mav.vehicle_log.ulog import read_vehicle_log
 
@@ -174,6 +175,20 @@ def test_a_refitted_profile_that_could_not_hover_is_refused() -> None:
         refitted(QUAD, [heavy])
     light = refitted(QUAD, [Override("body", "mass_kg", 1.2, "")])
     assert isinstance(light, VehicleProfile) and light.body.mass_kg == 1.2
+
+
+def test_gains_of_the_log_become_those_of_the_profile_where_they_can() -> None:
+    made_up = stepped(0.18, 0.45, 0.15, 0.05)
+    rng = np.random.default_rng(0)
+    air = fit_air(made_up, QUAD, rng)
+    thrust = fit_thrust(made_up, QUAD, air, "thrust", rng)
+    response = fit_response(made_up, QUAD.response, rng)
+    logged = {"MPC_XY_VEL_P_ACC": 2.5, "MPC_THR_HOVER": 5.0, "MPC_TKO_SPEED": 1.5, "COM_X": 1.0}
+    found = overrides_of(QUAD, QUAD, response, thrust, air, logged)
+    # Out of range, as the profile has it, not known here: none of these.
+    parameters = [each for each in found if each.table == "parameters"]
+    assert [(each.key, each.value) for each in parameters] == [("MPC_XY_VEL_P_ACC", 2.5)]
+    assert refitted(QUAD, found).parameters["MPC_XY_VEL_P_ACC"] == 2.5
 
 
 @pytest.mark.parametrize("content", [b"", b"not a log at all", b"ULog\x01\x12\x35\x01" + bytes(40)])
