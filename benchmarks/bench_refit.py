@@ -32,6 +32,7 @@ ASKED = {"dead_s": 0.008, "mass": 0.03, "wind_m_s": 0.5, "t2": 0.02}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--flights", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1, help="seed of the first flight")
     parser.add_argument("--keep", type=Path, help="keep the recordings in this folder")
     parser.add_argument("--rehearsals", type=int, default=0, help="of each flight, on its refit")
     asked = parser.parse_args()
@@ -39,7 +40,7 @@ def main() -> None:
     rows: dict[str, list[RefitErrors]] = {"with the vehicle's log": [], "black box alone": []}
     print("seed  log  dead ms  lag %  mass %  drag %  wind m/s  t2 %")
     with tempfile.TemporaryDirectory() as scratch:
-        for seed in range(1, asked.flights + 1):
+        for seed in range(asked.first, asked.first + asked.flights):
             truth = drawn_truth(seed)
             folder = (asked.keep or Path(scratch)) / f"{seed:03d}"
             flight = truth.fly(folder)

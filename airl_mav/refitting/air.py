@@ -43,8 +43,7 @@ SKEW_S = 0.01
 
 UNSEEN = 2.0
 """Errors of an estimator and gusts change slower than a short flight shows: the variance is so many
-times that which the rows show. Twenty flights of known wind (benchmarks/bench_refit.py) are inside
-the intervals then as often as these say."""
+times that which the rows show. Chosen on the first twenty flights of benchmarks/bench_refit.py."""
 
 LEAST_ROWS = 4 * WINDOW
 DRAWS = 4000
