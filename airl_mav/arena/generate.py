@@ -101,6 +101,7 @@ def generate(
             obstacles=_concatenate(static, moving),
             tours=tours,
             goal=goal,
+            appearance=spec.appearance,
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.arena.appearance import Drawn, draw_appearance
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.appearance import DEFAULT, Appearance
 
 
 class Shape(IntEnum):
@@ -73,11 +76,19 @@ class Arena:
     seed: int
     bounds: Bounds
     wall_colour: tuple[int, int, int]
-    """Red, green, blue, 0-255."""
+    """sRGB, 0-255."""
     obstacles: Obstacles
     """All obstacles; the last `len(tours)` of them move."""
     tours: tuple[Tour, ...]
     goal: NDArray[np.float64]  # (2,) north, east [m] from the start
+    appearance: Appearance = DEFAULT
+    """What the look is drawn from; geometry and depth know none of it."""
+
+    @cached_property
+    def look(self) -> Drawn:
+        """Materials of all surfaces, and the light; drawn when it is first asked for."""
+        moving = len(self.tours)
+        return draw_appearance(self.appearance, self.seed, self.n_static, moving, self.wall_colour)
 
     @property
     def n_static(self) -> int:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core import plugins
 from airl_mav.core.errors import UsageError
+from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.arena import ArenaSpec
 
 
@@ -29,6 +32,8 @@ def generate_own(
         raise UsageError(f"{told}: makes {type(arena).__name__}; accepted: airl_mav's Arena")
     if (problem := _problem(arena)) is not None:
         raise UsageError(f"{told}: {problem}")
+    if arena.appearance == DEFAULT:  # The generator says nothing of it: the profile does.
+        return replace(arena, appearance=spec.appearance)
     return arena
 
 

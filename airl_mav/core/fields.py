@@ -8,16 +8,24 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, PydanticUndefined
+from pydantic_core import (
+    CoreSchema,
+    ErrorDetails,
+    PydanticCustomError,
+    PydanticUndefined,
+    core_schema,
+)
 
 from airl_mav.core.errors import FieldError, UsageError, shown
 
 Model = TypeVar("Model", bound=BaseModel)
+Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
 
 MOST_NAMES = 40
 """Names of fields that a message lists."""
@@ -79,6 +87,40 @@ def quantity(
         lt=lt,
         json_schema_extra={"unit": unit},
     )
+
+
+@dataclass(frozen=True)
+class Each:
+    """Range of every number of a tuple field. The bounds carry pydantic's names for `range_of`."""
+
+    ge: float
+    le: float
+    ascending: bool = False
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Put the checks before and behind the field's own type."""
+        args = get_args(source)
+        length = None if Ellipsis in args else len(args)
+        inner = core_schema.no_info_after_validator_function(self.check, handler(source))
+
+        def listed(value: Any) -> Any:
+            if not isinstance(value, list | tuple) or len(value) != (length or len(value) or -1):
+                raise ValueError(
+                    f"{value!r}; accepted: a list of {length or 'one or more'} numbers"
+                )
+            return value
+
+        return core_schema.no_info_before_validator_function(listed, inner)
+
+    def check(self, values: Numbers) -> Numbers:
+        """Return `values`, or raise when one is out of range or they do not ascend."""
+        if not all(self.ge <= value <= self.le for value in values):
+            raise PydanticCustomError("out_of_range", "out of range")
+        if self.ascending and list(values) != sorted(values):
+            raise ValueError(f"{list(values)}; accepted: numbers in ascending order")
+        return values
 
 
 def unit_of(field: FieldInfo) -> str | None:

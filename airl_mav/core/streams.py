@@ -22,6 +22,7 @@ class Stream(IntEnum):
     WIND = 16
     FAULTS = 17
     STEREO = 18
+    APPEARANCE = 19
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:

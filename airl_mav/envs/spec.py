@@ -8,13 +8,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.fields import Each, ProfileModel, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import STRIP_ROWS, Frames, LayoutName, Told
-from airl_mav.profiles.arena import Each
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 from airl_mav.profiles.vehicle import Camera, load_vehicle

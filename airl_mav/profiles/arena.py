@@ -2,64 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    GetCoreSchemaHandler,
-    SerializerFunctionWrapHandler,
-    model_serializer,
-    model_validator,
-)
-from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
+from airl_mav.profiles.appearance import DEFAULT, Appearance
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 OBSTACLES = "obstacles"
 """The generator that is shipped: `arena.generate`."""
 GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
 Option = bool | int | float | str | list[int | float | str]
-Numbers = TypeVar("Numbers", bound="tuple[float, ...]")
 
 SPHERE_OFFSET = 0.5
 """A sphere's centre is at most this share of its radius off the flight altitude."""
-
-
-@dataclass(frozen=True)
-class Each:
-    """Range of every number of a tuple field. The bounds carry pydantic's names for `range_of`."""
-
-    ge: float
-    le: float
-    ascending: bool = False
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        """Put the checks before and behind the field's own type."""
-        args = get_args(source)
-        length = None if Ellipsis in args else len(args)
-        inner = core_schema.no_info_after_validator_function(self.check, handler(source))
-
-        def listed(value: Any) -> Any:
-            if not isinstance(value, list | tuple) or len(value) != (length or len(value) or -1):
-                raise ValueError(
-                    f"{value!r}; accepted: a list of {length or 'one or more'} numbers"
-                )
-            return value
-
-        return core_schema.no_info_before_validator_function(listed, inner)
-
-    def check(self, values: Numbers) -> Numbers:
-        """Return `values`, or raise when one is out of range or they do not ascend."""
-        if not all(self.ge <= value <= self.le for value in values):
-            raise PydanticCustomError("out_of_range", "out of range")
-        if self.ascending and list(values) != sorted(values):
-            raise ValueError(f"{list(values)}; accepted: numbers in ascending order")
-        return values
 
 
 class Size(ProfileModel):
@@ -161,7 +119,7 @@ class ArenaSpec(ProfileModel):
     description: str = Field(description="one line for people")
     default_seed: int = quantity("seed when none is asked for", "1", ge=0, le=999_999, default=0)
     wall_colour: Annotated[tuple[int, int, int], Each(0, 255)] = quantity(
-        "red, green, blue of all walls", "1", default=(153, 0, 0)
+        "sRGB colour of the walls whose material is wall_colour", "1", default=(153, 0, 0)
     )
     size: Size = Field(default_factory=Size, description="floor and walls")
     start: Start = Field(default_factory=Start, description="where the vehicle takes off")
@@ -203,6 +161,9 @@ class ArenaSpec(ProfileModel):
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
+    appearance: Appearance = Field(
+        default_factory=Appearance, description="what a colour camera sees: materials and light"
+    )
 
     @model_serializer(mode="wrap")
     def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -210,6 +171,8 @@ class ArenaSpec(ProfileModel):
         data: dict[str, Any] = dump(self)
         if self.generator == OBSTACLES and not self.options:
             del data["generator"], data["options"]
+        if self.appearance == DEFAULT:
+            del data["appearance"]
         return data
 
     @model_validator(mode="after")

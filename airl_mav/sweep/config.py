@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.profiles.arena import Each
+from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.profiles.loading import load_profile
 from airl_mav.training.config import SELECTION_SEED, TrainingConfig
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
@@ -52,6 +53,7 @@ class ArenaShown(Message):
     yaw: tuple[float, ...]
     tours: tuple[TourShown, ...]
     goal: tuple[float, float]
+    appearance: Appearance = DEFAULT
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -71,6 +73,7 @@ class ArenaShown(Message):
                 for tour in arena.tours
             ),
             goal=(north, east),
+            appearance=arena.appearance,
         )
 
     def arena(self) -> Arena:
@@ -89,6 +92,7 @@ class ArenaShown(Message):
             ),
             tours=tuple(Tour(np.array(t.times_s), np.array(t.points)) for t in self.tours),
             goal=np.array(self.goal),
+            appearance=self.appearance,
         )
 
 

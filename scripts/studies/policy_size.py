@@ -28,7 +28,7 @@ from size_latency_fit import Fit, fit_times
 from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import describe_machine, package_versions
@@ -37,7 +37,6 @@ from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.layouts import ObservationSpec, boxes
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.policy.template import Size, build_template, template_size
-from airl_mav.profiles.arena import Each
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.heatmap import Field as Cell
 from airl_mav.report.heatmap import HeatMap, draw_heat_map

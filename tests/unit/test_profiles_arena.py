@@ -14,6 +14,8 @@ from airl_mav.core.fields import range_of, unit_of
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 
+NO_NUMBERS = ("description", "shapes", "generator", "options", "materials")
+
 
 def load(text: str, folder: Path) -> ArenaSpec:
     path = folder / "mine.toml"
@@ -63,7 +65,7 @@ def test_every_number_has_meaning_unit_and_range() -> None:
     assert len(seen) > 25
     for path, field in seen.items():
         assert field.description, path
-        if path.rsplit(".", 1)[-1] in {"description", "shapes", "generator", "options"}:
+        if path.rsplit(".", 1)[-1] in {*NO_NUMBERS}:
             continue
         assert unit_of(field) is not None, path
         assert "<= value" in range_of(field), path
@@ -127,6 +129,32 @@ def test_every_number_has_meaning_unit_and_range() -> None:
         ("default_seed = -1", "default_seed = -1: accepted: 0 <= value <= 999999"),
         ("min_clearence_m = 1", "min_clearence_m: unknown field; did you mean 'min_clearance_m'?"),
         ("wall_colour = [1, 2", "not valid TOML: "),
+        (
+            "[appearance.sun]\nelevation_deg = [0, 30]",
+            "appearance.sun.elevation_deg = [0, 30]: accepted: 1 <= value <= 90 deg",
+        ),
+        (
+            "[appearance.fog]\nextinction_1_m = [0.2, 0.1]",
+            "appearance.fog.extinction_1_m: [0.2, 0.1]; accepted: numbers in ascending order",
+        ),
+        (
+            "[appearance.static]\nmaterials = ['brik']",
+            "appearance: static.materials = 'brik': accepted: plaster, concrete, gravel",
+        ),
+        ("[appearance.static]\ntint = 2", "appearance.static.tint = 2: accepted: 0 <= value <= 1"),
+        (
+            "[appearance.materials.mine]\nalbedo = [1, 2, 300]",
+            "appearance.materials.mine.albedo = [1, 2, 300]: accepted: 0 <= value <= 255",
+        ),
+        (
+            "[appearance.materials.mine]\nalbedo = [1, 2, 3]\ntexture = 'stripes'",
+            "appearance.materials.mine.texture = 'stripes': accepted: 'plain'",
+        ),
+        (
+            "[appearance.materials.wall_colour]\nalbedo = [1, 2, 3]",
+            "appearance: materials.wall_colour: this name stands for the arena's own field",
+        ),
+        ("[appearance]\nperiod = 0", "appearance.period = 0: accepted: 1 <= value <= 10000"),
     ],
 )
 def test_wrong_fields_get_one_clear_line(text: str, message: str, tmp_path: Path) -> None:

@@ -1,0 +1,183 @@
+"""What a seed draws of an arena's appearance: a material for each surface, and the light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.streams import Stream, stream
+from airl_mav.profiles.appearance import Appearance, Material, Surfaces, TextureName
+
+Floats = NDArray[np.float64]
+Rgb = tuple[int, int, int]
+
+TEXTURES: tuple[str, ...] = get_args(TextureName)
+"""Texture of each number in `Finish.texture`."""
+
+FLOOR, WALLS, OBSTACLE = 0, 1, 2
+"""Rows of a `Finish`: obstacle i has row OBSTACLE + i."""
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Share of linear red, green and blue in luminance (ITU-R BT.709, the primaries of sRGB)."""
+
+
+class _Part(IntEnum):
+    """Independent draws of one appearance: a change of one kind leaves the others alone."""
+
+    SUN = 0
+    SKY = 1
+    FOG = 2
+    FLOOR = 3
+    WALLS = 4
+    STATIC = 5
+    MOVING = 6
+
+
+@dataclass(frozen=True)
+class Finish:
+    """The materials of m surfaces: floor, walls, then the obstacles in their order."""
+
+    texture: NDArray[np.int8]  # (m,) number in TEXTURES
+    albedo: Floats  # (m, 2, 3) linear RGB 0..1 where the texture is 0, and where it is 1
+    size_m: Floats  # (m,) `Material.size_m`
+    offset: Floats  # (m, 2) where the pattern begins, in its periods, 0..1
+
+
+@dataclass(frozen=True)
+class Light:
+    """Sun, sky and fog. A white surface under the irradiance 1 reads full scale."""
+
+    to_sun: Floats  # (3,) unit vector NED towards the sun
+    sun: Floats  # (3,) linear RGB irradiance of a surface that faces the sun
+    zenith: Floats  # (3,) linear RGB of the sky overhead, as an image shows it
+    horizon: Floats  # (3,) the same at the horizon; the colour of fog
+    extinction: float
+    """Of fog [1/m]."""
+
+    @property
+    def sky(self) -> Floats:
+        """Linear RGB irradiance (3,) of a level surface by the whole sky.
+
+        Two times the integral of (horizon + (zenith - horizon) x) x for x, the sine of the
+        elevation, from 0 to 1.
+        """
+        return (self.horizon + 2.0 * self.zenith) / 3.0
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The appearance of one concrete arena."""
+
+    finish: Finish
+    light: Light
+
+
+def draw_appearance(
+    appearance: Appearance,
+    seed: int,
+    n_static: int,
+    n_moving: int,
+    wall_colour: Rgb,
+) -> Drawn:
+    """Draw the appearance of an arena. Same arguments, same appearance.
+
+    Args:
+        appearance: Knobs.
+        seed: Of the arena; runs of `appearance.period` seeds share what is drawn.
+        n_static: Number of obstacles that stand still.
+        n_moving: Number of obstacles that move.
+        wall_colour: sRGB of the material `wall_colour`, 0-255.
+    """
+    draw = seed // appearance.period
+    kinds: list[tuple[_Part, Surfaces, int]] = [
+        (_Part.FLOOR, appearance.floor, 1),
+        (_Part.WALLS, appearance.walls, 1),
+        (_Part.STATIC, appearance.static, n_static),
+        (_Part.MOVING, appearance.moving, n_moving),
+    ]
+    rows = [
+        _surfaces(stream(draw, Stream.APPEARANCE, part), n, kind, appearance, wall_colour)
+        for part, kind, n in kinds
+        if n
+    ]
+    texture, albedo, size, offset = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    return Drawn(Finish(texture.astype(np.int8), albedo, size, offset), _light(appearance, draw))
+
+
+def _surfaces(
+    rng: np.random.Generator,
+    n: int,
+    kind: Surfaces,
+    appearance: Appearance,
+    wall_colour: Rgb,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Draw n surfaces of a kind: texture, albedos, size and offset, as in `Finish`.
+
+    Everything is drawn whether or not it is used, and surface by surface: neither a knob nor the
+    number of surfaces changes the other draws.
+    """
+    draws = rng.random((n, 7))
+    materials = [appearance.material(name, wall_colour) for name in kind.materials]
+    chosen = (draws[:, 0] * len(materials)).astype(np.intp)
+    dark, bright = kind.brightness
+    factor = (dark + (bright - dark) * draws[:, 1, None]) * (
+        1.0 + kind.tint * (2.0 * draws[:, 2:5] - 1.0)
+    )
+    albedo = np.array([_albedos(material) for material in materials])[chosen] * factor[:, None]
+    texture = np.array([TEXTURES.index(material.texture) for material in materials], np.float64)
+    size = np.array([material.size_m for material in materials])
+    return texture[chosen], np.clip(albedo, 0.0, 1.0), size[chosen], draws[:, 5:]
+
+
+def _albedos(material: Material) -> Floats:
+    """Return both albedos (2, 3), linear RGB."""
+    second = material.albedo if material.albedo_2 is None else material.albedo_2
+    return linear_of(np.array([material.albedo, second]) / 255.0)
+
+
+def _light(appearance: Appearance, draw: int) -> Light:
+    """Draw sun, sky and fog."""
+    sun, sky = appearance.sun, appearance.sky
+    rng = stream(draw, Stream.APPEARANCE, _Part.SUN)
+    azimuth, elevation = (
+        math.radians(rng.uniform(*span)) for span in (sun.azimuth_deg, sun.elevation_deg)
+    )
+    sun_irradiance = rng.uniform(*sun.irradiance)
+    sky_irradiance = stream(draw, Stream.APPEARANCE, _Part.SKY).uniform(*sky.irradiance)
+    extinction = stream(draw, Stream.APPEARANCE, _Part.FOG).uniform(*appearance.fog.extinction_1_m)
+    level = math.cos(elevation)
+    to_sun = (level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation))
+    zenith, horizon = (linear_of(np.array(c) / 255.0) for c in (sky.zenith, sky.horizon))
+    whole = float(LUMINANCE @ (horizon + 2.0 * zenith) / 3.0)
+    scale = sky_irradiance / whole if whole > 0.0 else 0.0
+    colour = linear_of(np.array(sun.colour) / 255.0)
+    luminance = float(LUMINANCE @ colour)
+    return Light(
+        to_sun=np.array(to_sun),
+        sun=colour * (sun_irradiance / luminance if luminance > 0.0 else 0.0),
+        zenith=scale * zenith,
+        horizon=scale * horizon,
+        extinction=float(extinction),
+    )
+
+
+def linear_of(encoded: Floats) -> Floats:
+    """Return linear light of sRGB values, both 0..1 (IEC 61966-2-1)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_of(linear: Floats) -> Floats:
+    """Return sRGB values of linear light, both 0..1 (IEC 61966-2-1); clipped."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1.0 / 2.4) - 0.055)
+
+
+def srgb_bytes(linear: Floats) -> tuple[int, int, int]:
+    """Return linear RGB (3,) as sRGB 0-255."""
+    red, green, blue = (round(255.0 * float(channel)) for channel in srgb_of(linear))
+    return red, green, blue

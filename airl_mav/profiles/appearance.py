@@ -1,0 +1,213 @@
+"""What an arena looks like to a colour camera: materials, textures, sun, sky and fog.
+
+Every pair of numbers is [least, greatest], drawn uniformly for each seed. Colours are sRGB, 0-255.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from airl_mav.core.fields import Each, ProfileModel, quantity
+
+TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
+Colour = Annotated[tuple[int, int, int], Each(0, 255)]
+Materials = Annotated[tuple[str, ...], Field(min_length=1)]
+
+WALL_COLOUR = "wall_colour"
+"""The plain material whose albedo is the arena's `wall_colour`."""
+
+
+class Material(ProfileModel):
+    """A matt (Lambertian) material: two albedos, and the texture that mixes them."""
+
+    albedo: Colour = quantity(
+        "reflectance, as an sRGB colour, where the pattern is 0: mortar, shade between leaves", "1"
+    )
+    albedo_2: Colour | None = quantity(
+        "reflectance where the pattern is 1: bricks, leaves; left out: as albedo",
+        "1",
+        default=None,
+    )
+    texture: TextureName = Field(
+        default="plain",
+        description="pattern: plain, checker, value noise in three octaves, bricks in mortar, or"
+        " leaves over each other",
+    )
+    size_m: float = quantity(
+        "side of a check, length of a brick, width of a leaf, wavelength of the coarsest noise",
+        "m",
+        ge=0.02,
+        le=50,
+        default=0.5,
+    )
+
+
+MATERIALS: dict[str, Material] = {
+    "plaster": Material(albedo=(222, 214, 196)),
+    "concrete": Material(
+        albedo=(122, 120, 115), albedo_2=(184, 181, 174), texture="noise", size_m=0.8
+    ),
+    "gravel": Material(albedo=(96, 90, 80), albedo_2=(176, 168, 152), texture="noise", size_m=0.6),
+    "grass": Material(albedo=(66, 92, 42), albedo_2=(128, 148, 76), texture="noise", size_m=0.7),
+    "brick": Material(albedo=(206, 196, 182), albedo_2=(170, 84, 62), texture="brick", size_m=0.5),
+    "foliage": Material(
+        albedo=(30, 56, 24), albedo_2=(124, 158, 70), texture="foliage", size_m=0.25
+    ),
+    "checker": Material(
+        albedo=(38, 38, 40), albedo_2=(232, 232, 228), texture="checker", size_m=0.5
+    ),
+    "orange": Material(albedo=(240, 130, 30)),
+}
+"""Materials that every arena can name."""
+
+
+def _materials(*default: str) -> Any:
+    """Declare the materials of a kind of surface."""
+    known = ", ".join((*MATERIALS, WALL_COLOUR))
+    return Field(
+        default=default,
+        description="names, of which one is drawn with equal odds for each surface of this kind:"
+        f" {known}, or one of appearance.materials",
+    )
+
+
+def _brightness(least: float, greatest: float) -> Any:
+    """Declare by how much the albedo of a kind of surface differs."""
+    return quantity(
+        "factor of the albedo, drawn for each surface; albedos end at 1",
+        "1",
+        default=(least, greatest),
+    )
+
+
+def _tint(default: float) -> Any:
+    """Declare by how much the colour of a kind of surface differs."""
+    return quantity(
+        "each colour channel's albedo is changed by a factor between 1 - tint and 1 + tint, drawn"
+        " for each surface",
+        "1",
+        ge=0,
+        le=1,
+        default=default,
+    )
+
+
+Brightness = Annotated[tuple[float, float], Each(0, 4, ascending=True)]
+
+
+class Surfaces(ProfileModel):
+    """The four walls together: the materials of one kind of surface."""
+
+    materials: Materials = _materials(WALL_COLOUR)
+    brightness: Brightness = _brightness(1.0, 1.0)
+    tint: float = _tint(0.0)
+
+
+class Floor(Surfaces):
+    """The floor."""
+
+    materials: Materials = _materials("gravel")
+
+
+class Standing(Surfaces):
+    """Each obstacle that stands still."""
+
+    materials: Materials = _materials("brick", "concrete", "foliage", "plaster")
+    brightness: Brightness = _brightness(0.8, 1.2)
+    tint: float = _tint(0.1)
+
+
+class Moving(Surfaces):
+    """Each obstacle that moves."""
+
+    materials: Materials = _materials("orange")
+
+
+class Sun(ProfileModel):
+    """The sun, infinitely far away, with hard shadows."""
+
+    azimuth_deg: Annotated[tuple[float, float], Each(-360, 360, ascending=True)] = quantity(
+        "direction it stands in, clockwise from north", "deg", default=(0.0, 360.0)
+    )
+    elevation_deg: Annotated[tuple[float, float], Each(1, 90, ascending=True)] = quantity(
+        "height above the horizon", "deg", default=(30.0, 60.0)
+    )
+    irradiance: Annotated[tuple[float, float], Each(0, 10, ascending=True)] = quantity(
+        "luminous irradiance of a surface that faces it; a white surface under 1 reads full scale;"
+        " 0 at night",
+        "1",
+        default=(0.7, 0.7),
+    )
+    colour: Colour = quantity("colour of its light", "1", default=(255, 246, 230))
+
+
+class Sky(ProfileModel):
+    """The sky without clouds: its radiance goes from horizon to zenith with the sine of elevation.
+
+    It lights surfaces without shadows, by the share of the sky that their tilt lets them see.
+    """
+
+    irradiance: Annotated[tuple[float, float], Each(0, 10, ascending=True)] = quantity(
+        "luminous irradiance of a level surface, in the sun's unit; about 0.01 at night",
+        "1",
+        default=(0.4, 0.4),
+    )
+    zenith: Colour = quantity("colour overhead", "1", default=(120, 170, 236))
+    horizon: Colour = quantity("colour at the horizon, and of fog", "1", default=(214, 226, 238))
+
+
+class Fog(ProfileModel):
+    """Fog of one density, which takes on the colour of the horizon."""
+
+    extinction_1_m: Annotated[tuple[float, float], Each(0, 2, ascending=True)] = quantity(
+        "extinction coefficient of Beer-Lambert's law; 3 over it is the meteorological optical"
+        " range [m]; 0: no fog",
+        "1/m",
+        default=(0.0, 0.0),
+    )
+
+
+class Appearance(ProfileModel):
+    """What a colour camera sees. It has random streams of its own: the geometry knows none of it.
+
+    Depth images know none of it either.
+    """
+
+    period: int = quantity(
+        "consecutive seeds that share one drawn appearance", "1", ge=1, le=10_000, default=1
+    )
+    materials: dict[str, Material] = Field(
+        default_factory=dict, description="materials of your own, by name"
+    )
+    floor: Floor = Field(default_factory=Floor, description="the floor")
+    walls: Surfaces = Field(default_factory=Surfaces, description="the four walls together")
+    static: Standing = Field(
+        default_factory=Standing, description="each obstacle that stands still"
+    )
+    moving: Moving = Field(default_factory=Moving, description="each obstacle that moves")
+    sun: Sun = Field(default_factory=Sun, description="direct light")
+    sky: Sky = Field(default_factory=Sky, description="what is above the walls, and diffuse light")
+    fog: Fog = Field(default_factory=Fog, description="what hides far things")
+
+    @model_validator(mode="after")
+    def _materials_are_known(self) -> Appearance:
+        known = [*MATERIALS, WALL_COLOUR, *self.materials]
+        if WALL_COLOUR in self.materials:
+            raise ValueError(f"materials.{WALL_COLOUR}: this name stands for the arena's own field")
+        for kind in ("floor", "walls", "static", "moving"):
+            for name in getattr(self, kind).materials:
+                if name not in known:
+                    raise ValueError(f"{kind}.materials = {name!r}: accepted: {', '.join(known)}")
+        return self
+
+    def material(self, name: str, wall_colour: tuple[int, int, int]) -> Material:
+        """Return a material by name; one of the arena's own goes before a shipped one."""
+        if name == WALL_COLOUR:
+            return Material(albedo=wall_colour)
+        return self.materials[name] if name in self.materials else MATERIALS[name]
+
+
+DEFAULT = Appearance()
+"""That of an arena whose profile says nothing of it."""
