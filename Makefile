@@ -89,6 +89,7 @@ results-docs: $(ALL)  ## Write the figures of pages and cards from results/*.jso
 .PHONY: bench
 bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-python P ...")
 	$(BIN)/python benchmarks/bench_depth.py
+	$(BIN)/python benchmarks/bench_colour.py
 	$(BIN)/python benchmarks/bench_stack.py
 	$(BIN)/python benchmarks/bench_policy.py
 	$(BIN)/python benchmarks/bench_compensation.py

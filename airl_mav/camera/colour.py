@@ -1,0 +1,185 @@
+"""Colour image of an arena: bodies of `raycast`, then shadows, then what each body looks like.
+
+One ray a pixel. Like depth it is drawn obstacle by obstacle: each shades the pixels of its
+rectangles that see it. Depth, light and colour of the lines are planes of 32 bits, so that every
+loop along a line vectorises.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera.primitives import OBSTACLE, Ids
+from airl_mav.camera.projection import MIN_DEPTH_M, Pose
+from airl_mav.camera.raycast import aim, draw_bodies, invert
+from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, surface_of
+from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
+from airl_mav.camera.surfaces import draw_sky, shade_obstacle, shade_room
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle.rotation import Quat, Vec
+
+RANGE_M: Final = 10_000.0
+"""How far a colour camera sees [m]: beyond every arena."""
+
+
+@kernel
+def render_colour(
+    rgb: NDArray[np.uint8],
+    depth: Plane,
+    seen: Ids,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+    focal: float,
+    cx: float,
+    cy: float,
+    cylindrical: bool,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    lights: NDArray[np.float32],
+    atlas: Plane,
+) -> None:
+    """Render the colour image of an arena.
+
+    Args:
+        rgb: (height, width, 3) sRGB, written; black from inside an obstacle.
+        depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
+            written; 0: no surface.
+        seen: (height, width) what each pixel sees, written: SKY, FLOOR, ... of `primitives`, for an
+            obstacle OBSTACLE + its number.
+        position: As of `render_depth`, with the rest up to `yaw`.
+        quaternion: (4,).
+        focal: Focal length.
+        cx: Column of the optical axis.
+        cy: Row of the optical axis.
+        cylindrical: The image is a cylinder's.
+        bounds: (5,).
+        shape: (n,).
+        center: (n, 3).
+        half_size: (n, 3).
+        yaw: (n,).
+        texture: (2 + n,) `Finish.texture`.
+        per_m: (2 + n,) periods of the pattern for a metre.
+        offset: (2 + n, 2) `Finish.offset`.
+        albedo: (2 + n, 2, 3) `Finish.albedo`.
+        lights: (7, 3) direction of the sun, its irradiance, that of the sky, the floor's mean
+            radiosity, zenith, horizon; then the fog's extinction [1/m] in the first column.
+        atlas: `textures.atlas()`.
+    """
+    camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
+    height, width = depth.shape
+    n_lines, n_pixels = (width, height) if cylindrical else (height, width)
+    xs, lines = np.empty(n_pixels), np.empty((n_lines, 2))
+    view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
+    far = np.empty((n_lines, n_pixels), np.float32) if cylindrical else depth
+    ids = np.empty((n_lines, n_pixels), np.int32) if cylindrical else seen
+    rectangles = np.zeros((len(shape), 3, 4), np.int32)
+    inside = draw_bodies(
+        far, ids, rectangles, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw
+    )
+    if inside >= 0:
+        rgb[:, :, :] = 0
+        depth[:, :] = MIN_DEPTH_M
+        seen[:, :] = OBSTACLE + inside
+        return
+    invert(far)
+    light = _lit(lights)
+    lit, clear = (
+        np.empty((n_lines, n_pixels), np.float32),
+        np.empty((n_lines, n_pixels), np.float32),
+    )
+    out = np.empty((n_lines, n_pixels), np.int32)
+    points = Points(
+        np.empty(n_pixels, np.int32),
+        np.empty(n_pixels, np.float32),
+        np.empty(n_pixels, np.float32),
+        np.empty(n_pixels, np.float32),
+    )
+    to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
+    extinction = float(light.extinction)
+    shade_by_walls(lit, clear, far, lines, xs, axes, camera, bounds, to_sun, extinction)
+    corners = np.empty((CORNERS, 3))
+    sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
+    for i in range(len(shape)):
+        if sunny:
+            world, half = _placed(axes, camera, center, half_size, i)
+            shade_by_obstacle(
+                lit, far, ids, corners, i, lines, xs, view, world, camera, shape[i], half, yaw[i],
+                to_sun,
+            )  # fmt: skip
+    draw_sky(out, ids, points, lines, xs, axes, camera, light)
+    pixel2 = F32(1.0 / (focal * focal))
+    floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
+    walls = surface_of(texture, per_m, offset, albedo, WALLS_ROW)
+    shade_room(
+        out, ids, far, lit, clear, points, lines, xs, axes, camera, floor, walls, light, atlas,
+        pixel2,
+    )  # fmt: skip
+    for i in range(len(shape)):
+        world, half = _placed(axes, camera, center, half_size, i)
+        surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
+        for k in range(3 if cylindrical else 1):
+            shade_obstacle(
+                out, ids, far, lit, clear, points, rectangles[i, k], i, lines, xs, world, shape[i],
+                half, yaw[i], surface, light, atlas, pixel2,
+            )  # fmt: skip
+    _unpack(rgb, out, cylindrical)
+    if cylindrical:
+        depth[:, :] = far.T
+        seen[:, :] = ids.T
+
+
+@kernel
+def _placed(
+    axes: Pose, camera: Vec, center: NDArray[np.float64], half_size: NDArray[np.float64], i: int
+) -> tuple[Pose, Vec]:
+    """Return the camera's axes with an obstacle's centre from the camera, and its half size."""
+    offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
+    half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
+    return Pose(axes.forward, axes.across, axes.along, offset), half
+
+
+@kernel
+def _lit(lights: NDArray[np.float32]) -> Lit:
+    """Return the light of its array."""
+    return Lit(
+        (lights[0, 0], lights[0, 1], lights[0, 2]),
+        (lights[1, 0], lights[1, 1], lights[1, 2]),
+        (lights[2, 0], lights[2, 1], lights[2, 2]),
+        (lights[3, 0], lights[3, 1], lights[3, 2]),
+        (lights[4, 0], lights[4, 1], lights[4, 2]),
+        (lights[5, 0], lights[5, 1], lights[5, 2]),
+        lights[6, 0],
+    )
+
+
+@kernel
+def _unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
+    """Write the image of its packed lines."""
+    if cylindrical:
+        for v in range(rgb.shape[0]):
+            for u in range(rgb.shape[1]):
+                colour = out[u, v]
+                rgb[v, u, 0] = colour & 255
+                rgb[v, u, 1] = (colour >> 8) & 255
+                rgb[v, u, 2] = (colour >> 16) & 255
+        return
+    for v in range(rgb.shape[0]):
+        row, pixels = rgb[v], out[v]
+        for u in range(len(pixels)):
+            colour = pixels[u]
+            row[u, 0] = colour & 255
+            row[u, 1] = (colour >> 8) & 255
+            row[u, 2] = (colour >> 16) & 255

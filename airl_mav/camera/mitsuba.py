@@ -1,0 +1,266 @@
+"""An arena and a camera as a scene of Mitsuba 3: path tracing, the reference of `colour`.
+
+Light goes as far as it does: shadows of the sky in corners, colour that one surface throws onto
+another. None of this is in the fast images. Fog and cylindrical cameras are not here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
+from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.camera.colour import RANGE_M
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.textures import PERIOD, means, pattern
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_to_matrix
+
+Floats = NDArray[np.float64]
+
+VARIANT = "scalar_rgb"
+"""Needs no compiler and no GPU."""
+
+MOST_BOUNCES = 8
+
+_SKY_ROWS = 256
+
+
+def path_traced(
+    arena: Arena,
+    centers: Floats,
+    intrinsics: Intrinsics,
+    position: Floats,
+    quaternion: Floats,
+    *,
+    samples: int,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    """Return the sRGB image (height, width, 3) of an arena by Mitsuba's path tracer.
+
+    Args:
+        arena: What is seen.
+        centers: (n, 3) present obstacle centres NED [m].
+        intrinsics: The camera, a pinhole.
+        position: (3,) camera NED [m].
+        quaternion: (4,) unit [w, x, y, z] camera -> NED.
+        samples: Paths a pixel.
+        seed: Of the paths.
+
+    Raises:
+        UsageError: The arena has fog, or the camera is a cylinder.
+        ImportError: Mitsuba is not installed: the extra `render`.
+    """
+    if intrinsics.cylindrical:
+        raise UsageError("renderer mitsuba: accepted: a pinhole camera, not a cylindrical one")
+    if arena.look.light.extinction > 0.0:
+        raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
+    import mitsuba as mi
+
+    mi.set_variant(VARIANT)
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": MOST_BOUNCES},
+        "sensor": _sensor(mi, intrinsics, position, quaternion, samples),
+        **_lights(mi, arena.look.light),
+        **_bodies(mi, arena, centers),
+    }
+    rendered = np.array(mi.render(mi.load_dict(scene), seed=seed))
+    encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(rendered[..., :3])).astype(np.uint8)
+    return encoded
+
+
+def _sensor(
+    mi: Any, k: Intrinsics, position: Floats, quaternion: Floats, samples: int
+) -> dict[str, Any]:
+    forward, right, down = quat_to_matrix(quaternion).T
+    # Its camera looks along +z; x points to the left of the image, y up.
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([-right, -down, forward, position])
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": math.degrees(k.horizontal_fov_rad),
+        "near_clip": 0.001,
+        "far_clip": 2.0 * RANGE_M,
+        "to_world": mi.ScalarTransform4f(pose),
+        "film": {
+            "type": "hdrfilm",
+            "width": k.width,
+            "height": k.height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+        },
+        "sampler": {"type": "independent", "sample_count": samples},
+    }
+
+
+def _lights(mi: Any, light: Light) -> dict[str, Any]:
+    """Return sun and sky. A white surface reflects 1 / pi of its irradiance to each side."""
+    sine = np.sin((0.5 - (np.arange(_SKY_ROWS) + 0.5) / _SKY_ROWS) * math.pi).clip(0.0)
+    rows = light.horizon + sine[:, None] * (light.zenith - light.horizon)
+    sky = np.repeat(rows[:, None], 2 * _SKY_ROWS, axis=1).astype(np.float32)
+    # The map's pole is +y; up is -z here.
+    turn = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)
+    lights: dict[str, Any] = {
+        "sky": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(sky),
+            "to_world": mi.ScalarTransform4f(turn),
+        }
+    }
+    if light.sun.any():
+        lights["sun"] = {
+            "type": "directional",
+            "direction": (-light.to_sun).tolist(),
+            "irradiance": {"type": "rgb", "value": (math.pi * light.sun).tolist()},
+        }
+    return lights
+
+
+def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
+    b, finish, o = arena.bounds, arena.look.finish, arena.obstacles
+    north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
+    half_n, half_e, half_h = b.north_max - north, b.east_max - east, 0.5 * b.height
+    x, y, z = np.eye(3)
+    made = [
+        # Across is east, along (down in the image of the pattern) is south.
+        _face(mi, finish, FLOOR, np.array([north, east, 0.0]), half_e * y, -half_n * x),
+        _ground(mi, finish),
+    ]
+    for side in (-1.0, 1.0):
+        at = np.array([north + side * half_n, east, -half_h])
+        made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
+        at = np.array([north, east + side * half_e, -half_h])
+        made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+    for i in range(len(o)):
+        row, half, at = OBSTACLE + i, o.half_size[i], centers[i]
+        if o.shape[i] == Shape.BOX:
+            made += _box(mi, finish, row, at, half, float(o.yaw[i]))
+        elif o.shape[i] == Shape.CYLINDER:
+            made += _cylinder(mi, finish, row, at, half)
+        else:
+            made.append(_sphere(mi, finish, row, at, float(half[0])))
+    return {f"body_{k}": body for k, body in enumerate(made)}
+
+
+def _face(
+    mi: Any,
+    finish: Finish,
+    row: int,
+    center: Floats,
+    across: Floats,
+    along: Floats,
+    origin: Floats | None = None,
+) -> dict[str, Any]:
+    """Return a rectangle. Its pattern is measured in the world, or from an origin."""
+    pose = np.eye(4)
+    pose[:3, :4] = np.column_stack([across, along, np.cross(across, along), center])
+    pose[:3, 2] /= np.linalg.norm(pose[:3, 2])
+    width, height = float(np.linalg.norm(across)), float(np.linalg.norm(along))
+    middle = center if origin is None else center - origin
+    first = middle @ across / width - width, middle @ along / height - height
+    per_m = _per_m(finish, row)
+    size, begin = (2.0 * width * per_m, 2.0 * height * per_m), finish.offset[row]
+    start = (float(first[0] * per_m + begin[0]), float(first[1] * per_m + begin[1]))
+    bsdf = _material(mi, finish, row, size, start)
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
+
+
+def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
+    """Return the ground beyond the walls, of the floor's mean albedo, just below it."""
+    dark, bright = finish.albedo[FLOOR]
+    mean = dark + means()[finish.texture[FLOOR]] * (bright - dark)
+    pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
+    pose[2, 3] = 0.01
+    return {"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": _diffuse(mean)}
+
+
+def _box(
+    mi: Any, finish: Finish, row: int, center: Floats, half: Floats, yaw: float
+) -> list[dict[str, Any]]:
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    a, b, c = half[:, None] * axes
+    faces = [(a, b, c), (b, a, c), (c, a, b)]
+    return [
+        _face(mi, finish, row, center + side * out, across, along, origin=center)
+        for out, across, along in faces
+        for side in (-1.0, 1.0)
+    ]
+
+
+def _cylinder(
+    mi: Any, finish: Finish, row: int, center: Floats, half: Floats
+) -> list[dict[str, Any]]:
+    radius, height, per_m = float(half[0]), float(half[2]), _per_m(finish, row)
+    begin = finish.offset[row]
+    # Its second place goes from end to end, here from the top down.
+    bsdf = _material(
+        mi,
+        finish,
+        row,
+        (_around(finish, row, radius), 2.0 * height * per_m),
+        (begin[0], begin[1] - height * per_m),
+    )
+    ends = [(center + np.array([0.0, 0.0, side * height])).tolist() for side in (-1.0, 1.0)]
+    side = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": bsdf}
+    dark, bright = finish.albedo[row]
+    mean = _diffuse(dark + means()[finish.texture[row]] * (bright - dark))
+    caps = []
+    for end in ends:
+        pose = np.diag([radius, radius, 1.0, 1.0])
+        pose[:3, 3] = end
+        caps.append({"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": mean})
+    return [side, *caps]
+
+
+def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) -> dict[str, Any]:
+    around, begin = _around(finish, row, radius), finish.offset[row]
+    # Its second place goes from the pole at +z, down, to the other one.
+    bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
+    return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
+
+
+def _per_m(finish: Finish, row: int) -> float:
+    """Return the periods of a pattern for a metre."""
+    return 1.0 / (float(finish.size_m[row]) * PERIOD[TEXTURES[finish.texture[row]]])
+
+
+def _around(finish: Finish, row: int, radius: float) -> float:
+    """Return the periods of a pattern around a body."""
+    return max(round(2.0 * math.pi * radius * _per_m(finish, row)), 1.0)
+
+
+def _diffuse(albedo: Floats) -> dict[str, Any]:
+    colour = {"type": "rgb", "value": albedo.tolist()}
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
+
+
+def _material(
+    mi: Any,
+    finish: Finish,
+    row: int,
+    size: tuple[float, float],
+    start: tuple[float, float],
+) -> dict[str, Any]:
+    """Return a material whose pattern begins at `start` and goes on for `size`, in periods."""
+    name = TEXTURES[finish.texture[row]]
+    dark, bright = finish.albedo[row]
+    if name == "plain":
+        return _diffuse(dark)
+    texels = (dark + pattern(name)[..., None] * (bright - dark)).astype(np.float32)
+    place = np.eye(4)
+    place[0, 0], place[1, 1], place[0, 3], place[1, 3] = *size, *start
+    texture = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(texels),
+        "raw": True,
+        "filter_type": "nearest",
+        "to_uv": mi.ScalarTransform4f(place),
+    }
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}

@@ -1,0 +1,132 @@
+"""What a colour camera sees of an arena: colour, depth and what is seen, from one pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import TEXTURES, Drawn, linear_of, srgb_of
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.colour import render_colour
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.textures import PERIOD, atlas, means
+from airl_mav.vehicle.rotation import Quat, Vec
+
+LUMA = (0.299, 0.587, 0.114)
+"""Shares of red, green and blue in grey: luma of ITU-R BT.601, as OpenCV and Pillow have it."""
+
+
+class Picture(NamedTuple):
+    """What a colour camera sees in one exposure."""
+
+    rgb: NDArray[np.uint8]  # (height, width, 3) sRGB
+    depth_m: NDArray[np.float32]  # (height, width), 0 = no surface
+    seen: NDArray[np.int32]  # (height, width) SKY, FLOOR, ... of `raycast`, OBSTACLE + i
+
+
+@dataclass(frozen=True)
+class ColourArrays:
+    """The look of an arena as `render_colour` takes it."""
+
+    texture: NDArray[np.int8]  # (m,)
+    per_m: NDArray[np.float32]  # (m,) [1/m]
+    offset: NDArray[np.float32]  # (m, 2)
+    albedo: NDArray[np.float32]  # (m, 2, 3)
+    lights: NDArray[np.float32]  # (7, 3)
+
+    @classmethod
+    def of(cls, look: Drawn) -> ColourArrays:
+        """Return the arrays of a drawn appearance."""
+        finish, light = look.finish, look.light
+        periods = np.array([PERIOD[name] for name in TEXTURES])
+        floor = finish.albedo[FLOOR_ROW]
+        share = means()[finish.texture[FLOOR_ROW]]
+        radiosity = (floor[0] + share * (floor[1] - floor[0])) * (
+            light.sky - light.to_sun[2] * light.sun
+        )
+        lights = [light.to_sun, light.sun, light.sky, radiosity, light.zenith, light.horizon]
+        lights.append(np.array([light.extinction, 0.0, 0.0]))
+        return cls(
+            finish.texture,
+            (1.0 / (finish.size_m * periods[finish.texture])).astype(np.float32),
+            finish.offset.astype(np.float32),
+            finish.albedo.astype(np.float32),
+            np.array(lights, np.float32),
+        )
+
+
+def render_picture(
+    arena: Arena,
+    centers: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+) -> Picture:
+    """Return the colour image of an arena, with depth and what is seen; arguments as of `render`.
+
+    Depth has no limit of range.
+    """
+    k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
+    shape = (k.height, k.width)
+    picture = Picture(
+        np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
+    )
+    render_colour(
+        *picture,
+        position,
+        quaternion,
+        k.focal,
+        k.cx,
+        k.cy,
+        k.cylindrical,
+        arena.bounds.as_array(),
+        obstacles.shape,
+        centers,
+        obstacles.half_size,
+        obstacles.yaw,
+        look.texture,
+        look.per_m,
+        look.offset,
+        look.albedo,
+        look.lights,
+        atlas(),
+    )
+    return picture
+
+
+def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return sRGB images (..., 3) as grey ones (...): luma of the encoded numbers, rounded."""
+    luma: NDArray[np.uint8] = np.rint(rgb @ np.array(LUMA)).astype(np.uint8)
+    return luma
+
+
+def antialiased(
+    arena: Arena,
+    centers: NDArray[np.float64],
+    intrinsics: Intrinsics,
+    position: Vec | NDArray[np.float64],
+    quaternion: Quat | NDArray[np.float64],
+    side: int,
+) -> NDArray[np.uint8]:
+    """Return the sRGB image (height, width, 3) of side x side rays a pixel: their mean of light.
+
+    The sensor has one ray a pixel (`render_picture`, with the other arguments); this is for people.
+    """
+    k = intrinsics
+    fine = replace(
+        k,
+        width=side * k.width,
+        height=side * k.height,
+        focal=side * k.focal,
+        cx=side * (k.cx + 0.5) - 0.5,
+        cy=side * (k.cy + 0.5) - 0.5,
+    )
+    codes = render_picture(arena, centers, fine, position, quaternion).rgb
+    light = linear_of(np.arange(256) / 255.0)[codes]
+    mean = light.reshape(k.height, side, k.width, side, 3).mean(axis=(1, 3))
+    rgb: NDArray[np.uint8] = np.rint(255.0 * srgb_of(mean)).astype(np.uint8)
+    return rgb

@@ -1,0 +1,270 @@
+"""The inverse depth of one body along the lines of an image: room, box, cylinder, sphere.
+
+How it is worked out says `raycast`, which puts the bodies together.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Shape
+from airl_mav.camera.projection import Image, Pose, Rectangle, View, dot
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+
+BOX: Final = int(Shape.BOX)
+CYLINDER: Final = int(Shape.CYLINDER)
+
+SKY: Final = 0
+FLOOR: Final = 1
+WALL_NORTH_SOUTH: Final = 2
+WALL_EAST_WEST: Final = 3
+OBSTACLE: Final = 4
+"""What a pixel sees: the first obstacle has this number, the next ones those after it."""
+
+_UNLIMITED: Final = 1e30  # inverse depth of an entry that lies behind the camera
+TINY: Final = 1e-9  # least distance to a plane [m], least range [1/m]; keeps inverses finite
+
+Line = NDArray[np.float64]
+Ids = NDArray[np.int32]
+Rectangles = NDArray[np.int32]
+Lines = NDArray[np.float64]
+"""(n, 2) how much of the forward axis, and of the axis across, is in the first ray of a line."""
+
+
+class _Slab(NamedTuple):
+    """Inverse depths at two parallel planes, for a ray's component d across them.
+
+    Entry: enter_gain d + enter_base. Exit: the greater of exit_a d and exit_b d.
+    """
+
+    enter_gain: float
+    enter_base: float
+    exit_a: float
+    exit_b: float
+
+
+@kernel
+def _slab(low: float, high: float) -> _Slab:
+    """Return the slab between two planes at signed distances low < high from the camera."""
+    if low > 0.0:
+        return _Slab(1.0 / max(low, TINY), 0.0, 1.0 / max(high, TINY), 0.0)
+    if high < 0.0:
+        return _Slab(1.0 / min(high, -TINY), 0.0, 1.0 / min(low, -TINY), 0.0)
+    return _Slab(0.0, _UNLIMITED, 1.0 / min(low, -TINY), 1.0 / max(high, TINY))
+
+
+@kernel
+def _turn(v: Vec, cos: float, sin: float) -> Vec:
+    """Return a world vector along axes that are turned about the vertical."""
+    return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2])
+
+
+@kernel
+def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
+    """Return a line's ray at x = 0."""
+    f, d = pose.forward, pose.across
+    return (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
+
+
+@kernel
+def draw_room(
+    out: Image,
+    ids: Ids | None,
+    lines: Lines,
+    xs: Line,
+    view: View,
+    pose: Pose,
+    half: Vec,
+) -> None:
+    """Write the inverse depth of floor and walls; 0 = no return. And what is seen, in `ids`.
+
+    The room is a box without a lid. A ray that leaves it by the lid sees nothing, one that enters
+    by the lid sees the inside, any other that enters sees a wall from outside.
+    """
+    c, r = pose.center, pose.along
+    north = _slab(c[0] - half[0], c[0] + half[0])
+    east = _slab(c[1] - half[1], c[1] + half[1])
+    floor, top = 1.0 / (c[2] + half[2]), c[2] - half[2]
+    above = top > 0.0
+    lid = 1.0 / (max(top, TINY) if above else min(top, -TINY))
+    enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
+    for v in range(out.shape[0]):
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        row = out[v]
+        if ids is not None:
+            marks = ids[v]
+        for u in range(len(xs)):
+            x = xs[u]
+            n, e, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            by_side = min(
+                north.enter_gain * n + north.enter_base, east.enter_gain * e + east.enter_base
+            )
+            by_lid = enter_gain * d + enter_base
+            leave = max(
+                max(north.exit_a * n, north.exit_b * n),
+                max(max(east.exit_a * e, east.exit_b * e), floor * d),
+            )
+            leave_lid = exit_gain * d
+            inner = leave if leave >= leave_lid else 0.0
+            s = by_side if by_side < by_lid else inner
+            enters = min(by_side, by_lid) >= max(leave, leave_lid)
+            s = s if enters else 0.0
+            s = s if s >= view.s_min else 0.0
+            row[u] = s
+            if ids is not None:
+                inwards = by_side < by_lid
+                norths = max(north.exit_a * n, north.exit_b * n)
+                easts = max(east.exit_a * e, east.exit_b * e)
+                north_in = north.enter_gain * n + north.enter_base
+                east_in = east.enter_gain * e + east.enter_base
+                wall_out = WALL_NORTH_SOUTH if norths >= easts else WALL_EAST_WEST
+                inner_id = FLOOR if floor * d >= max(norths, easts) else wall_out
+                outer_id = WALL_NORTH_SOUTH if north_in <= east_in else WALL_EAST_WEST
+                found = outer_id if inwards else inner_id
+                marks[u] = found if s > 0.0 else SKY
+
+
+@kernel
+def draw_box(
+    out: Image,
+    ids: Ids | None,
+    number: int,
+    lines: Lines,
+    xs: Line,
+    view: View,
+    pose: Pose,
+    half: Vec,
+    rectangle: Rectangle,
+) -> bool:
+    """Draw a box; return whether the camera is inside."""
+    c, r = pose.center, pose.along
+    i = _slab(c[0] - half[0], c[0] + half[0])
+    j = _slab(c[1] - half[1], c[1] + half[1])
+    k = _slab(c[2] - half[2], c[2] + half[2])
+    if i.enter_base > 0.0 and j.enter_base > 0.0 and k.enter_base > 0.0:
+        return True
+    top, bottom, left, end = rectangle
+    x_span = xs[left:end]
+    for v in range(top, bottom):
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        row = out[v, left:end]
+        if ids is not None:
+            marks = ids[v, left:end]
+        for u in range(len(x_span)):
+            x = x_span[u]
+            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            enter = min(
+                i.enter_gain * a + i.enter_base,
+                min(j.enter_gain * b + j.enter_base, k.enter_gain * d + k.enter_base),
+            )
+            leave = max(
+                max(max(i.exit_a * a, i.exit_b * a), max(j.exit_a * b, j.exit_b * b)),
+                max(max(k.exit_a * d, k.exit_b * d), view.s_min),
+            )
+            s = enter if enter >= leave else 0.0
+            if ids is not None:
+                marks[u] = number if s > row[u] else marks[u]
+            row[u] = max(row[u], s)
+    return False
+
+
+@kernel
+def draw_cylinder(
+    out: Image,
+    ids: Ids | None,
+    number: int,
+    lines: Lines,
+    xs: Line,
+    view: View,
+    pose: Pose,
+    half: Vec,
+    rectangle: Rectangle,
+) -> bool:
+    """Draw a vertical cylinder with caps; return whether the camera is inside."""
+    c, r = pose.center, pose.along
+    k = _slab(c[2] - half[2], c[2] + half[2])
+    # Side: (c.c - radius²) s² - 2 (d.c) s + d.d = 0, horizontal components only.
+    cc = c[0] * c[0] + c[1] * c[1] - half[0] * half[0]
+    outside = cc > 0.0
+    if not outside and k.enter_base > 0.0:
+        return True
+    out_gain = 1.0 / max(cc, TINY * TINY) if outside else 1.0 / min(cc, -TINY * TINY)
+    in_gain, in_base = (out_gain, 0.0) if outside else (0.0, _UNLIMITED)
+    top, bottom, left, end = rectangle
+    x_span = xs[left:end]
+    for v in range(top, bottom):
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        row = out[v, left:end]
+        if ids is not None:
+            marks = ids[v, left:end]
+        for u in range(len(x_span)):
+            x = x_span[u]
+            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            toward = a * c[0] + b * c[1]
+            square = toward * toward - cc * (a * a + b * b)
+            root = math.sqrt(max(square, 0.0))
+            enter = min(in_gain * (toward + root) + in_base, k.enter_gain * d + k.enter_base)
+            leave = max(
+                max(out_gain * (toward - root), view.s_min), max(k.exit_a * d, k.exit_b * d)
+            )
+            s = enter if enter >= leave else 0.0
+            s = s if square >= 0.0 else 0.0
+            if ids is not None:
+                marks[u] = number if s > row[u] else marks[u]
+            row[u] = max(row[u], s)
+    return False
+
+
+@kernel
+def draw_sphere(
+    out: Image,
+    ids: Ids | None,
+    number: int,
+    lines: Lines,
+    xs: Line,
+    view: View,
+    pose: Pose,
+    radius: float,
+    rectangle: Rectangle,
+) -> bool:
+    """Draw a sphere; return whether the camera is inside."""
+    c, r = pose.center, pose.along
+    cc = dot(c, c) - radius * radius
+    if cc <= 0.0:
+        return True
+    gain = 1.0 / max(cc, TINY * TINY)
+    top, bottom, left, end = rectangle
+    x_span = xs[left:end]
+    for v in range(top, bottom):
+        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        row = out[v, left:end]
+        if ids is not None:
+            marks = ids[v, left:end]
+        for u in range(len(x_span)):
+            x = x_span[u]
+            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            toward = a * c[0] + b * c[1] + d * c[2]
+            square = toward * toward - cc * (a * a + b * b + d * d)
+            s = gain * (toward + math.sqrt(max(square, 0.0)))
+            s = s if s >= view.s_min else 0.0
+            s = s if square >= 0.0 else 0.0
+            if ids is not None:
+                marks[u] = number if s > row[u] else marks[u]
+            row[u] = max(row[u], s)
+    return False
+
+
+@kernel
+def turned(pose: Pose, cos: float, sin: float) -> Pose:
+    """Return a pose in the world along axes that are turned about the vertical."""
+    return Pose(
+        _turn(pose.forward, cos, sin),
+        _turn(pose.across, cos, sin),
+        _turn(pose.along, cos, sin),
+        _turn(pose.center, cos, sin),
+    )

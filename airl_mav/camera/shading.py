@@ -1,0 +1,222 @@
+"""What one point of a surface looks like: light, texture, fog, and the sRGB number of a pixel.
+
+Everything is in float32, without branches, so that the loops that inline it vectorise.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.textures import LEVELS, STRIDE
+from airl_mav.core.kernels import kernel
+
+F32 = np.float32
+I32 = np.int32
+Vec32 = tuple[np.float32, np.float32, np.float32]
+Plane = NDArray[np.float32]
+Packed = NDArray[np.int32]
+
+ZERO: Final = F32(0.0)
+HALF: Final = F32(0.5)
+ONE: Final = F32(1.0)
+LEAST: Final = F32(1e-6)
+"""Least size of a divisor."""
+
+
+class Surface(NamedTuple):
+    """The material of one surface."""
+
+    base: np.int64
+    """Where its pattern begins in the atlas."""
+    per_m: np.float32
+    """Periods of the pattern for a metre [1/m]."""
+    offset: tuple[np.float32, np.float32]
+    """Where the pattern begins, in periods."""
+    albedo: Vec32
+    """Where the pattern is 0."""
+    more: Vec32
+    """That where the pattern is 1, less `albedo`."""
+
+
+class Points(NamedTuple):
+    """Rows of the points of one line of an image, to work in."""
+
+    place: Packed
+    """Of the nearest texel in its pattern."""
+    facing: Plane
+    """Cosine of the angle between normal and sun; 0 for what faces away."""
+    up: Plane
+    """Cosine of the angle between normal and zenith."""
+    pattern: Plane
+    """What the texture is there."""
+
+
+class Lit(NamedTuple):
+    """The light of an arena, linear RGB."""
+
+    to_sun: Vec32
+    """Unit vector NED."""
+    sun: Vec32
+    """Irradiance of a surface that faces the sun."""
+    sky: Vec32
+    """Irradiance of a level surface by the whole sky."""
+    ground: Vec32
+    """Radiosity of the sunlit floor: irradiance of a surface that sees nothing else."""
+    zenith: Vec32
+    horizon: Vec32
+    extinction: np.float32
+
+
+@kernel
+def surface_of(
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    i: int,
+) -> Surface:
+    """Return row i of the arrays of materials."""
+    dark = (albedo[i, 0, 0], albedo[i, 0, 1], albedo[i, 0, 2])
+    more = (
+        albedo[i, 1, 0] - dark[0],
+        albedo[i, 1, 1] - dark[1],
+        albedo[i, 1, 2] - dark[2],
+    )
+    base = np.int64(texture[i]) * STRIDE
+    return Surface(base, per_m[i], (offset[i, 0], offset[i, 1]), dark, more)
+
+
+@kernel
+def _part(x: np.float32) -> np.float32:
+    """Return x less the greatest whole number that is not above it; `floor` does not vectorise."""
+    part = x - F32(I32(x))
+    return part + ONE if part < ZERO else part
+
+
+@kernel
+def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
+    """Return where the nearest texel lies in a pattern, of the level whose texels fit a pixel.
+
+    Args:
+        u: Place across, in periods.
+        v: Place down, in periods.
+        texels2: Square of the texels of the finest level that a pixel covers, each way.
+    """
+    # Half the exponent of a float is the logarithm of its root; the side is 2 to its opposite.
+    exponent = I32(F32(texels2 + texels2).view(I32) >> 23) - I32(127)
+    level = I32(min(max(exponent, I32(0)), I32(2 * LEVELS))) >> 1
+    side = I32(I32(127 + LEVELS - level) << 23).view(F32)
+    # A place just below a whole number may round up to it.
+    column = min(F32(I32(_part(u) * side)), side - ONE)
+    row = min(F32(I32(_part(v) * side)), side - ONE)
+    return I32(side * (side + row) + column)
+
+
+@kernel
+def paint(
+    out: Packed,
+    seen: Packed,
+    lit: Plane,
+    clear: Plane,
+    v: int,
+    left: int,
+    end: int,
+    first: np.int32,
+    last: np.int32,
+    points: Points,
+    surface: Surface,
+    light: Lit,
+    atlas: Plane,
+) -> None:
+    """Write the packed sRGB of a part of a line where it sees a surface.
+
+    Lambert's law for the sun; the sky and the ground by the shares that a tilted plane sees of
+    them, (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The long-term average
+    performance of flat-plate solar-energy collectors, 1963); fog by Beer-Lambert's law.
+
+    Args:
+        out: (n, m) packed colours, written.
+        seen: (n, m) what is seen.
+        lit: (n, m) 1 in the sun, 0 in shadow.
+        clear: (n, m) share of light that the fog lets through.
+        v: Which line.
+        left: Where the part begins.
+        end: Where it ends.
+        first: Least number of this surface in `seen`.
+        last: Greatest.
+        points: The part's points.
+        surface: Its material.
+        light: The light.
+        atlas: `textures.atlas()`.
+    """
+    place, facing, up, pattern = points
+    row, marks = out[v, left:end], seen[v, left:end]
+    lit_row, clear_row = lit[v, left:end], clear[v, left:end]
+    # By itself: a loop that reads from all over the atlas does not vectorise.
+    for u in range(end - left):
+        pattern[u] = atlas[surface.base + place[u]]
+    dark, more, sun, sky, ground = (
+        surface.albedo,
+        surface.more,
+        light.sun,
+        light.sky,
+        light.ground,
+    )
+    horizon = light.horizon
+    for u in range(end - left):
+        value, through = pattern[u], clear_row[u]
+        direct, above, below = lit_row[u] * facing[u], HALF + HALF * up[u], HALF - HALF * up[u]
+        fog = ONE - through
+        red = (dark[0] + more[0] * value) * (direct * sun[0] + above * sky[0] + below * ground[0])
+        green = (dark[1] + more[1] * value) * (direct * sun[1] + above * sky[1] + below * ground[1])
+        blue = (dark[2] + more[2] * value) * (direct * sun[2] + above * sky[2] + below * ground[2])
+        colour = packed(
+            through * red + fog * horizon[0],
+            through * green + fog * horizon[1],
+            through * blue + fog * horizon[2],
+        )
+        row[u] = colour if (marks[u] >= first) & (marks[u] <= last) else row[u]
+
+
+@kernel
+def encoded(x: np.float32) -> np.int32:
+    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1).
+
+    The power is a polynomial of the root, fitted for the least greatest error: 0.09 of a step.
+    """
+    x = min(max(x, ZERO), ONE)
+    s = np.sqrt(x)
+    curve = F32(-413.73478559914724) + F32(131.81300432715605) * s
+    curve = F32(517.7284762186123) + curve * s
+    curve = F32(-357.54480524554555) + curve * s
+    curve = F32(387.0472913646104) + curve * s
+    curve = F32(-10.226101032503605) + curve * s
+    curve = curve if x > F32(0.0031308) else F32(12.92 * 255.0) * x
+    return I32(min(curve, F32(255.0)) + HALF)
+
+
+@kernel
+def packed(red: np.float32, green: np.float32, blue: np.float32) -> np.int32:
+    """Return linear RGB as one number: sRGB red + 256 green + 65536 blue."""
+    return I32(encoded(red) + I32(I32(256) * encoded(green)) + I32(I32(65536) * encoded(blue)))
+
+
+@kernel
+def turn_of(y: np.float32, x: np.float32) -> np.float32:
+    """Return the angle of a direction in turns, -0.5..0.5, to 1e-5.
+
+    An odd polynomial for the angle below 45 degrees, fitted for the least greatest error.
+    """
+    ax, ay = abs(x), abs(y)
+    z = min(ax, ay) / max(max(ax, ay), LEAST)
+    z2 = z * z
+    angle = F32(0.14628965886563458) + F32(-0.03900338343142313) * z2
+    angle = F32(-0.32118531071533873) + angle * z2
+    angle = (F32(0.999214808018403) + angle * z2) * z * F32(0.5 / math.pi)
+    angle = F32(0.25) - angle if ay > ax else angle
+    angle = HALF - angle if x < ZERO else angle
+    return -angle if y < ZERO else angle

@@ -1,0 +1,283 @@
+"""Sky, floor, walls and obstacles in colour, each where the image sees them.
+
+A line is shaded in three steps: where its points lie in the pattern and how they face the light,
+then the texels, then the colours.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.primitives import (
+    BOX,
+    CYLINDER,
+    FLOOR,
+    OBSTACLE,
+    SKY,
+    WALL_EAST_WEST,
+    WALL_NORTH_SOUTH,
+    Ids,
+    Line,
+    Lines,
+    turned,
+)
+from airl_mav.camera.projection import MIN_DEPTH_M, Pose
+from airl_mav.camera.shading import (
+    F32,
+    I32,
+    LEAST,
+    ONE,
+    ZERO,
+    Lit,
+    Packed,
+    Plane,
+    Points,
+    Surface,
+    packed,
+    paint,
+    texel_at,
+    turn_of,
+)
+from airl_mav.camera.shadows import start32, widened
+from airl_mav.camera.textures import SIDE
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+
+FOG_LAYER_M: Final = 100.0
+"""Height of the fog above the floor, seen towards the sky [m]."""
+
+_TURN: Final = 2.0 * math.pi
+_STEEP: Final = F32(0.02)  # least cosine between ray and normal for the size of a pixel
+
+
+@kernel
+def _span(
+    ids: Ids, v: int, left: int, end: int, first: np.int32, last: np.int32
+) -> tuple[int, int]:
+    """Return the pixels of a part of a line from the first to the last that sees a surface.
+
+    They begin and end with whole vectors. Its numbers are first..last.
+    """
+    seen, length = ids[v, left:end], I32(end - left)
+    begin, stop = length, I32(0)
+    for u in range(end - left):
+        here = (seen[u] >= first) & (seen[u] <= last)
+        at = I32(u)
+        begin = min(begin, at if here else length)
+        stop = max(stop, I32(at + I32(1)) if here else I32(0))
+    if stop == 0:
+        return 0, 0
+    return widened(left + int(begin), left + int(stop), ids.shape[1])
+
+
+@kernel
+def draw_sky(
+    out: Packed,
+    ids: Ids,
+    points: Points,
+    lines: Lines,
+    xs: Line,
+    axes: Pose,
+    camera: Vec,
+    light: Lit,
+) -> None:
+    """Write what is seen where there is no surface: sky, and below the horizon level ground.
+
+    The ground beyond the walls is as bright as the floor is in the mean.
+    """
+    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
+    above = F32(max(-camera[2], MIN_DEPTH_M))
+    zenith, horizon, ground = light.zenith, light.horizon, light.ground
+    rises, clear = points.up, points.pattern
+    for v in range(len(lines)):
+        left, end = _span(ids, v, 0, len(xs), I32(SKY), I32(SKY))
+        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
+        row, x_row = out[v, left:end], xs[left:end]
+        for u in range(end - left):
+            x = F32(x_row[u])
+            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            rises[u] = -d / np.sqrt(n * n + e * e + d * d)
+            clear[u] = ONE
+        if light.extinction > 0.0:
+            for u in range(end - left):
+                thick = F32(FOG_LAYER_M) if rises[u] > ZERO else above
+                clear[u] = math.exp(-light.extinction * thick / max(abs(rises[u]), LEAST))
+        for u in range(end - left):
+            rise, through = rises[u], clear[u]
+            fog, share = ONE - through, max(rise, ZERO)
+            red = horizon[0] + share * (zenith[0] - horizon[0])
+            green = horizon[1] + share * (zenith[1] - horizon[1])
+            blue = horizon[2] + share * (zenith[2] - horizon[2])
+            red = red if rise >= ZERO else ground[0]
+            green = green if rise >= ZERO else ground[1]
+            blue = blue if rise >= ZERO else ground[2]
+            row[u] = packed(
+                through * red + fog * horizon[0],
+                through * green + fog * horizon[1],
+                through * blue + fog * horizon[2],
+            )
+
+
+@kernel
+def _texels2(surface: Surface, pixel2: np.float32) -> np.float32:
+    """Return the square of the texels of the finest level that a pixel covers 1 m away, head on."""
+    texels = F32(SIDE) * surface.per_m
+    return texels * texels * pixel2
+
+
+@kernel
+def shade_room(
+    out: Packed,
+    ids: Ids,
+    far: Plane,
+    lit: Plane,
+    clear: Plane,
+    points: Points,
+    lines: Lines,
+    xs: Line,
+    axes: Pose,
+    camera: Vec,
+    floor: Surface,
+    walls: Surface,
+    light: Lit,
+    atlas: Plane,
+    pixel2: np.float32,
+) -> None:
+    """Shade floor and walls. Their patterns begin in the start, and at the foot of a wall."""
+    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
+    at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
+    sun0, sun1, sun_up = light.to_sun[0], light.to_sun[1], -light.to_sun[2]
+    floor_texel = _texels2(floor, pixel2) / max(-at2, F32(MIN_DEPTH_M))
+    walls_texel = _texels2(walls, pixel2)
+    for v in range(len(lines)):
+        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
+        left, end = _span(ids, v, 0, len(xs), I32(FLOOR), I32(FLOOR))
+        far_row, x_row = far[v, left:end], xs[left:end]
+        for u in range(end - left):
+            x, t = F32(x_row[u]), far_row[u]
+            n, e = d0 + x * r0, d1 + x * r1
+            across = (at1 + t * e) * floor.per_m + floor.offset[0]
+            along = floor.offset[1] - (at0 + t * n) * floor.per_m
+            # The camera's height is t times the ray's slope.
+            points.place[u] = texel_at(across, along, floor_texel * t * t * t)
+            points.facing[u] = sun_up
+            points.up[u] = ONE
+        first, last = I32(FLOOR), I32(FLOOR)
+        paint(out, ids, lit, clear, v, left, end, first, last, points, floor, light, atlas)
+        first, last = I32(WALL_NORTH_SOUTH), I32(WALL_EAST_WEST)
+        left, end = _span(ids, v, 0, len(xs), first, last)
+        far_row, x_row, seen = far[v, left:end], xs[left:end], ids[v, left:end]
+        for u in range(end - left):
+            x, t = F32(x_row[u]), far_row[u]
+            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            north = seen[u] == first
+            normal, to_sun = (n if north else e), (sun0 if north else sun1)
+            to_sun = -to_sun if normal > ZERO else to_sun
+            across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
+            along = (at2 + t * d) * walls.per_m + walls.offset[1]
+            texels = walls_texel * t * t / max(abs(normal), _STEEP)
+            points.place[u] = texel_at(across, along, texels)
+            points.facing[u] = max(to_sun, ZERO)
+            points.up[u] = ZERO
+        paint(out, ids, lit, clear, v, left, end, first, last, points, walls, light, atlas)
+
+
+@kernel
+def shade_obstacle(
+    out: Packed,
+    ids: Ids,
+    far: Plane,
+    lit: Plane,
+    clear: Plane,
+    points: Points,
+    rectangle: NDArray[np.int32],
+    number: int,
+    lines: Lines,
+    xs: Line,
+    world: Pose,
+    shape: int,
+    half: Vec,
+    yaw: float,
+    surface: Surface,
+    light: Lit,
+    atlas: Plane,
+    pixel2: np.float32,
+) -> None:
+    """Shade what is seen of an obstacle in a rectangle of the image.
+
+    The pattern of a box begins in the middle of each face. That of a cylinder goes round it in a
+    whole number of periods, that of a sphere by longitude and latitude.
+    """
+    cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == BOX else (1.0, 0.0)
+    pose = turned(world, cos, sin)
+    c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
+    r0, r1, r2 = F32(pose.along[0]), F32(pose.along[1]), F32(pose.along[2])
+    s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
+    s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
+    s2 = light.to_sun[2]
+    per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
+    texel, radius = _texels2(surface, pixel2), F32(half[0])
+    per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
+    per_turn = F32(max(np.rint(_TURN * half[0] * per_m), 1.0))
+    place, facing, ups, _ = points
+    own = I32(OBSTACLE + number)
+    for v in range(rectangle[0], rectangle[1]):
+        left, end = _span(ids, v, rectangle[2], rectangle[3], own, own)
+        if end == 0:
+            continue
+        x_row = xs[left:end]
+        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        far_row = far[v, left:end]
+        if shape == BOX:
+            for u in range(end - left):
+                x, t = F32(x_row[u]), far_row[u]
+                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                a, b, c = t * n - c0, t * e - c1, t * d - c2
+                qa, qb, qc = abs(a) * per0, abs(b) * per1, abs(c) * per2
+                on_c = qc >= max(qa, qb)
+                on_a = qa >= qb
+                normal = d if on_c else (n if on_a else e)
+                outward = c if on_c else (a if on_a else b)
+                to_sun = s2 if on_c else (s0 if on_a else s1)
+                to_sun = to_sun if outward > ZERO else -to_sun
+                up = ONE if c < ZERO else -ONE
+                across = a if on_c else (b if on_a else a)
+                along = b if on_c else c
+                texels = texel * t * t / max(abs(normal), _STEEP)
+                place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
+                facing[u] = max(to_sun, ZERO)
+                ups[u] = up if on_c else ZERO
+        elif shape == CYLINDER:
+            for u in range(end - left):
+                x, t = F32(x_row[u]), far_row[u]
+                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                a, b, c = t * n - c0, t * e - c1, t * d - c2
+                cap = abs(c) * per2 * radius >= np.sqrt(a * a + b * b)
+                normal = d if cap else (a * n + b * e) * per0
+                vertical = s2 if c > ZERO else -s2
+                to_sun = vertical if cap else (a * s0 + b * s1) * per0
+                up = ONE if c < ZERO else -ONE
+                across = a * per_m if cap else turn_of(b, a) * per_turn
+                along = (b if cap else c) * per_m
+                texels = texel * t * t / max(abs(normal), _STEEP)
+                place[u] = texel_at(across + begin_u, along + begin_v, texels)
+                facing[u] = max(to_sun, ZERO)
+                ups[u] = up if cap else ZERO
+        else:
+            for u in range(end - left):
+                x, t = F32(x_row[u]), far_row[u]
+                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                a, b, c = t * n - c0, t * e - c1, t * d - c2
+                normal = (a * n + b * e + c * d) * per0
+                to_sun = (a * s0 + b * s1 + c * s2) * per0
+                across = turn_of(b, a) * per_turn
+                along = turn_of(c, np.sqrt(a * a + b * b)) * per_turn
+                texels = texel * t * t / max(abs(normal), _STEEP)
+                place[u] = texel_at(across + begin_u, along + begin_v, texels)
+                facing[u] = max(to_sun, ZERO)
+                ups[u] = min(max(-c * per0, -ONE), ONE)
+        paint(out, ids, lit, clear, v, left, end, own, own, points, surface, light, atlas)

@@ -1,0 +1,127 @@
+"""Procedural textures: patterns of numbers 0..1 that repeat, with their coarser levels (mip maps).
+
+A pattern is a function of nothing but its name. What differs from surface to surface is where it
+begins, how large it is and between which albedos it mixes.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import TEXTURES
+
+Floats = NDArray[np.float64]
+
+LEVELS: Final = 7
+"""Coarser levels of a pattern: the last is one texel."""
+
+SIDE: Final = 1 << LEVELS
+"""Texels of a pattern's finest level, each way."""
+
+STRIDE: Final = 2 * SIDE * SIDE
+"""Length of one pattern in the atlas: the level of n texels a side is at n² to 2 n², row by row."""
+
+PERIOD: Final = {"plain": 1.0, "checker": 2.0, "noise": 8.0, "brick": 4.0, "foliage": 16.0}
+"""Length of the period of a pattern, in `Material.size_m`."""
+
+COURSES: Final = 8
+"""Courses of bricks in a period: a brick is twice as long as high."""
+
+_JOINT: Final = 2  # texels of mortar above a brick, and on its left
+_OCTAVES: Final = 3
+
+
+@cache
+def atlas() -> NDArray[np.float32]:
+    """Return all levels of all patterns (patterns * STRIDE,), in the order of TEXTURES."""
+    made = np.zeros(len(TEXTURES) * STRIDE, np.float32)
+    for number, name in enumerate(TEXTURES):
+        level, n = pattern(name), SIDE
+        while True:
+            begin = number * STRIDE + n * n
+            made[begin : begin + n * n] = level.ravel()
+            if n == 1:
+                break
+            n //= 2
+            level = level.reshape(n, 2, n, 2).mean(axis=(1, 3))
+    made.setflags(write=False)
+    return made
+
+
+def pattern(name: str) -> Floats:
+    """Return the finest level of a pattern (SIDE, SIDE): rows go down, columns to the right."""
+    row, column = np.mgrid[:SIDE, :SIDE]
+    if name == "checker":
+        half = SIDE // 2
+        checks: Floats = ((row // half + column // half) % 2).astype(np.float64)
+        return checks
+    if name == "brick":
+        return _bricks(row, column)
+    if name == "noise":
+        return _value_noise(np.random.default_rng(1), 8, _OCTAVES)
+    if name == "foliage":
+        return _leaves(np.random.default_rng(2))
+    return np.zeros((SIDE, SIDE))
+
+
+def _bricks(row: NDArray[np.intp], column: NDArray[np.intp]) -> Floats:
+    """Return a running bond: every second course is shifted by half a brick."""
+    height, length = SIDE // COURSES, SIDE // int(PERIOD["brick"])
+    course = row // height
+    along = column + (course % 2) * (length // 2)
+    tone = np.random.default_rng(3).uniform(0.75, 1.0, (COURSES, int(PERIOD["brick"])))
+    brick = tone[course, (along % SIDE) // length]
+    joint = (row % height < _JOINT) | (along % length < _JOINT)
+    return np.where(joint, 0.0, brick)
+
+
+def _value_noise(rng: np.random.Generator, cells: int, octaves: int) -> Floats:
+    """Return value noise that repeats: random values on a grid, smoothly interpolated.
+
+    Each octave has half the wavelength and half the amplitude of the one before.
+    """
+    total, weight = np.zeros((SIDE, SIDE)), 0.0
+    for octave in range(octaves):
+        n = cells << octave
+        values = rng.random((n, n))
+        place = np.arange(SIDE) * n / SIDE
+        low = place.astype(np.intp)
+        part = place - low
+        blend = part * part * (3.0 - 2.0 * part)
+        high = (low + 1) % n
+        rows = values[low] + (values[high] - values[low]) * blend[:, None]
+        total += 0.5**octave * (rows[:, low] + (rows[:, high] - rows[:, low]) * blend)
+        weight += 0.5**octave
+    contrast = 1.7  # The mean of many octaves keeps near the middle.
+    return np.clip(0.5 + contrast * (total / weight - 0.5), 0.0, 1.0)
+
+
+def _leaves(rng: np.random.Generator) -> Floats:
+    """Return ellipses over each other, each brighter at its midrib, the later ones brighter."""
+    seen = np.zeros((SIDE, SIDE))
+    row, column = np.mgrid[:SIDE, :SIDE]
+    count = 500
+    length = SIDE / PERIOD["foliage"]
+    for k in range(count):
+        middle = rng.random(2) * SIDE
+        angle, size = rng.uniform(0.0, np.pi), length * rng.uniform(0.6, 1.1)
+        dr, dc = (
+            (x - m + SIDE / 2) % SIDE - SIDE / 2 for x, m in zip((row, column), middle, strict=True)
+        )
+        along = (np.cos(angle) * dc + np.sin(angle) * dr) / size
+        across = (np.cos(angle) * dr - np.sin(angle) * dc) / (0.45 * size)
+        inside = along**2 + across**2 <= 1.0
+        tone = (0.25 + 0.6 * k / count) * rng.uniform(0.7, 1.0)
+        seen = np.where(inside, tone * (1.0 - 0.35 * np.abs(across)), seen)
+    leaves: Floats = seen / seen.max()
+    return leaves
+
+
+@cache
+def means() -> Floats:
+    """Return the mean of each pattern, in the order of TEXTURES."""
+    return np.array([pattern(name).mean() for name in TEXTURES])

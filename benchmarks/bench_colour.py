@@ -1,0 +1,79 @@
+"""Colour images a second on one core, and what one costs in depth images.
+
+Run as `python benchmarks/bench_colour.py`. The arenas and poses are those of `bench_depth`; every
+obstacle has a texture, the sun casts shadows. Depth and colour are measured in turns, so that their
+ratio holds on a busy machine, too. Both kernels are called from a compiled loop, as in training.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from bench_depth import FOV, POSES, RANGE_M, make_arena, make_poses, render_all
+from rich.console import Console
+from rich.table import Table
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.colour import render_colour
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import ColourArrays
+from airl_mav.camera.textures import atlas
+from airl_mav.core.kernels import kernel
+
+SIZES = ((32, 24), (64, 48), (128, 96))
+OBSTACLES = (0, 10, 50)
+ROUNDS = 15
+
+
+@kernel
+def colour_all(rgb, depth, seen, position, attitude, focal, cx, cy, bounds, shape, center, half,
+               yaw, texture, per_m, offset, albedo, lights, patterns):  # type: ignore[no-untyped-def] # fmt: skip
+    for i in range(len(position)):
+        p, q = position[i], attitude[i]
+        render_colour(
+            rgb, depth, seen, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy, False,
+            bounds, shape, center, half, yaw, texture, per_m, offset, albedo, lights, patterns,
+        )  # fmt: skip
+
+
+def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
+    """Return depth and colour images a second: of each the best of rounds taken in turns."""
+    o, look, shape = arena.obstacles, ColourArrays.of(arena.look), (k.height, k.width)
+    bodies = (arena.bounds.as_array(), o.shape, o.center, o.half_size, o.yaw)
+    depth, seen = np.empty(shape, np.float32), np.empty(shape, np.int32)
+    rgb, patterns = np.empty((*shape, 3), np.uint8), atlas()
+    surfaces = (look.texture, look.per_m, look.offset, look.albedo, look.lights, patterns)
+    times: tuple[list[float], list[float]] = ([], [])
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        render_all(depth, *poses, k.focal, k.cx, k.cy, *bodies)
+        middle = time.perf_counter()
+        colour_all(rgb, depth, seen, *poses, k.focal, k.cx, k.cy, *bodies, *surfaces)
+        times[0].append(middle - start)
+        times[1].append(time.perf_counter() - middle)
+    return POSES / min(times[0]), POSES / min(times[1])
+
+
+def main() -> None:
+    rng = np.random.default_rng(0)
+    poses = make_poses(rng)
+    table = Table(title=f"Images a second, one core; depth to {RANGE_M:g} m, colour without limit")
+    for heading in ("image", "obstacles", "depth", "colour", "depth / colour"):
+        table.add_column(heading, justify="right")
+    for n in OBSTACLES:
+        arena = make_arena(n, rng)
+        for width, height in SIZES:
+            depth, colour = rates(arena, Intrinsics.from_fov(width, height, FOV), poses)
+            table.add_row(
+                f"{width}x{height}",
+                str(n),
+                f"{depth:,.0f}",
+                f"{colour:,.0f}",
+                f"{depth / colour:.1f}",
+            )
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

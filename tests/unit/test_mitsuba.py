@@ -1,0 +1,134 @@
+"""The colour kernel beside Mitsuba 3, a path tracer: same bodies, albedos, sun and sky."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.mitsuba import path_traced
+from airl_mav.camera.picture import antialiased, render_picture
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+
+pytest.importorskip("mitsuba")
+
+LIGHT: dict[str, Any] = {
+    "sun": {"azimuth_deg": [200, 200], "elevation_deg": [42, 42], "irradiance": [0.6, 0.6]},
+    "sky": {
+        "irradiance": [0.4, 0.4],
+        "zenith": [200, 200, 200],
+        "horizon": [200, 200, 200],
+    },
+}
+"""A sky of one radiance, and a sun."""
+
+PLAIN = {
+    "materials": {"mat": {"albedo": [180, 150, 120]}, "earth": {"albedo": [120, 125, 110]}},
+    "floor": {"materials": ["earth"]},
+    "static": {"materials": ["mat"], "brightness": [0.6, 1.2], "tint": 0.3},
+}
+
+CAMERA = Intrinsics.from_fov(96, 64, 1.5)
+
+
+def arena(name: str, seed: int, **appearance: Any) -> Arena:
+    spec = load_profile("arenas", name, ArenaSpec)
+    spec = ArenaSpec.model_validate({**spec.model_dump(), "appearance": appearance})
+    return generate(spec, seed, name=name, vehicle_width_m=0.55)
+
+
+def edges(seen: NDArray[np.int32], width: int = 1) -> NDArray[np.bool_]:
+    """Pixels beside an edge of what is seen: theirs are means over a pixel."""
+    found = np.zeros(seen.shape, bool)
+    for axis in (0, 1):
+        step = np.diff(seen, axis=axis) != 0
+        found |= np.concatenate([step, np.zeros_like(step.take([0], axis))], axis)
+        found |= np.concatenate([np.zeros_like(step.take([0], axis)), step], axis)
+    widened: NDArray[np.bool_] = binary_dilation(found, iterations=width)
+    return widened
+
+
+def difference(
+    scene: Arena, position: tuple[float, float, float], yaw: float, *, rays: int = 1
+) -> tuple[float, float]:
+    """Mean absolute difference away from edges, in shares of full scale, and that of all of it.
+
+    `rays`: ours a pixel, each way.
+    """
+    attitude = quat_from_euler(0.03, -0.08, yaw)
+    centers = scene.centers_at(0)
+    place = np.array(position)
+    ours = render_picture(scene, centers, CAMERA, place, attitude)
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=48)
+    rgb = antialiased(scene, centers, CAMERA, place, attitude, rays)
+    apart = np.abs(rgb.astype(float) - theirs) / 255.0
+    inner = ~edges(ours.seen)
+    assert inner.mean() > 0.4
+    return float(apart[inner].mean()), float(apart.mean())
+
+
+VIEWS = [
+    ((0.0, 0.0, -2.5), 0.0),
+    ((20.0, 5.0, -3.0), 2.2),
+    ((35.0, -10.0, -1.5), math.pi),
+    ((10.0, 0.0, -12.0), 0.4),
+]
+
+
+@pytest.mark.parametrize(("position", "yaw"), VIEWS)
+def test_plain_materials_are_within_three_percent(
+    position: tuple[float, float, float], yaw: float
+) -> None:
+    inner, _ = difference(arena("dense-obstacles", 3, **LIGHT, **PLAIN), position, yaw)
+    assert inner < 0.03
+
+
+def test_textures_lie_where_they_do_in_the_reference() -> None:
+    """Bricks on every obstacle, checks on the floor, by bitmaps of the same patterns."""
+    textured = {
+        "floor": {"materials": ["checker"]},
+        "materials": {"checker": {
+            "albedo": [90, 90, 90], "albedo_2": [180, 180, 180], "texture": "checker",
+            "size_m": 1.0,
+        }},
+        "static": {"materials": ["brick"]},
+        "walls": {"materials": ["brick"]},
+    }  # fmt: skip
+    scene = arena("dense-obstacles", 3, **LIGHT, **textured)
+    inner, whole = difference(scene, (6.0, -6.0, -3.0), 0.3, rays=4)
+    assert inner < 0.03
+    assert whole < 0.03
+    # Patterns that begin elsewhere are far off: the limits above can fail.
+    moved, centers = arena("dense-obstacles", 4, **LIGHT, **textured), scene.centers_at(0)
+    place, attitude = np.array([6.0, -6.0, -3.0]), quat_from_euler(0.03, -0.08, 0.3)
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=16)
+    scene.__dict__["look"] = moved.look
+    other = antialiased(scene, centers, CAMERA, place, attitude, 4)
+    assert float(np.abs(other.astype(float) - theirs).mean()) / 255.0 > 0.05
+
+
+def test_a_blue_sky_is_theirs() -> None:
+    """Radiance from horizon to zenith, and what it makes of plain surfaces."""
+    inner, _ = difference(arena("static-obstacles", 7, **PLAIN), (0.0, 0.0, -2.5), 0.2)
+    assert inner < 0.03
+
+
+def test_what_it_has_not_is_refused() -> None:
+    fog = arena("no-obstacles", 0, fog={"extinction_1_m": [0.1, 0.1]})
+    place, level = np.array([0.0, 0.0, -2.5]), quat_from_euler(0, 0, 0)
+    with pytest.raises(UsageError, match=r"without appearance\.fog"):
+        path_traced(fog, fog.obstacles.center, CAMERA, place, level, samples=1)
+    cylinder = Intrinsics.from_fov(32, 24, 6.0, "cylindrical")
+    bare = arena("no-obstacles", 0)
+    with pytest.raises(UsageError, match="a pinhole camera"):
+        path_traced(bare, bare.obstacles.center, cylinder, place, level, samples=1)
