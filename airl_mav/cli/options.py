@@ -353,7 +353,8 @@ EXTRAS = {
     "export": ("foxglove", "mcap"),
     "profile": ("onnx",),
     "refit": ("mcap", "pyulog"),
-    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "pymavlink", "scipy"),
+    "render": ("mitsuba",),
+    "sim": ("filterpy", "jinja2", "matplotlib", "numba", "PIL", "pymavlink", "scipy"),
     "train": ("gymnasium", "onnx", "onnxscript", "stable_baselines3", "tensorboard", "torch"),
     "view": ("viser",),
 }
